@@ -1,0 +1,78 @@
+"""imulab: inertial sensors from test recordings to calibration records, reports and firmware.
+
+Frames, units and notation, valid everywhere:
+
+- SI inside: s, m/s^2, rad, rad/s; temperature in degC. Engineering units only in files, messages and reports.
+- Specific force, not acceleration: +g on the upward axis at rest. Body frame right-handed; vectors have shape (n, 3),
+  time first axis.
+- Terms of IEEE Std 528, 1293, 813, 836: bias b, scale factor S, input-axis misalignment m, nonlinearity k2, k3, ...
+- ``M = S (A + b)``, ``A = s + k2 s^2 + ...``, ``s = T f``: output M, specific force f, along the input axes s.
+- An uncertainty is a standard uncertainty (one sigma, GUM) unless an interval is named.
+
+The way through the package::
+
+    import imulab as il
+    recording = il.read("tumble.csv")
+    fit = il.fit_tumble(il.find_attitudes(recording), order="auto", gravity=9.81362)
+    print(fit.calibration)
+    fit.calibration.save("sn42.json")
+    il.write_report(fit.calibration, "sn42.html")
+    corrected = il.apply(il.load("sn42.json"), il.read("flight.csv"))
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from imulab._version import VERSION as __version__  # noqa: N811
+
+if TYPE_CHECKING:
+    from imulab.apply import apply as apply
+    from imulab.attitudes import Attitudes as Attitudes
+    from imulab.calibration import Calibration as Calibration
+    from imulab.calibration import load as load
+    from imulab.errors import ImulabError as ImulabError
+    from imulab.gravity import normal_gravity as normal_gravity
+    from imulab.present import write_report as write_report
+    from imulab.readers import read as read
+    from imulab.readers import read_blocks as read_blocks
+    from imulab.recording import Recording as Recording
+    from imulab.segment import find_attitudes as find_attitudes
+    from imulab.tumble.fit import TumbleFit as TumbleFit
+    from imulab.tumble.fit import fit_tumble as fit_tumble
+    from imulab.tumble.simulate import simulate_tumble as simulate_tumble
+    from imulab.writers import write_csv as write_csv
+
+_HOME = {
+    "Attitudes": "attitudes",
+    "Calibration": "calibration",
+    "ImulabError": "errors",
+    "Recording": "recording",
+    "TumbleFit": "tumble.fit",
+    "apply": "apply",
+    "find_attitudes": "segment",
+    "fit_tumble": "tumble.fit",
+    "load": "calibration",
+    "normal_gravity": "gravity",
+    "read": "readers",
+    "read_blocks": "readers",
+    "simulate_tumble": "tumble.simulate",
+    "write_csv": "writers",
+    "write_report": "present",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names when they are first used, so that ``import imulab`` costs nothing."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'imulab' has no attribute {name!r}")
+    value = getattr(import_module(f"imulab.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

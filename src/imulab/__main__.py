@@ -1,0 +1,5 @@
+"""``python -m imulab``: the command line."""
+
+from imulab.cli import run
+
+run()

@@ -1,0 +1,71 @@
+"""Records to corrected recordings: one dispatch over the procedures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from imulab.calibration import Calibration
+from imulab.errors import RecordError, UnitError
+from imulab.recording import Recording
+from imulab.tumble.apply import apply_tumble
+from imulab.units import conversion_factor, to_si
+
+_FAR_IN_TEMPERATURE = 20.0
+
+_APPLY = {"tumble": apply_tumble}
+
+
+def apply(record: Calibration, recording: Recording) -> Recording:
+    """Return the recording corrected by a record; columns that it does not touch pass unchanged.
+
+    Raises
+    ------
+    RecordError
+        The record's procedure has nothing to apply here.
+    UnitError
+        The recording's unit cannot be converted to the record's.
+    DataError
+        The recording lacks the columns that the record corrects.
+    """
+    try:
+        correct = _APPLY[record.procedure]
+    except KeyError:
+        known = " ".join(_APPLY)
+        raise RecordError(f"a {record.procedure} record cannot be applied; known procedures: {known}") from None
+    return correct(record, recording)
+
+
+def apply_blocks(records: Iterable[Calibration], blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Correct consecutive blocks of a recording by several records in the order given."""
+    chain = list(records)
+    for block in blocks:
+        for record in chain:
+            block = apply(record, block)
+        yield block
+
+
+def warnings_of(record: Calibration, recording: Recording) -> list[str]:
+    """Return what a user should know about applying this record to this recording."""
+    made = record.model.get("temperature")
+    here = recording_temperature(recording)
+    if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
+        return []
+    return [
+        f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
+        f"{made['value']:.1f} degC at which the record was made"
+    ]
+
+
+def recording_temperature(recording: Recording) -> float | None:
+    """Return the mean temperature of a recording, degC, if known."""
+    if "temperature" in recording:
+        try:
+            unit = recording.units["temperature"]
+            conversion_factor(unit, "K")
+        except UnitError:
+            return None
+        values = to_si(recording.column("temperature"), unit)
+        return float(np.nanmean(values)) if np.isfinite(values).any() else None
+    return None

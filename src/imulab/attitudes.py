@@ -1,0 +1,87 @@
+"""Attitudes: what segmentation hands to a tumble fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.recording import Array, Recording
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Windowed variance of a triad over time (sum of the axes), in the squared unit of its columns.
+
+    ``threshold`` is the variance below which a window is at rest, ``quiet`` that of the quietest stretch.
+    """
+
+    time: Array
+    variance: Array
+    threshold: float
+    quiet: float
+
+    def describe(self) -> str:
+        """Return the trace in a few words, for a message."""
+        below = np.count_nonzero(self.variance <= self.threshold) / len(self.variance)
+        low, middle, high = np.sqrt(np.quantile(self.variance, [0.05, 0.5, 0.95]))
+        return (
+            f"standard deviation within a window {low:.3g} (quietest 5 %), {middle:.3g} (median), {high:.3g} "
+            f"(95 %); {100 * below:.0f} % of the time below the threshold {np.sqrt(self.threshold):.3g}"
+        )
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Static attitudes of one tumble test.
+
+    Attributes
+    ----------
+    mean
+        Mean output of the triad in each attitude, shape (n, 3), in `unit`.
+    covariance
+        Covariance of each mean, shape (n, 3, 3), or None where nothing is known of the noise.
+    samples
+        Number of samples behind each mean, shape (n,).
+    start, stop
+        Time of the first and last sample, s, shape (n,); row numbers for a table of attitudes.
+    unit
+        Unit of the outputs as in the file.
+    recording
+        Where they come from.
+    temperature
+        Mean temperature of the test, degC, if known.
+    trace
+        The variance trace that the attitudes were found in; None for a table.
+    pieces
+        Static stretches as rows (first sample, last sample + 1, attitude), for a continuous recording.
+    swing
+        Range of each axis over the whole recording, motion included, shape (3,).
+    """
+
+    mean: Array
+    covariance: Array | None
+    samples: NDArray[np.int64]
+    start: Array
+    stop: Array
+    unit: str
+    recording: Recording
+    temperature: float | None = None
+    trace: Trace | None = None
+    pieces: NDArray[np.int64] | None = None
+    swing: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def label(self, index: int) -> str:
+        """Return how messages name an attitude: by its row, or by its time."""
+        if self.trace is None:
+            return self.recording.place(index)
+        return f"attitude {index + 1} ({self.start[index]:.1f} to {self.stop[index]:.1f} s)"
+
+    def times(self) -> str:
+        """Return when the attitudes were found, for a message."""
+        shown = [f"{a:.0f}-{b:.0f} s" for a, b in zip(self.start[:12], self.stop[:12], strict=True)]
+        return ", ".join(shown) + (", ..." if len(self) > 12 else "")

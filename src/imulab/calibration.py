@@ -1,0 +1,275 @@
+"""The calibration record: what a procedure found, with uncertainty, provenance and the data behind its figures.
+
+A record is JSON, one procedure a file. It is written whole or not at all, holds finite numbers only, and carries
+a SHA-256 of each source file and of its own content, so that an altered record is noticed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab._version import VERSION
+from imulab.errors import RecordError
+from imulab.files import write_text
+from imulab.recording import Source
+
+FORMAT = "imulab.calibration"
+SCHEMA_VERSION = 1
+PROCEDURES = ("tumble", "gyro_array", "warmup", "centrifuge")
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A value with its standard uncertainty (None where none can be stated) and its SI or output unit."""
+
+    value: float
+    standard_uncertainty: float | None
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Covariance:
+    """Covariance matrix of the parameters in the order of `names`, in products of their units."""
+
+    names: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    def array(self) -> NDArray[np.float64]:
+        """Return the matrix, shape (p, p)."""
+        return np.array(self.matrix, dtype=np.float64).reshape(len(self.names), len(self.names))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One calibration of one unit by one procedure.
+
+    Attributes
+    ----------
+    procedure
+        ``tumble``, ``gyro_array``, ``warmup`` or ``centrifuge``.
+    parameters
+        Name to value, standard uncertainty and unit.
+    covariance
+        Of all parameters that have an uncertainty.
+    model, options, data, fit
+        What was fitted, with which options, the data behind the figures, and how well it fitted.
+    sensor, created, software, sources
+        Provenance.
+    warnings
+        What a user of the record must know, a sentence each.
+    sections
+        Further top-level keys that a procedure adds (``table``, ``elements``, ``levels``, ``runs`` ...).
+    version
+        Version of the schema that the record was read from.
+    """
+
+    procedure: str
+    parameters: Mapping[str, Parameter]
+    covariance: Covariance
+    model: Mapping[str, Any]
+    fit: Mapping[str, Any]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    data: Mapping[str, Any] = field(default_factory=dict)
+    sensor: Mapping[str, str] = field(default_factory=dict)
+    sources: tuple[Source, ...] = ()
+    warnings: tuple[str, ...] = ()
+    created: str = field(default_factory=lambda: datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"))
+    software: str = f"imulab {VERSION}"
+    sections: Mapping[str, Any] = field(default_factory=dict)
+    version: int = SCHEMA_VERSION
+
+    def value(self, name: str) -> float:
+        """Return the value of a parameter."""
+        return self.parameters[name].value
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the record as plain JSON values, ``content_sha256`` included.
+
+        Raises
+        ------
+        RecordError
+            A number is not finite.
+        """
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            "version": self.version,
+            "procedure": self.procedure,
+            "sensor": dict(self.sensor),
+            "created": self.created,
+            "software": self.software,
+            "sources": [asdict(source) for source in self.sources],
+            "model": self.model,
+            "parameters": {name: asdict(parameter) for name, parameter in self.parameters.items()},
+            "covariance": asdict(self.covariance),
+            "options": self.options,
+            "fit": self.fit,
+            "warnings": list(self.warnings),
+            **self.sections,
+            "data": self.data,
+        }
+        plain: dict[str, Any] = _plain(content, "")
+        return {**plain, "content_sha256": content_sha256(plain)}
+
+    def to_json(self) -> str:
+        """Return the record as JSON text."""
+        return json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write the record, whole or not at all.
+
+        Raises
+        ------
+        RecordError
+            A number is not finite.
+        OptionError
+            The file cannot be written there.
+        """
+        write_text(path, self.to_json())
+
+    def __str__(self) -> str:
+        lines = [f"{self.procedure} calibration of {self.sensor.get('serial', 'a unit without serial number')}"]
+        for name, p in self.parameters.items():
+            uncertainty = "" if p.standard_uncertainty is None else f" ± {p.standard_uncertainty:.2g}"
+            lines.append(f"  {name} = {p.value:.9g}{uncertainty} {p.unit}")
+        return "\n".join(lines)
+
+
+def load(path: str | Path) -> Calibration:
+    """Read a calibration record.
+
+    Raises
+    ------
+    RecordError
+        The file is missing, is no record, is of a newer version, was altered, or lacks something.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise RecordError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+    return loads(data, str(path))
+
+
+def loads(data: bytes, name: str) -> Calibration:
+    """Read a calibration record from the bytes of its file; errors as for `load`."""
+    try:
+        content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as error:
+        reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
+        raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')
+    version = content.get("version")
+    if type(version) is not int or version < 1:
+        raise RecordError(f"{name}: expected a version number from 1, found {version!r}")
+    if version > SCHEMA_VERSION:
+        raise RecordError(
+            f"{name}: record version {version} is newer than version {SCHEMA_VERSION}, "
+            f"which imulab {VERSION} reads: update imulab"
+        )
+    stated = content.pop("content_sha256", None)
+    if stated is None:
+        raise RecordError(f"{name}: the record has no content_sha256: it was altered after it was written")
+    try:
+        found = content_sha256(content)
+    except ValueError as error:  # a number beyond the range of a double, or text that is no Unicode
+        raise RecordError(f"{name}: the record was altered after it was written ({error})") from None
+    if stated != found:
+        raise RecordError(f"{name}: the record was altered after it was written (its content_sha256 does not match)")
+    return _validated(content, name)
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of the record's JSON without ``content_sha256``: keys sorted, no spaces, UTF-8."""
+    text = json.dumps(
+        {key: value for key, value in content.items() if key != "content_sha256"},
+        sort_keys=True,
+        separators=(",", ":"),
+        ensure_ascii=False,
+        allow_nan=False,
+    )
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+@cache
+def _adapter() -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Calibration)
+
+
+def _validated(content: dict[str, Any], name: str) -> Calibration:
+    from pydantic import ValidationError
+
+    known = {f.name for f in fields(Calibration)} - {"sections"}
+    sections = {key: value for key, value in content.items() if key not in known and key != "format"}
+    for key in (
+        "procedure",
+        "sensor",
+        "created",
+        "software",
+        "sources",
+        "model",
+        "parameters",
+        "covariance",
+        "fit",
+    ):
+        if key not in content:
+            raise RecordError(f"{name}: the record lacks {key!r}")
+    try:
+        record: Calibration = _adapter().validate_python(
+            {key: value for key, value in content.items() if key in known} | {"sections": sections}
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise RecordError(f"{name}: {where}: {first['msg']}, found {_short(first['input'])}") from None
+    if record.procedure not in PROCEDURES:
+        raise RecordError(f"{name}: unknown procedure {record.procedure!r}; known procedures: {' '.join(PROCEDURES)}")
+    size = len(record.covariance.names)
+    if len(record.covariance.matrix) != size or any(len(row) != size for row in record.covariance.matrix):
+        raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
+    return record
+
+
+def _plain(value: Any, where: str) -> Any:
+    """Return `value` as plain JSON types; refuse numbers that are not finite."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    elif isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        raise RecordError(f"record: {where.lstrip('.')} is {value}; a record holds finite numbers only")
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(item, f"{where}[{index}]") for index, item in enumerate(value)]
+    return value
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        raise ValueError("a key appears twice")
+    return content
+
+
+def _refuse_constant(text: str) -> None:
+    raise ValueError(f"{text} is not a finite number")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,67 @@
+"""The command line: `main` runs a command and turns every mistake in the input into one line and exit status 2."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+_INTERRUPTED_PIPE = 141  # 128 + SIGPIPE, as a shell reports it
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``imulab`` with the given arguments (those of the process by default) and return the exit status."""
+    from typer.exceptions import TyperException
+
+    from imulab.cli.app import command
+    from imulab.errors import ImulabError
+
+    try:
+        status = command().main(args=arguments, prog_name="imulab", standalone_mode=False)
+        sys.stdout.flush()
+    except ImulabError as error:
+        return _refuse(str(error))
+    except TyperException as error:
+        return _refuse(_usage(error))
+    except (BrokenPipeError, SystemExit):
+        # The reader of the output has gone; nothing more can be said there.
+        sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
+        return _INTERRUPTED_PIPE
+    except KeyboardInterrupt:
+        return 130
+    except Exception as error:
+        if os.environ.get("IMULAB_DEBUG"):
+            raise
+        print(
+            f"imulab: internal error: {type(error).__name__}: {_one_line(str(error))} "
+            "(a fault of imulab; IMULAB_DEBUG=1 shows where)",
+            file=sys.stderr,
+        )
+        return 1
+    return status if isinstance(status, int) else 0
+
+
+def run() -> None:
+    """Entry point of the installed command."""
+    sys.exit(main())
+
+
+def _refuse(message: str) -> int:
+    print(f"imulab: {_one_line(message)}", file=sys.stderr)
+    return 2
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _usage(error: object) -> str:
+    """Return a usage error as one line that says what there is instead."""
+    message = _one_line(str(error.format_message()))  # type: ignore[attr-defined]
+    context = getattr(error, "ctx", None)
+    if context is None:
+        return message
+    known = getattr(context.command, "commands", None)
+    if known and "command" in message.lower():
+        return f"{message.rstrip('.')}; known commands: {' '.join(known)}"
+    return f"{message.rstrip('.')}; see '{context.command_path} --help'"

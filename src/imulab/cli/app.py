@@ -1,0 +1,42 @@
+"""The tree of commands."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from imulab._version import VERSION
+from imulab.cli import records, tumble
+
+_SETTINGS: dict[str, Any] = {
+    "no_args_is_help": True,
+    "add_completion": False,
+    "rich_markup_mode": None,
+    "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100},
+}
+
+
+def command() -> Any:
+    """Return the root command."""
+    app = typer.Typer(help="From recordings of inertial sensors to calibration records and reports.", **_SETTINGS)
+    app.callback()(_root)
+    app.add_typer(
+        tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
+    )
+    records.add_commands(app)
+    return typer.main.get_command(app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"imulab {VERSION}")
+        raise typer.Exit
+
+
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """From recordings of inertial sensors to calibration records and reports."""

@@ -1,0 +1,65 @@
+"""What several commands take, and how texts on the command line become values."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from imulab.errors import OptionError, UnitError
+from imulab.units import parse_unit, to_si
+
+RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
+RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
+LayoutFile = Annotated[str | None, typer.Option("--layout", metavar="L.toml", help="Columns of a foreign file.")]
+OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
+ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
+
+
+def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
+    """Return a text such as ``0.7mg`` or ``5 s`` in SI.
+
+    Raises
+    ------
+    OptionError
+        It is no number with a unit of this kind.
+    """
+    match = _QUANTITY.fullmatch(text)
+    expected = f"{option} {text!r}: expected a number with a unit of {kind}, such as 1 {default_unit}"
+    if match is None:
+        raise OptionError(expected)
+    try:
+        unit = parse_unit(match[2].strip() if match[2] else default_unit)
+    except UnitError as error:
+        raise OptionError(f"{option} {text!r}: {error}") from None
+    if unit.quantity != kind:
+        raise OptionError(expected)
+    return to_si(float(match[1]), unit.symbol)
+
+
+def refuse_overwriting(outputs: list[str | None], inputs: list[str]) -> None:
+    """Check that no output is an input, nor two outputs the same file.
+
+    Raises
+    ------
+    OptionError
+        One would overwrite another.
+    """
+    taken = {Path(name).resolve(): name for name in inputs if name != "-"}
+    for name in outputs:
+        if name is None:
+            continue
+        if Path(name).resolve() in taken:
+            raise OptionError(f"{name}: would overwrite {taken[Path(name).resolve()]}; expected another name")
+        taken[Path(name).resolve()] = name
+
+
+def warn(message: str) -> None:
+    """Print one line on standard error."""
+    print(f"imulab: warning: {message}", file=sys.stderr)

@@ -1,0 +1,114 @@
+"""Commands on records and recordings of every procedure: apply, show, report, demo."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, refuse_overwriting, warn
+from imulab.errors import OptionError, ReadError
+
+if TYPE_CHECKING:
+    from imulab.calibration import Calibration
+    from imulab.recording import Recording
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Add these commands to the root."""
+    for name, function in (("apply", apply), ("show", show), ("report", report), ("demo", demo)):
+        app.command(name)(function)
+
+
+def apply(
+    files: Annotated[list[str], typer.Argument(metavar="RECORD... FILE", help="Records, then the recording.")],
+    layout: LayoutFile = None,
+    output: OutputFile = None,
+) -> None:
+    """Correct a recording by one or more records, in the order given; native CSV to OUT or standard output."""
+    from imulab.apply import apply_blocks
+    from imulab.calibration import load
+    from imulab.readers import read_blocks
+    from imulab.writers import write_csv, write_csv_to
+
+    if len(files) < 2:
+        raise OptionError("apply: expected at least one RECORD and the FILE to correct")
+    *names, file = files
+    refuse_overwriting([output], files)
+    records = [load(name) for name in names]
+    blocks = apply_blocks(records, _warned(records, read_blocks(file, layout)))
+    if output:
+        write_csv(blocks, output)
+    else:
+        # The first block is corrected before anything is written, so that a refusal leaves no head behind.
+        first = next(iter(blocks))
+        write_csv_to(chain([first], blocks), sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+
+
+def _warned(records: list[Calibration], blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Pass blocks on; say once, at the first, what a user should know."""
+    from imulab.apply import warnings_of
+
+    for number, block in enumerate(blocks):
+        if number == 0:
+            for message in dict.fromkeys(message for record in records for message in warnings_of(record, block)):
+                warn(message)
+        yield block
+
+
+def show(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Record or recording.")],
+    layout: LayoutFile = None,
+    json: AsJson = False,
+) -> None:
+    """Say what is in a record or a recording."""
+    from imulab.calibration import load
+    from imulab.cli.show import describe_record, describe_recording
+    from imulab.readers import read
+
+    if layout is None and _is_json(file):
+        record = load(file)
+        print(record.to_json() if json else describe_record(record))
+        return
+    if json:
+        raise OptionError(f"{file}: --json prints records; expected a record")
+    print(describe_recording(read(file, layout)))
+
+
+def _is_json(file: str) -> bool:
+    if file == "-":
+        return False
+    try:
+        with Path(file).open("rb") as stream:
+            return stream.read(64).lstrip().startswith(b"{")
+    except FileNotFoundError:
+        raise ReadError(f"{file}: no such file") from None
+    except OSError as error:
+        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
+
+
+def report(
+    file: RecordFile,
+    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.html", help="Report to write.")],
+) -> None:
+    """Draw the report of a record."""
+    from imulab.calibration import load
+    from imulab.present import write_report
+
+    refuse_overwriting([output], [file])
+    write_report(load(file), output)
+    print(f"report: {output}")
+
+
+def demo(
+    folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Folder to write to.")] = "demo",
+) -> None:
+    """Run the procedures on simulated rigs and write recordings, records, corrected data and reports."""
+    from imulab.demo import run
+
+    print(run(folder))

@@ -1,0 +1,141 @@
+"""``imulab tumble``: simulate and fit."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from imulab.cli.options import (
+    AsJson,
+    LayoutFile,
+    OutputFile,
+    RecordingFile,
+    ReportFile,
+    quantity,
+    refuse_overwriting,
+    warn,
+)
+from imulab.errors import OptionError
+
+if TYPE_CHECKING:
+    from imulab.tumble.record import Gravity
+
+
+def commands(settings: dict[str, Any]) -> typer.Typer:
+    """Return the group of commands."""
+    group = typer.Typer(**settings)
+    group.command("simulate")(simulate)
+    group.command("fit")(fit)
+    return group
+
+
+def simulate(
+    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.csv", help="Recording to write.")],
+    attitudes: Annotated[int, typer.Option(help="Number of static attitudes.")] = 24,
+    order: Annotated[int, typer.Option(help="Order of the true nonlinearity, 1 to 5.")] = 2,
+    rate: Annotated[str, typer.Option(help="Sample rate.")] = "100 Hz",
+    hold: Annotated[str, typer.Option(help="Duration of an attitude.")] = "5 s",
+    move: Annotated[str, typer.Option(help="Duration of the motion between two.")] = "2 s",
+    noise: Annotated[str, typer.Option(help="Standard deviation of one sample.")] = "0.7 mg",
+    unit: Annotated[str, typer.Option(help="Unit of the outputs: m/s^2 g mg count V.")] = "m/s^2",
+    gravity: Annotated[float | None, typer.Option(help="Local gravity, m/s^2.")] = None,
+    knock: Annotated[int | None, typer.Option(help="Number of an attitude that is knocked.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the random numbers.")] = 1,
+) -> None:
+    """Simulate a tumble recording of a random MEMS triad, with its truth in the head of the file."""
+    from imulab.tumble.simulate import simulate_tumble
+    from imulab.units import STANDARD_GRAVITY
+    from imulab.writers import write_csv
+
+    recording = simulate_tumble(
+        attitudes=attitudes,
+        order=order,
+        sample_rate=quantity(rate, "--rate", "frequency", "Hz"),
+        hold=quantity(hold, "--hold", "time", "s"),
+        move=quantity(move, "--move", "time", "s"),
+        noise=quantity(noise, "--noise", "acceleration", "mg"),
+        unit=unit,
+        gravity=STANDARD_GRAVITY if gravity is None else gravity,
+        knock=knock,
+        seed=seed,
+    )
+    write_csv(recording, output)
+    print(f"{output}: {len(recording)} samples, {attitudes} attitudes, serial {recording.metadata['serial']}")
+
+
+def fit(
+    file: RecordingFile,
+    layout: LayoutFile = None,
+    order: Annotated[str, typer.Option(help="auto, or 1 to 5.")] = "auto",
+    method: Annotated[str, typer.Option(help="norm or linearised.")] = "norm",
+    loss: Annotated[str, typer.Option(help="square, or huber against single disturbed attitudes.")] = "square",
+    gravity: Annotated[float | None, typer.Option(help="Local gravity, m/s^2.")] = None,
+    latitude: Annotated[float | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
+    height: Annotated[float | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Calibrate an accelerometer triad from a recording, or from a table of attitudes (no time column).
+
+    Prints what was found; -o writes the calibration record, --report its figures.
+    """
+    from imulab.files import replacing
+    from imulab.present import exhibits_of
+    from imulab.readers import read
+    from imulab.report import render
+    from imulab.segment import find_attitudes
+    from imulab.tumble.fit import fit_tumble
+
+    refuse_overwriting([output, report], [file] + ([layout] if layout else []))
+    local = _gravity(gravity, latitude, height)
+    result = fit_tumble(
+        find_attitudes(read(file, layout)),
+        order=_order(order),
+        gravity=local,
+        method=method,
+        loss=loss,
+    )
+    record = result.calibration
+    with ExitStack() as stack:
+        # Both files are opened before either is finished, so that neither is left alone behind an error.
+        to_record = stack.enter_context(replacing(output)) if output else None
+        to_report = stack.enter_context(replacing(report)) if report else None
+        if to_record:
+            to_record.write(record.to_json().encode("utf-8"))
+        if to_report:
+            to_report.write(render(record, exhibits_of(record)).encode("utf-8"))
+    if json:
+        print(record.to_json(), end="")
+        return
+    from imulab.cli.show import describe_record
+
+    print(describe_record(record, provenance=False))
+    for name, what in ((output, "record"), (report, "report")):
+        if name:
+            print(f"{what}: {name}")
+    for message in record.warnings:
+        warn(message)
+
+
+def _order(text: str) -> int | str:
+    return int(text) if text.isdecimal() and len(text) < 3 else text
+
+
+def _gravity(gravity: float | None, latitude: float | None, height: float | None) -> Gravity | float | None:
+    from imulab.gravity import normal_gravity
+    from imulab.tumble.record import Gravity
+
+    if gravity is not None:
+        if latitude is not None or height is not None:
+            raise OptionError("--gravity together with --latitude or --height: expected one or the other")
+        return gravity
+    if latitude is None:
+        if height is not None:
+            raise OptionError("--height without --latitude: expected both")
+        return None
+    value = normal_gravity(math.radians(latitude), height or 0.0)
+    return Gravity(value, f"normal gravity at latitude {latitude:g} deg, height {height or 0.0:g} m (WGS 84)")

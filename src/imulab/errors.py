@@ -1,0 +1,37 @@
+"""The errors that imulab raises for what a person can get wrong.
+
+Every message is one line that names the place (file, column, row or time), what was expected and what was
+found. The command line prints the message alone and exits with 2.
+"""
+
+
+class ImulabError(Exception):
+    """Base of all errors that name a mistake in the input rather than in imulab."""
+
+
+class ReadError(ImulabError):
+    """A file cannot be read as what it should be."""
+
+
+class UnitError(ImulabError):
+    """A unit is unknown, or cannot be converted to the one that is needed."""
+
+
+class RecordError(ImulabError):
+    """A calibration record is damaged, of a newer version, or no record at all."""
+
+
+class DataError(ImulabError):
+    """The samples cannot be what they are said to be: not finite, clipped, dead axis, time running backwards."""
+
+
+class SegmentError(ImulabError):
+    """The recording does not hold the static attitudes, runs or cycles that the procedure needs."""
+
+
+class ObservabilityError(ImulabError):
+    """The attitudes cannot separate the parameters of the model; the message names them."""
+
+
+class OptionError(ImulabError):
+    """An option has a value that cannot be used; the message lists what can."""

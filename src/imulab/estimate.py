@@ -1,0 +1,290 @@
+"""Weighted nonlinear least squares for many small problems at once, and what can be said of their results.
+
+The leading axis of every array counts independent problems: one fit is a batch of one, leave-one-out is a batch of
+n with one weight each set to zero, Monte Carlo a batch of trials. There is no Python loop over problems.
+
+Sources: Moré, The Levenberg-Marquardt algorithm, LNM 630 (1978) 105; Huber, Robust Statistics (1981), 7.6-7.10;
+Mandel and Paule, Analytical Chemistry 42 (1970) 1194 (excess variance); Belsley, Kuh, Welsch, Regression
+Diagnostics (1980) (scaled condition number).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.recording import Array
+
+Index = NDArray[np.intp]
+Model = Callable[[Array, Index], tuple[Array, Array]]
+"""(parameters (k, p), indices of the k problems) -> residuals (k, n), Jacobian (k, n, p)."""
+
+_HUBER = 1.345
+"""95 % efficiency for normal errors (Huber 1981)."""
+_MAX_DAMPING = 1e12
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Least-squares solutions of a batch of problems.
+
+    Attributes
+    ----------
+    parameters
+        Shape (b, p).
+    residuals, jacobian
+        Unweighted, at the solution, shapes (b, n) and (b, n, p).
+    weights
+        As used, shape (b, n).
+    iterations
+        Number of steps tried, shape (b,).
+    converged
+        Whether the last step was below the tolerance, shape (b,).
+    """
+
+    parameters: Array
+    residuals: Array
+    jacobian: Array
+    weights: Array
+    iterations: NDArray[np.int64]
+    converged: NDArray[np.bool_]
+
+
+def levenberg_marquardt(
+    model: Model, start: Array, weights: Array, *, tolerance: float = 1e-9, max_iterations: int = 60
+) -> Fit:
+    """Minimise ``sum_i w_i r_i(p)^2`` for each problem of a batch.
+
+    A Gauss-Newton step is tried first; damping enters only when a step does not lower the cost, so that convergence
+    stays quadratic where residuals are small.
+
+    Parameters
+    ----------
+    model
+        Residuals and Jacobian; parameters must be scaled so that steps of `tolerance` do not matter.
+    start
+        Start parameters, shape (b, p).
+    weights
+        Inverse variances, shape (b, n); zero leaves an observation out.
+    tolerance
+        Largest step of any parameter that counts as converged.
+    max_iterations
+        Steps tried before a problem is given up as not converged.
+
+    Returns
+    -------
+    Fit
+    """
+    parameters = np.array(start, dtype=np.float64)
+    count = len(parameters)
+    everything = np.arange(count)
+    residuals, jacobian = model(parameters, everything)
+    residuals, jacobian = np.array(residuals), np.array(jacobian)
+    cost = np.einsum("bn,bn,bn->b", weights, residuals, residuals)
+    damping = np.zeros(count)
+    iterations = np.zeros(count, dtype=np.int64)
+    converged = np.zeros(count, dtype=np.bool_)
+    active = everything
+    for _ in range(max_iterations):
+        weighted = jacobian[active] * weights[active, :, None]
+        normal = np.matmul(weighted.transpose(0, 2, 1), jacobian[active])
+        gradient = np.einsum("bnp,bn->bp", weighted, residuals[active])
+        step = _damped_step(normal, gradient, damping[active])
+        trial = parameters[active] + step
+        with np.errstate(all="ignore"):
+            new_residuals, new_jacobian = model(trial, active)
+            new_cost = np.einsum("bn,bn,bn->b", weights[active], new_residuals, new_residuals)
+        small = np.abs(step).max(axis=1) <= tolerance
+        # Near the minimum the cost is flat to rounding: a small step that changes nothing is an arrival.
+        better = new_cost <= cost[active] * (1 + 1e-12 * small)
+        iterations[active] += 1
+        taken = active[better]
+        parameters[taken], residuals[taken] = trial[better], new_residuals[better]
+        jacobian[taken], cost[taken] = new_jacobian[better], new_cost[better]
+        relaxed = damping[taken] / 10
+        damping[taken] = np.where(relaxed < 1e-9, 0.0, relaxed)
+        failed = active[~better]
+        damping[failed] = np.maximum(10 * damping[failed], 1e-6)
+        converged[active] = small & (better | (damping[active] <= 1e-6))
+        active = active[~converged[active] & (damping[active] < _MAX_DAMPING)]
+        if not active.size:
+            break
+    return Fit(parameters, residuals, jacobian, np.asarray(weights), iterations, converged)
+
+
+def _damped_step(normal: Array, gradient: Array, damping: Array) -> Array:
+    """Solve ``(H + damping diag H) step = -g`` in scaled parameters; a singular H gets the smallest useful damping."""
+    scale = np.sqrt(np.maximum(np.einsum("bpp->bp", normal), np.finfo(float).tiny))
+    scaled = normal / (scale[:, :, None] * scale[:, None, :])
+    size = scaled.shape[1]
+    scaled[:, range(size), range(size)] += np.maximum(damping, 1e-15)[:, None]
+    right = (-gradient / scale)[:, :, None]
+    try:
+        solution = np.linalg.solve(scaled, right)
+    except np.linalg.LinAlgError:
+        scaled[:, range(size), range(size)] += 1e-8
+        solution = np.linalg.solve(scaled, right)
+    step: Array = solution[:, :, 0] / scale
+    return step
+
+
+def covariance(jacobian: Array, weights: Array) -> Array:
+    """Return ``(J' W J)^-1`` of each problem, shape (b, p, p), through a QR decomposition of sqrt(W) J."""
+    weighted = jacobian * np.sqrt(weights)[:, :, None]
+    scale = np.maximum(np.linalg.norm(weighted, axis=1), np.finfo(float).tiny)
+    r = np.linalg.qr(weighted / scale[:, None, :], mode="r")
+    inverse = np.linalg.inv(r) / scale[:, :, None]
+    result: Array = inverse @ inverse.transpose(0, 2, 1)
+    return result
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What one problem's observations can tell apart, from the singular values of its scaled Jacobian.
+
+    Attributes
+    ----------
+    rank
+        Number of independent combinations of parameters that the observations determine.
+    condition
+        Largest over smallest singular value of the weighted Jacobian with columns scaled to length 1.
+    blind
+        Combinations that are not determined, as unit vectors in the parameters, shape (p - rank, p).
+    weakest
+        The combination that is determined worst, shape (p,).
+    """
+
+    rank: int
+    condition: float
+    blind: Array
+    weakest: Array
+
+    def confused(self, names: list[str]) -> list[str]:
+        """Return the parameters in the undetermined combinations (or in the weakest), by their share."""
+        vectors = self.blind if len(self.blind) else self.weakest[None]
+        share = np.sqrt((vectors**2).sum(axis=0))
+        return [names[i] for i in np.argsort(-share, kind="stable") if share[i] > 0.2 * share.max()]
+
+
+_WORST_CONDITION = 2000.0
+_WORST_CURVATURE = 2.0
+
+
+def observability(jacobian: Array, weights: Array) -> Observability:
+    """Judge what the observations of one problem, Jacobian (n, p) and weights (n,), can tell apart.
+
+    A combination of parameters counts as determined when its singular value is above 1/2000 of the largest, and when
+    the observations fix it to first order: where its standard uncertainty is so large that the second-order change
+    of the observations, half its square, exceeds twice their noise, any value within a wide range fits as well.
+    Parameters must be scaled so that the model's second derivatives are of order one.
+    """
+    used = weights > 0
+    size = jacobian.shape[1]
+    weighted = np.zeros((max(int(used.sum()), size), size))
+    weighted[: int(used.sum())] = jacobian[used] * np.sqrt(weights[used])[:, None]
+    scale = np.linalg.norm(weighted, axis=0)
+    scale = np.where(scale > 0, scale, np.finfo(float).tiny)
+    _, values, vectors = np.linalg.svd(weighted / scale, full_matrices=False)
+    values = np.maximum(values, np.finfo(float).eps * values[0])
+    directions = vectors / scale
+    length = np.linalg.norm(directions, axis=1)
+    uncertainty = length / values
+    noise = 1 / np.sqrt(np.median(weights[used]))
+    determined = (values > values[0] / _WORST_CONDITION) & (uncertainty**2 / 2 < _WORST_CURVATURE * noise)
+    return Observability(
+        rank=int(determined.sum()),
+        condition=float(values[0] / values[-1]),
+        blind=(directions / length[:, None])[~determined],
+        weakest=directions[-1] / length[-1],
+    )
+
+
+def leverage(jacobian: Array, weights: Array) -> Array:
+    """Return the diagonal of each hat matrix, shape (b, n)."""
+    weighted = jacobian * np.sqrt(weights)[:, :, None]
+    scale = np.maximum(np.linalg.norm(weighted, axis=1), np.finfo(float).tiny)
+    q = np.linalg.qr(weighted / scale[:, None, :])[0]
+    result: Array = np.einsum("bnp,bnp->bn", q, q)
+    return result
+
+
+def huber_weights(standardised: Array) -> Array:
+    """Return ``min(1, c / |z|)`` for residuals in units of their standard deviation."""
+    weights: Array = np.minimum(1.0, _HUBER / np.maximum(np.abs(standardised), 1e-300))
+    return weights
+
+
+def huber_inflation(standardised: Array, size: int) -> Array:
+    """Return the factor of the covariance of a Huber estimate, shape (b,).
+
+    ``K^2 [sum psi^2 / (n - p)] / [mean psi']^2`` (Huber 1981, 7.6.12) with residuals in units of their standard
+    deviation; multiplies ``(J' W J)^-1`` with the weights before down-weighting.
+    """
+    count = standardised.shape[1]
+    inside = np.abs(standardised) <= _HUBER
+    psi = np.clip(standardised, -_HUBER, _HUBER)
+    slope = np.maximum(inside.mean(axis=1), 1.0 / count)
+    correction = 1 + size / count * (1 - slope) / slope
+    factor: Array = correction**2 * (psi**2).sum(axis=1) / max(count - size, 1) / slope**2
+    return factor
+
+
+def excess_variance(residuals: Array, variance: Array, freedom: int) -> Array:
+    """Return the variance that must be added to each observation's own for chi-square to equal its expectation.
+
+    Mandel-Paule: the root tau^2 >= 0 of ``sum r^2 / (variance + tau^2) = freedom``, by Newton from below (the sum is
+    convex and falling). Residuals and variances have shape (b, n), the result (b,).
+    """
+    squares = residuals**2
+    tau = np.zeros(len(residuals))
+    for _ in range(60):
+        total = variance + tau[:, None]
+        excess = (squares / total).sum(axis=1) - freedom
+        step = np.maximum(excess, 0.0) / np.maximum((squares / total**2).sum(axis=1), np.finfo(float).tiny)
+        tau = tau + step
+        if not np.any(step > 1e-6 * tau):
+            break
+    return tau
+
+
+def robust_scale(standardised: Array, size: int) -> Array:
+    """Return the scale of standardised residuals from their median absolute value, shape (b,)."""
+    count = standardised.shape[1]
+    scale: Array = 1.4826 * np.median(np.abs(standardised), axis=1) * np.sqrt(count / max(count - size, 1))
+    return scale
+
+
+def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: int) -> float:
+    """Return the probability of so large a gain if the larger of two nested models were no better (F-test)."""
+    from scipy.special import fdtrc
+
+    if larger_size >= count:
+        return 1.0
+    gain = (cost - larger_cost) / (larger_size - size)
+    noise = larger_cost / (count - larger_size)
+    if noise <= 0:
+        return 0.0 if gain > 0 else 1.0
+    return float(fdtrc(larger_size - size, count - larger_size, max(gain / noise, 0.0)))
+
+
+def bayesian_information(cost: float, size: int, count: int) -> float:
+    """Return ``n ln(cost / n) + p ln n`` (Schwarz 1978, noise level unknown)."""
+    return float(count * np.log(max(cost, np.finfo(float).tiny) / count) + size * np.log(count))
+
+
+def chi_square_limit(freedom: int, probability: float = 1e-3) -> float:
+    """Return the value that chi-square exceeds with the given probability; infinite without degrees of freedom."""
+    from scipy.special import chdtri
+
+    return float(chdtri(freedom, probability)) if freedom > 0 else float("inf")
+
+
+def coverage_factor(freedom: float | None, probability: float = 0.95) -> float:
+    """Return the two-sided coverage factor: Student's t, or the normal quantile where `freedom` is None."""
+    from scipy.special import ndtri, stdtrit
+
+    tail = 0.5 + probability / 2
+    return float(ndtri(tail) if freedom is None else stdtrit(freedom, tail))

@@ -1,0 +1,42 @@
+"""Records to reports: picks the procedure's exhibits and hands them to the layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from imulab import report
+from imulab.calibration import Calibration
+from imulab.errors import RecordError
+from imulab.exhibit import Exhibits
+from imulab.tumble import figures as tumble
+
+_EXHIBITS = {"tumble": tumble.exhibits}
+
+
+def exhibits_of(record: Calibration) -> Exhibits:
+    """Return the figures and tables of a record.
+
+    Raises
+    ------
+    RecordError
+        There are none for its procedure, or the record lacks the data that they need.
+    """
+    if record.procedure not in _EXHIBITS:
+        raise RecordError(f"no report for a {record.procedure} record; known procedures: {' '.join(_EXHIBITS)}")
+    try:
+        return _EXHIBITS[record.procedure](record)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise RecordError(f"the record lacks data that its report needs ({error!r})") from None
+
+
+def write_report(record: Calibration, path: str | Path) -> None:
+    """Write the report of a record as one HTML file that opens without a network.
+
+    Raises
+    ------
+    RecordError
+        The record lacks the data that its figures need.
+    OptionError
+        The file cannot be written there.
+    """
+    report.write(record, exhibits_of(record), path)

@@ -1,0 +1,84 @@
+"""Files to recordings: one module per family of formats, one dispatch."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from imulab.errors import ReadError
+from imulab.readers.layout import Layout, load_layout
+from imulab.readers.text import TextFile
+from imulab.recording import Recording, Source
+
+__all__ = ["Layout", "load_layout", "read", "read_blocks"]
+
+
+def read(file: str | Path, layout: str | Path | Layout | None = None) -> Recording:
+    """Read a recording as a whole.
+
+    Parameters
+    ----------
+    file
+        Path of the file; ``-`` reads standard input.
+    layout
+        How to read a file that is not native CSV: the path of a layout file, or a `Layout`.
+
+    Returns
+    -------
+    Recording
+        With its source's name and SHA-256.
+
+    Raises
+    ------
+    ReadError, UnitError
+        The file cannot be read; the message names file, row and column.
+    """
+    with _open(file) as stream:
+        text = TextFile(stream, _name(file), _layout(layout))
+        blocks = list(text.blocks())
+        source = Source(_name(file), text.sha256())
+    first = blocks[0]
+    joined = {name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns}
+    return Recording(
+        columns=joined if len(blocks) > 1 else first.columns,
+        units=first.units,
+        metadata=first.metadata,
+        name=first.name,
+        source=source,
+        lines_before=first.lines_before,
+        notes=first.notes,
+    )
+
+
+def read_blocks(file: str | Path, layout: str | Path | Layout | None = None) -> Iterator[Recording]:
+    """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
+
+    Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
+    """
+    with _open(file) as stream:
+        yield from TextFile(stream, _name(file), _layout(layout)).blocks()
+
+
+def _name(file: str | Path) -> str:
+    return "standard input" if str(file) == "-" else str(file)
+
+
+def _layout(layout: str | Path | Layout | None) -> Layout | None:
+    return load_layout(layout) if isinstance(layout, str | Path) else layout
+
+
+def _open(file: str | Path) -> BinaryIO:
+    if str(file) == "-":
+        return sys.stdin.buffer
+    try:
+        return Path(file).open("rb")
+    except FileNotFoundError:
+        raise ReadError(f"{file}: no such file") from None
+    except IsADirectoryError:
+        raise ReadError(f"{file}: expected a file, found a folder") from None
+    except OSError as error:
+        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None

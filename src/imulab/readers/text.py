@@ -1,0 +1,208 @@
+"""Delimited text: native CSV, and foreign text through a layout.
+
+Native CSV has comment lines ``# key: value`` at the head, one line of titles ``name [unit]``, and rows of numbers.
+The numbers are read by the C module `_text` in blocks of whole lines.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from typing import BinaryIO
+
+import numpy as np
+
+from imulab.errors import ReadError
+from imulab.readers import _text
+from imulab.readers.layout import Layout
+from imulab.recording import Recording, parse_column_title
+
+_BLOCK_BYTES = 1 << 24
+_LONGEST_LINE = 1 << 20
+
+
+class TextFile:
+    """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
+
+    def __init__(self, stream: BinaryIO, name: str, layout: Layout | None) -> None:
+        self._stream = stream
+        self._name = name
+        self._layout = layout
+        self._hash = hashlib.sha256()
+        self._rest = b""
+        self._ended = False
+        self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
+        self._lines_before = 0
+        self._read_more()
+        if not self._rest.strip():
+            raise ReadError(f"{name}: the file is empty")
+        if b"\0" in self._rest[:4096]:
+            raise ReadError(f"{name}: expected text, found binary data")
+        self._delimiter = layout.delimiter if layout else ","
+        self._blanks = b" \r\n" if self._delimiter == "\t" else b" \t\r\n"
+        self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the bytes read so far, hexadecimal."""
+        return self._hash.hexdigest()
+
+    def blocks(self) -> Iterator[Recording]:
+        """Yield the rows as recordings; there is at least one row, or the file is refused."""
+        row = 1
+        while True:
+            block = self._next_lines()
+            if block is None:
+                break
+            recording = self._parse(block, row)
+            row += len(recording)
+            yield recording
+        if row == 1:
+            raise ReadError(f"{self._name}: no rows of data below the header")
+
+    # --- bytes -------------------------------------------------------------------------------------------------
+
+    def _read_more(self) -> None:
+        try:
+            data = self._stream.read(_BLOCK_BYTES)
+        except OSError as error:
+            raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
+        self._ended = not data
+        self._hash.update(data)
+        self._rest += data
+
+    def _next_lines(self) -> bytes | None:
+        """Return whole lines of about a block's size, without blank lines at the end of the file."""
+        while not self._ended:
+            end = self._rest.rfind(b"\n") + 1
+            if end:
+                lines, self._rest = self._rest[:end], self._rest[end:]
+                # Blank lines may be the end of the file: they wait for what follows.
+                kept = lines.rstrip(self._blanks)
+                if kept:
+                    self._rest = lines[len(kept) :].partition(b"\n")[2] + self._rest
+                    return kept
+                self._rest = lines + self._rest
+            self._read_more()
+        lines, self._rest = self._rest.rstrip(self._blanks), b""
+        return lines or None
+
+    def _line(self) -> str | None:
+        """Take one line of the head."""
+        while b"\n" not in self._rest and not self._ended and len(self._rest) < _LONGEST_LINE:
+            self._read_more()
+        if not self._rest:
+            return None
+        line, _, self._rest = self._rest.partition(b"\n")
+        self._lines_before += 1
+        try:
+            return line.decode("utf-8-sig" if self._lines_before == 1 else "utf-8").rstrip("\r")
+        except UnicodeDecodeError:
+            raise ReadError(f"{self._name}: line {self._lines_before}: expected UTF-8 text") from None
+
+    # --- head --------------------------------------------------------------------------------------------------
+
+    def _comments(self) -> str | None:
+        """Take the comment lines and return the first line that is none."""
+        while (line := self._line()) is not None:
+            if line.startswith("#"):
+                key, colon, value = line.lstrip("# ").partition(":")
+                if colon and key.strip():
+                    self._metadata[key.strip()] = value.strip()
+            elif line.strip():
+                return line
+        return None
+
+    def _native_head(self) -> tuple[list[str], dict[str, str], np.ndarray]:
+        line = self._comments()
+        if line is None:
+            raise ReadError(f"{self._name}: only comments; expected a line of titles 'name [unit]' and rows")
+        if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
+            raise ReadError(
+                f"{self._name}: line {self._lines_before}: expected titles such as 'time [s],accel_x [m/s^2]', "
+                "found numbers; describe a foreign file with --layout FILE.toml"
+            )
+        titles, units = [], {}
+        for title in line.split(","):
+            name, unit = parse_column_title(title, self._name)
+            if not name:
+                raise ReadError(f"{self._name}: line {self._lines_before}: a column without a name")
+            if name in units:
+                raise ReadError(f"{self._name}: line {self._lines_before}: column {name} appears twice")
+            titles.append(name)
+            units[name] = unit
+        return titles, units, np.arange(len(titles), dtype=np.int32)
+
+    def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
+        for _ in range(layout.skip_lines):
+            self._line()
+        if layout.header:
+            header = self._line() or ""
+            present = [title.strip().strip('"') for title in _fields(header.lstrip("# "), layout.delimiter)]
+        else:
+            while self._rest.startswith(b"#"):
+                self._line()
+            while b"\n" not in self._rest and not self._ended:
+                self._read_more()
+            first = self._rest.partition(b"\n")[0].decode("utf-8", "replace")
+            present = [str(number) for number in range(len(_fields(first, layout.delimiter)))]
+        slots = np.full(len(present), -1, dtype=np.int32)
+        for slot, (name, column) in enumerate(layout.columns.items()):
+            origin = column.origin
+            index = origin if isinstance(origin, int) else present.index(origin) if origin in present else -1
+            if not 0 <= index < len(present):
+                what = f"column {origin}" if isinstance(origin, int) else f"a column named {origin!r}"
+                found = f"{len(present)} columns" if isinstance(origin, int) else " ".join(present)
+                raise ReadError(f"{self._name}: {layout.name} takes {name} from {what}, found {found}")
+            if slots[index] >= 0:
+                other = list(layout.columns)[slots[index]]
+                raise ReadError(f"{self._name}: {layout.name} takes both {other} and {name} from column {origin}")
+            slots[index] = slot
+        return list(layout.columns), {name: c.unit for name, c in layout.columns.items()}, slots
+
+    # --- rows --------------------------------------------------------------------------------------------------
+
+    def _parse(self, block: bytes, row: int) -> Recording:
+        capacity = block.count(b"\n") + 1
+        out = np.empty((len(self._titles), capacity))
+        rows, problem, field = _text.parse(block, self._delimiter, self._slots, out, capacity)
+        if problem:
+            self._refuse(block, row, rows, problem, field)
+        columns = dict(zip(self._titles, out, strict=True))
+        units = dict(self._units)
+        layout = self._layout
+        if layout is not None and layout.sample_rate is not None:
+            columns = {"time": np.arange(row - 1, row - 1 + rows) / layout.sample_rate, **columns}
+            units = {"time": "s", **units}
+        return Recording(
+            columns=columns,
+            units=units,
+            metadata=self._metadata,
+            name=self._name,
+            first_row=row,
+            lines_before=self._lines_before,
+        )
+
+    def _refuse(self, block: bytes, row: int, index: int, problem: int, field: int) -> None:
+        number = row + index
+        place = f"{self._name}: row {number} (line {number + self._lines_before})"
+        line = block.split(b"\n", index + 1)[index].decode("utf-8", "replace").rstrip("\r")
+        if not line.strip():
+            raise ReadError(f"{place}: expected {len(self._slots)} fields, found an empty line")
+        if problem == 2:
+            raise ReadError(f"{place}: expected {len(self._slots)} fields, found {field}")
+        found = _fields(line, self._delimiter)[field].strip()
+        slot = int(self._slots[field])
+        shown = found if len(found) <= 40 else found[:37] + "..."
+        raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}")
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    return line.split() if delimiter == " " else line.split(delimiter)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

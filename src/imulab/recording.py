@@ -1,0 +1,264 @@
+"""Recording: the samples of one test, as they were read, with their units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import DataError, UnitError
+from imulab.units import parse_unit, to_si
+
+Array = NDArray[np.float64]
+
+_QUANTITIES = {
+    "time": ("time",),
+    "accel": ("acceleration", "output"),
+    "gyro": ("rate", "output"),
+    "dtg": ("rate", "output"),
+    "fog": ("rate", "output"),
+    "temperature": ("temperature", "output"),
+    "table_angle": ("angle", "output"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A file that a recording was read from, and the SHA-256 of its bytes."""
+
+    file: str
+    sha256: str
+
+
+class Frame(Protocol):
+    """What pandas and polars data frames have in common."""
+
+    columns: Any
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a column."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The samples of one test: columns as read with their units; SI arrays are derived on request.
+
+    Attributes
+    ----------
+    columns
+        Name to samples, each of shape (n,), in file order.
+    units
+        Name to unit symbol.
+    metadata
+        ``key: value`` comments at the head of the file (serial, model, power_on_temperature, ...).
+    name
+        What messages call the recording: its file name.
+    source
+        File and hash, where the recording was read from a file as a whole.
+    first_row
+        Number of the first sample's data row, counted from 1 (blocks of a file start further down).
+    lines_before
+        Lines of the file above data row 1; None where rows are not lines of text.
+    notes
+        What the reader did to the data that a user should know.
+    """
+
+    columns: Mapping[str, Array]
+    units: Mapping[str, str]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    name: str = "recording"
+    source: Source | None = None
+    first_row: int = 1
+    lines_before: int | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        lengths = {len(column) for column in self.columns.values()}
+        if len(lengths) > 1:
+            raise DataError(f"{self.name}: columns of different length: {sorted(lengths)}")
+        for name in self.columns:
+            check_unit(name, self.units.get(name, ""), self.name)
+
+    def __len__(self) -> int:
+        for column in self.columns.values():
+            return len(column)
+        return 0
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def place(self, index: int) -> str:
+        """Return how messages name sample `index`: ``row 50 (line 51)``."""
+        row = self.first_row + int(index)
+        return f"row {row}" if self.lines_before is None else f"row {row} (line {row + self.lines_before})"
+
+    def column(self, name: str) -> Array:
+        """Return the samples of a column as read, shape (n,).
+
+        Raises
+        ------
+        DataError
+            The recording has no such column; the message lists those that it has.
+        """
+        try:
+            return self.columns[name]
+        except KeyError:
+            raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}") from None
+
+    def si(self, name: str) -> Array:
+        """Return the samples of a column in SI (counts and volts as they are), shape (n,)."""
+        return to_si(self.column(name), self.units[name])
+
+    @property
+    def time(self) -> Array | None:
+        """Time of each sample, s, shape (n,), or None for a table without a time column."""
+        return self.si("time") if "time" in self.columns else None
+
+    def triad(self, sensor: str) -> Array:
+        """Return the three columns ``<sensor>_x``, ``_y``, ``_z`` as read, shape (n, 3).
+
+        Raises
+        ------
+        DataError
+            A column is missing.
+        """
+        return np.column_stack([self.column(f"{sensor}_{axis}") for axis in "xyz"])
+
+    def triad_unit(self, sensor: str) -> str:
+        """Return the unit that the three columns of a triad share.
+
+        Raises
+        ------
+        UnitError
+            They have different units.
+        """
+        names = [f"{sensor}_{axis}" for axis in "xyz"]
+        for name in names:
+            self.column(name)
+        units = {name: parse_unit(self.units[name]).symbol for name in names}
+        if len(set(units.values())) > 1:
+            found = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
+            raise UnitError(f"{self.name}: the axes of a triad must share one unit, found {found}")
+        return units[names[0]]
+
+    def with_columns(self, columns: Mapping[str, Array], units: Mapping[str, str]) -> Recording:
+        """Return a copy in which some columns are replaced (or added at the end)."""
+        return replace(self, columns={**self.columns, **columns}, units={**self.units, **units})
+
+    @classmethod
+    def from_frame(cls, frame: Frame, name: str = "frame") -> Recording:
+        """Make a recording from a pandas or polars data frame with columns named ``name [unit]``."""
+        columns, units = {}, {}
+        for title in frame.columns:
+            key, unit = parse_column_title(str(title), name)
+            columns[key] = np.asarray(frame[title].to_numpy(), dtype=np.float64)
+            units[key] = unit
+        return cls(columns=columns, units=units, name=name)
+
+    def to_frame(self) -> Any:
+        """Return a polars data frame with columns named ``name [unit]`` (needs the extra ``tables``)."""
+        try:
+            import polars
+        except ImportError:
+            raise DataError("to_frame needs polars: pip install 'imulab[tables]'") from None
+        return polars.DataFrame({f"{name} [{self.units[name]}]": values for name, values in self.columns.items()})
+
+
+def parse_column_title(title: str, file: str) -> tuple[str, str]:
+    """Split ``name [unit]``; a name outside the vocabulary may come without a unit.
+
+    Raises
+    ------
+    UnitError
+        No unit on a column that needs one, or an unknown unit.
+    """
+    name, bracket, rest = title.strip().strip('"').strip().partition("[")
+    name = name.strip()
+    if not bracket:
+        if _expected(name) is None:
+            return name, "1"
+        raise UnitError(f"{file}: column {name} has no unit; expected a title such as '{name} [{_example(name)}]'")
+    if not rest.rstrip().endswith("]"):
+        raise UnitError(f"{file}: column title {title.strip()!r}: expected 'name [unit]'")
+    try:
+        unit = parse_unit(rest.rstrip()[:-1]).symbol
+    except UnitError as error:
+        raise UnitError(f"{file}: column {name}: {error}") from None
+    return name, unit
+
+
+def _expected(name: str) -> tuple[str, ...] | None:
+    stem = name.removeprefix("truth_").removeprefix("std_")
+    for prefix, quantities in _QUANTITIES.items():
+        if stem == prefix or stem.startswith(prefix + "_"):
+            return quantities
+    return None
+
+
+def _example(name: str) -> str:
+    return {"time": "s", "acceleration": "m/s^2", "rate": "deg/s", "temperature": "degC", "angle": "deg"}[
+        (_expected(name) or ("time",))[0]
+    ]
+
+
+def check_unit(name: str, unit: str, file: str) -> None:
+    """Check that a column of the vocabulary has a unit of its quantity.
+
+    Raises
+    ------
+    UnitError
+        It has none, or one of another quantity.
+    """
+    expected = _expected(name)
+    quantity = parse_unit(unit).quantity if unit else "nothing"
+    if expected is not None and quantity not in expected:
+        raise UnitError(
+            f"{file}: column {name}: expected a unit of {' or '.join(expected)}, found {unit!r} ({quantity})"
+        )
+
+
+def check_finite(recording: Recording, names: list[str]) -> None:
+    """Check that the named columns hold finite numbers only.
+
+    Raises
+    ------
+    DataError
+        NaN or infinity; the message names column and row of the first, and their count.
+    """
+    for name in names:
+        values = recording.column(name)
+        finite = np.isfinite(values)
+        if not finite.all():
+            index = int(np.argmin(finite))
+            count = int(np.size(finite) - np.count_nonzero(finite))
+            more = f" (and {count - 1} more)" if count > 1 else ""
+            raise DataError(
+                f"{recording.name}: {recording.place(index)}, column {name}: "
+                f"expected a finite number, found {values[index]}{more}"
+            )
+
+
+def check_time(recording: Recording) -> Array:
+    """Check that time rises from sample to sample and return it, s, shape (n,).
+
+    Raises
+    ------
+    DataError
+        Time runs backwards or stands still; the message names the row.
+    """
+    check_finite(recording, ["time"])
+    time = recording.si("time")
+    step = np.diff(time)
+    if step.size and not step.min() > 0:
+        index = int(np.argmax(step <= 0)) + 1
+        raw = recording.column("time")
+        verb = "stands still" if step[index - 1] == 0 else "runs backwards"
+        unit = recording.units["time"]
+        raise DataError(
+            f"{recording.name}: {recording.place(index)}, column time: time {verb}: "
+            f"expected more than {raw[index - 1]:.9g} {unit}, found {raw[index]:.9g} {unit}"
+        )
+    return time

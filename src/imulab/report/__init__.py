@@ -1,0 +1,86 @@
+"""Exhibits and a record to one self-contained HTML file that opens from disk without a network."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from imulab.calibration import Calibration
+from imulab.exhibit import Exhibits, Figure
+from imulab.files import write_text
+
+_TITLES = {"tumble": "Tumble calibration"}
+
+
+def render(record: Calibration, exhibits: Exhibits) -> str:
+    """Return the report of a record as HTML text."""
+    plots = [item for item in exhibits.items if isinstance(item, Figure)]
+    return str(
+        _template().render(
+            record=record,
+            title=_TITLES.get(record.procedure, record.procedure.capitalize()),
+            exhibits=exhibits,
+            is_figure=lambda item: isinstance(item, Figure),
+            plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
+            plotly=_plotly(),
+            provenance=_provenance(record),
+        )
+    )
+
+
+def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:
+    """Write the report of a record, whole or not at all.
+
+    Raises
+    ------
+    OptionError
+        The file cannot be written there.
+    """
+    write_text(path, render(record, exhibits))
+
+
+@cache
+def _template() -> Any:
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string((files("imulab.report") / "page.html.j2").read_text(encoding="utf-8"))
+
+
+@cache
+def _plotly() -> Any:
+    from markupsafe import Markup
+
+    code = (files("imulab.report") / "vendor" / "plotly-cartesian.min.js").read_text(encoding="utf-8")
+    return Markup(code.replace("</script", "<\\/script"))
+
+
+def _json_for_script(value: Any) -> Any:
+    """Return JSON that cannot end the script element it stands in."""
+    from markupsafe import Markup
+
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
+
+
+def _provenance(record: Calibration) -> list[tuple[str, str]]:
+    rows = [("created", record.created), ("software", record.software)]
+    rows += [(f"source {source.file}", f"SHA-256 {source.sha256}") for source in record.sources]
+    rows += [(f"sensor {key}", value) for key, value in record.sensor.items()]
+    rows += [(f"model {key}", _plain(value)) for key, value in record.model.items()]
+    rows += [(f"option {key}", _plain(value)) for key, value in record.options.items()]
+    rows.append(("record SHA-256", str(record.to_dict()["content_sha256"])))
+    return rows
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, Mapping):
+        if {"value", "unit"} <= set(value):
+            origin = f" ({value['from']})" if "from" in value else ""
+            return f"{value['value']:.9g} {value['unit']}{origin}"
+        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
+    return str(value)

@@ -1,0 +1,326 @@
+"""A continuous recording to static attitudes.
+
+The recording is cut into short blocks whose means and scatters are formed once; windows of a second or so slide over
+the blocks. A window is quiet where its variance stays below a threshold relative to the quietest stretch. The
+threshold is swept, and the one is kept whose attitudes predict each other best: the outputs of a triad at rest lie on
+an ellipsoid, whose leave-one-out error needs no gravity, no model order and no iteration.
+
+Source: Tedaldi, Pretto, Menegatti, ICRA 2014 (threshold sweep); batch means: Fishman, Grouping observations in
+digital simulation, Management Science 24 (1978) 510.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.attitudes import Attitudes, Trace
+from imulab.clipping import check_clipped_rows, check_clipping
+from imulab.errors import SegmentError
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.units import to_si
+
+_BLOCK_SECONDS = 0.1
+_SMALLEST_BLOCK = 4
+_THRESHOLDS = np.geomspace(1.5, 400.0, 18)
+_SAME_ATTITUDE = 2e-3
+"""Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
+shortens the vector by less than 0.5 ug."""
+_POOL_DEGREES = 10.0
+"""Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
+_TRACE_POINTS = 4000
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Means and mean squared scatters of consecutive blocks of `length` samples, shape (n, 3)."""
+
+    mean: Array
+    scatter: Array
+    length: int
+    duration: float
+    broken: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """Static stretches in blocks, half-open, and the attitude that each belongs to."""
+
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+    attitude: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+
+
+def find_attitudes(
+    recording: Recording,
+    *,
+    sensor: str = "accel",
+    window: float = 1.0,
+    settling: float = 0.3,
+    shortest: float = 1.0,
+) -> Attitudes:
+    """Find the static attitudes of a tumble recording, with the covariance of each mean.
+
+    A recording without a time column is a table of attitudes, a row each; it is taken as it is, with the
+    covariances that its ``std_<sensor>_<axis>`` columns state.
+
+    Parameters
+    ----------
+    recording
+        Columns ``<sensor>_x``, ``_y``, ``_z``, and ``time`` unless it is a table.
+    sensor
+        Stem of the triad's columns.
+    window
+        Length of the window whose variance decides on rest, s.
+    settling
+        Discarded at both ends of each static stretch, s.
+    shortest
+        Shortest static stretch to use after that, s.
+
+    Returns
+    -------
+    Attitudes
+        Means in the unit of the columns.
+
+    Raises
+    ------
+    DataError
+        A sample is not finite or clipped, time does not rise.
+    SegmentError
+        No static stretch was found.
+    UnitError
+        The three columns have different units.
+    """
+    unit = recording.triad_unit(sensor)
+    names = [f"{sensor}_{axis}" for axis in "xyz"]
+    check_finite(recording, names)
+    temperature = _temperature(recording)
+    if "time" not in recording:
+        check_clipped_rows(recording, names)
+        return Attitudes(
+            mean=recording.triad(sensor),
+            covariance=_stated_covariance(recording, names, unit),
+            samples=np.ones(len(recording), dtype=np.int64),
+            start=np.arange(recording.first_row, recording.first_row + len(recording), dtype=np.float64),
+            stop=np.arange(recording.first_row, recording.first_row + len(recording), dtype=np.float64),
+            unit=unit,
+            recording=recording,
+            temperature=temperature,
+        )
+    time = check_time(recording)
+    blocks = _form_blocks(recording, names, time, window)
+    width = max(3, round(window / blocks.duration))
+    if len(blocks.mean) < 2 * width:
+        raise SegmentError(
+            f"{recording.name}: {len(recording)} samples over {time[-1] - time[0]:.3g} s are too few to find static "
+            f"attitudes with a window of {window:g} s"
+        )
+    variance = _window_variance(blocks, width)
+    finite = variance[np.isfinite(variance) & (variance > 0)]
+    quiet = float(np.quantile(finite, 0.05)) if finite.size else 1.0
+    trim = int(np.ceil(settling / blocks.duration))
+    fewest = max(2, int(np.ceil(shortest / blocks.duration)))
+    candidates = [_merge(_stretches(variance <= factor * quiet, width, trim, fewest), blocks) for factor in _THRESHOLDS]
+    best = _choose(candidates, blocks)
+    trace = _trace(variance, time, blocks, width, _THRESHOLDS[best] * quiet, quiet)
+    pieces = candidates[best]
+    if not pieces.start.size:
+        raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
+    stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
+    check_clipping(recording, names, stretches)
+    mean, covariance, samples = _statistics(pieces, blocks, recording, names)
+    first = np.unique(pieces.attitude, return_index=True)[1]
+    last = np.append(first[1:], len(pieces.start)) - 1
+    return Attitudes(
+        mean=mean,
+        covariance=covariance,
+        samples=samples,
+        start=time[pieces.start[first] * blocks.length],
+        stop=time[pieces.stop[last] * blocks.length - 1],
+        unit=unit,
+        recording=recording,
+        temperature=temperature,
+        trace=trace,
+        pieces=stretches,
+        swing=np.ptp(blocks.mean, axis=0),
+    )
+
+
+def _temperature(recording: Recording) -> float | None:
+    """Mean temperature of the test, degC, where the recording knows one."""
+    if "temperature" in recording and recording.units["temperature"] in ("degC", "K"):
+        values = recording.si("temperature")
+        values = values[np.isfinite(values)]
+        return float(values.mean()) if values.size else None
+    for key in ("temperature", "power_on_temperature"):
+        try:
+            return float(recording.metadata[key].split()[0])
+        except (KeyError, ValueError, IndexError):
+            continue
+    return None
+
+
+def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:
+    """Covariances from the ``std_*`` columns of a table, in the unit of the means, or None."""
+    present = [f"std_{name}" for name in names if f"std_{name}" in recording]
+    if not present:
+        return None
+    stated = [f"std_{name}" for name in names]
+    check_finite(recording, stated)
+    scale = to_si(1.0, unit)
+    std = np.column_stack([recording.si(name) for name in stated]) / scale
+    if not (std > 0).all():
+        row, axis = np.argwhere(std <= 0)[0]
+        raise SegmentError(
+            f"{recording.name}: {recording.place(row)}, column {stated[axis]}: "
+            f"expected a positive standard deviation, found {std[row, axis]:g}"
+        )
+    covariance = np.zeros((len(std), 3, 3))
+    covariance[:, range(3), range(3)] = std**2
+    return covariance
+
+
+def _form_blocks(recording: Recording, names: list[str], time: Array, window: float) -> _Blocks:
+    step = float(np.median(np.diff(time[:100_000]))) if len(time) > 1 else 1.0
+    length = max(_SMALLEST_BLOCK, round(min(_BLOCK_SECONDS, window / 3) / step))
+    count = len(time) // length
+    mean, scatter = np.empty((count, 3)), np.empty((count, 3))
+    for axis, name in enumerate(names):
+        samples = recording.column(name)[: count * length].reshape(count, length)
+        mean[:, axis] = samples.mean(axis=1)
+        deviation = samples - mean[:, axis, None]
+        scatter[:, axis] = np.einsum("ij,ij->i", deviation, deviation) / length
+    begins = time[: count * length : length]
+    spans = np.diff(begins, append=2 * begins[-1] - begins[-2] if count > 1 else 0.0)
+    return _Blocks(mean, scatter, length, length * step, spans > 1.5 * length * step)
+
+
+def _window_variance(blocks: _Blocks, width: int) -> Array:
+    """Variance of each window of `width` blocks, summed over the axes; infinite across a gap in time."""
+    count = len(blocks.mean) - width + 1
+    windows = [slice(k, k + count) for k in range(width)]
+    centre = sum(blocks.mean[w] for w in windows) / width
+    within = sum(blocks.scatter[w] for w in windows) / width
+    between = sum((blocks.mean[w] - centre) ** 2 for w in windows) / width
+    variance: Array = np.sum(within + between, axis=1)
+    broken = np.convolve(blocks.broken, np.ones(width), mode="valid") > 0
+    variance[broken] = np.inf
+    return variance
+
+
+def _stretches(quiet: NDArray[np.bool_], width: int, trim: int, fewest: int) -> _Pieces:
+    """Blocks covered by a quiet window, as stretches without their settling edges."""
+    edges = np.zeros(len(quiet) + width, dtype=np.int64)
+    edges[: len(quiet)] += quiet
+    edges[width:] -= quiet
+    static = np.concatenate([[False], np.cumsum(edges) > 0, [False]])
+    change = np.flatnonzero(static[1:] != static[:-1])
+    start, stop = change[::2] + trim, np.minimum(change[1::2], len(quiet) + width - 1) - trim
+    keep = stop - start >= fewest
+    return _Pieces(start[keep], stop[keep])
+
+
+def _piece_means(pieces: _Pieces, blocks: _Blocks) -> Array:
+    """Mean of the blocks of each stretch, shape (pieces, 3)."""
+    bounds = np.column_stack([pieces.start, pieces.stop]).ravel()
+    sums = np.add.reduceat(np.vstack([blocks.mean, np.zeros((1, 3))]), bounds, axis=0)[::2]
+    mean: Array = sums / (pieces.stop - pieces.start)[:, None]
+    return mean
+
+
+def _merge(pieces: _Pieces, blocks: _Blocks) -> _Pieces:
+    """Number the attitudes: neighbouring stretches with the same mean are one attitude that was interrupted."""
+    if not pieces.start.size:
+        return pieces
+    mean = _piece_means(pieces, blocks)
+    radius = np.ptp(mean, axis=0).max() / 2
+    new = np.linalg.norm(np.diff(mean, axis=0), axis=1) > _SAME_ATTITUDE * radius
+    return _Pieces(pieces.start, pieces.stop, np.concatenate([[0], np.cumsum(new)]))
+
+
+def _attitude_means(pieces: _Pieces, blocks: _Blocks) -> Array:
+    first = np.unique(pieces.attitude, return_index=True)[1]
+    size = (pieces.stop - pieces.start).astype(np.float64)
+    sums = np.add.reduceat(_piece_means(pieces, blocks) * size[:, None], first, axis=0)
+    mean: Array = sums / np.add.reduceat(size, first)[:, None]
+    return mean
+
+
+def _choose(candidates: list[_Pieces], blocks: _Blocks) -> int:
+    """Index of the threshold whose attitudes predict each other best, among those that find enough."""
+    counts = np.array([pieces.attitude[-1] + 1 if pieces.attitude.size else 0 for pieces in candidates])
+    enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * np.median(counts[counts > 0])))) if counts.any() else 0)
+    errors = [
+        _ellipsoid_error(_attitude_means(pieces, blocks)) if count >= max(enough, 1) else np.inf
+        for pieces, count in zip(candidates, counts, strict=True)
+    ]
+    if np.isfinite(errors).any():
+        return int(np.argmin(errors))
+    return int(np.argmax(counts))
+
+
+def _ellipsoid_error(mean: Array) -> float:
+    """Leave-one-out error of an ellipsoid through the attitude means, as a fraction of its radius.
+
+    ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude predicted from all
+    others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the radius.
+    """
+    if len(mean) < 11:
+        return np.inf
+    centre = (mean.max(axis=0) + mean.min(axis=0)) / 2
+    x, y, z = ((mean - centre) / (np.ptp(mean, axis=0).max() / 2)).T
+    design = np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x, x, y, z])
+    q, r = np.linalg.qr(design)
+    if np.abs(np.diag(r)).min() < 1e-6 * np.abs(np.diag(r)).max():
+        return np.inf
+    leverage = np.einsum("ij,ij->i", q, q)
+    residual = 1 - q @ q.sum(axis=0)
+    return float(np.sqrt(np.mean((residual / np.maximum(1 - leverage, 1e-9)) ** 2)) / 2)
+
+
+def _statistics(
+    pieces: _Pieces, blocks: _Blocks, recording: Recording, names: list[str]
+) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Mean, covariance of the mean by batch means, and number of samples of each attitude."""
+    mean = _attitude_means(pieces, blocks)
+    count = len(mean)
+    size = pieces.stop - pieces.start
+    total = np.bincount(pieces.attitude, size, count)
+    per_batch = max(1, min(int(np.median(total)) // 10, int(size.min()) // 2))
+    batches = size // per_batch
+    owner = np.repeat(pieces.attitude, batches)
+    offset = np.arange(len(owner)) - np.repeat(np.cumsum(batches) - batches, batches)
+    start = np.repeat(pieces.start, batches) + offset * per_batch
+    batch = blocks.mean[start[:, None] + np.arange(per_batch)].mean(axis=1)
+    number = np.bincount(owner, minlength=count)
+    centre = np.column_stack([np.bincount(owner, batch[:, k], count) for k in range(3)]) / number[:, None]
+    deviation = batch - centre[owner]
+    scatter = np.zeros((count, 3, 3))
+    np.add.at(scatter, owner, deviation[:, :, None] * deviation[:, None, :])
+    # Shrink towards the noise common to all: ten batches alone would make poor weights.
+    freedom = (number - 1.0)[:, None, None]
+    level = np.trace(scatter, axis1=1, axis2=2) / np.maximum(number - 1, 1)
+    usual = level <= 3 * np.median(level)
+    pooled = scatter[usual].sum(axis=0) / max(float((number - 1)[usual].sum()), 1.0)
+    floor = [0.0 if pooled[k, k] > 0 else _resolution(recording.column(name)) for k, name in enumerate(names)]
+    pooled = pooled + np.diag(np.square(floor) / 12)
+    shrunk = (scatter + _POOL_DEGREES * pooled) / (freedom + _POOL_DEGREES)
+    covariance: Array = shrunk * (per_batch / total)[:, None, None]
+    return mean, covariance, (total * blocks.length).astype(np.int64)
+
+
+def _resolution(samples: Array) -> float:
+    """Smallest step between the values of a channel that shows no noise at all."""
+    values = np.unique(samples[:: max(1, len(samples) // 100_000)])
+    return float(np.diff(values).min()) if len(values) > 1 else 0.0
+
+
+def _trace(variance: Array, time: Array, blocks: _Blocks, width: int, threshold: float, quiet: float) -> Trace:
+    """Decimate the variance trace for the record: the largest value of each group of windows."""
+    group = max(1, len(variance) // _TRACE_POINTS)
+    usable = variance[: len(variance) // group * group].reshape(-1, group)
+    largest = np.where(np.isfinite(usable), usable, 0.0).max(axis=1)
+    middle = (np.arange(len(largest)) * group * blocks.length + width * blocks.length // 2).clip(max=len(time) - 1)
+    return Trace(time=time[middle], variance=largest, threshold=float(threshold), quiet=quiet)

@@ -1,0 +1,1 @@
+"""Tumble test: an accelerometer triad calibrated with gravity as the only reference."""

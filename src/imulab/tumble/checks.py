@@ -1,0 +1,84 @@
+"""Is this a tumble test of an accelerometer at all? One clear sentence for each way in which it may not be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imulab.attitudes import Attitudes
+from imulab.errors import DataError
+from imulab.tumble.solve import Solution
+from imulab.units import from_si, parse_unit, to_si
+
+_ENOUGH_TO_TELL = 5
+_DEAD_SPAN = 0.02
+_GYRO_SPAN = 0.05
+_WORST_RMS = 0.1
+
+
+def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
+    """Check that attitudes can be those of an accelerometer triad under `gravity`, m/s^2.
+
+    Raises
+    ------
+    DataError
+        A gyroscope's recording, a dead or doubled axis, a wrong unit.
+    """
+    _check_turned(attitudes)
+    _check_magnitude(attitudes, gravity)
+
+
+def _check_turned(attitudes: Attitudes) -> None:
+    name, unit = attitudes.recording.name, attitudes.unit
+    span = np.ptp(attitudes.mean, axis=0)
+    columns = [f"accel_{axis}" for axis in "xyz"]
+    for axis, column in enumerate(columns):
+        for other in range(axis):
+            if np.array_equal(attitudes.mean[:, axis], attitudes.mean[:, other]):
+                raise DataError(
+                    f"{name}: columns {columns[other]} and {column} hold the same samples; "
+                    f"expected three different axes"
+                )
+    if attitudes.swing is not None and len(attitudes) >= _ENOUGH_TO_TELL:
+        swing = float(attitudes.swing.max())
+        if span.max() < _GYRO_SPAN * swing:
+            raise DataError(
+                f"{name}: columns accel_x accel_y accel_z: at rest the outputs change by {span.max():.3g} {unit} from "
+                f"attitude to attitude, while moving by {swing:.3g} {unit}; expected gravity to turn through the axes: "
+                "is this a gyroscope's recording?"
+            )
+    if len(attitudes) >= _ENOUGH_TO_TELL and span.min() < _DEAD_SPAN * span.max():
+        axis = int(np.argmin(span))
+        raise DataError(
+            f"{name}: column {columns[axis]}: the output changes by only {span[axis]:.3g} {unit} over the "
+            f"{len(attitudes)} attitudes, the other axes by up to {span.max():.3g} {unit}: a dead axis, or one that "
+            "was never turned towards the vertical"
+        )
+
+
+def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
+    unit = parse_unit(attitudes.unit)
+    if unit.quantity != "acceleration":
+        return
+    found = to_si(float(np.median(np.linalg.norm(attitudes.mean, axis=1))), unit.symbol)
+    if not gravity / 2 <= found <= 2 * gravity:
+        raise DataError(
+            f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
+            f"{from_si(found, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
+            f"{unit.symbol}: is the unit wrong?"
+        )
+
+
+def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) -> None:
+    """Check after the fit that |f| = g holds at all.
+
+    Raises
+    ------
+    DataError
+        It is off by more than a tenth of g in the median attitude.
+    """
+    typical = float(np.median(np.abs(solution.deviations[0])))
+    if not typical < _WORST_RMS:
+        raise DataError(
+            f"{attitudes.recording.name}: the calibrated magnitudes miss gravity ({gravity:.5g} m/s^2) by "
+            f"{typical * gravity:.3g} m/s^2 in the median attitude: these are not static attitudes of an accelerometer"
+        )

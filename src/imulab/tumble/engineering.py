@@ -1,0 +1,63 @@
+"""The parameters of a tumble record in the units that people read: mg, ppm, mrad, µg/g²."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from imulab.calibration import Calibration
+from imulab.exhibit import format_uncertain
+from imulab.tumble.record import zero_outputs
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+
+@dataclass(frozen=True)
+class EngineeringRow:
+    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ..."""
+
+    name: str
+    value: float
+    standard_uncertainty: float | None
+    unit: str
+
+    def text(self) -> tuple[str, str]:
+        """Return value and uncertainty as text."""
+        return format_uncertain(self.value, self.standard_uncertainty)
+
+
+def engineering_rows(record: Calibration) -> list[EngineeringRow]:
+    """Return the parameters in engineering units, the outputs at zero specific force included for counts and volts."""
+    rows = []
+    output = str(record.model["output_unit"])
+    physical = parse_unit(output).quantity == "acceleration"
+    zeros = {} if physical else zero_outputs(record)
+    for name, parameter in record.parameters.items():
+        stem, _, axis = name.rpartition("_")
+        factor, offset, unit = _engineering(stem, output, physical)
+        rows.append(
+            EngineeringRow(
+                name if not (physical and stem == "scale_factor") else f"scale_factor_error_{axis}",
+                parameter.value * factor + offset,
+                None if parameter.standard_uncertainty is None else parameter.standard_uncertainty * abs(factor),
+                unit,
+            )
+        )
+        if stem == "bias" and axis == "z":
+            rows += [
+                EngineeringRow(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zeros.items()
+            ]
+    return rows
+
+
+def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, str]:
+    """Factor, offset and unit that turn an SI parameter into engineering units."""
+    if stem == "bias":
+        return from_si(1.0, "mg"), 0.0, "mg"
+    if stem == "scale_factor":
+        if physical:
+            return 1e6 / from_si(1.0, output), -1e6, "ppm"
+        return 1.0, 0.0, f"{output}/(m/s²)"
+    if stem == "misalignment":
+        return 1e3, 0.0, "mrad"
+    power = int(stem[1:])
+    superscript = "⁰¹²³⁴⁵"[power]
+    return 1e6 * STANDARD_GRAVITY ** (power - 1), 0.0, f"µg/g{superscript}"

@@ -1,0 +1,401 @@
+"""The figures and tables of a tumble record, from the record alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imulab.calibration import Calibration
+from imulab.exhibit import BAD, GOOD, INK, QUIET, Exhibits, Figure, Table, format_uncertain
+from imulab.recording import Array
+from imulab.tumble.engineering import engineering_rows
+from imulab.tumble.model import AXES
+from imulab.units import from_si
+
+_ALARM = 0.5
+
+
+def exhibits(record: Calibration) -> Exhibits:
+    """Return what a report on this record shows."""
+    fit, model, data = record.fit, record.model, record.data["attitudes"]
+    good = [weight >= _ALARM for weight in data["down_weight"]]
+    used = [value for value, ok in zip(data["residual"], good, strict=True) if ok] or data["residual"]
+    bad = len(good) - sum(good)
+    left_out = fit.get("leave_one_out")
+    worst = _worst_scale_uncertainty(record)
+    facts = [
+        ("attitudes", str(fit["attitudes"])),
+        ("order", str(model["order"])),
+        ("rms of |f| − g", _small_g(fit["rms"]["value"])),
+        ("leave-one-out", _small_g(left_out["value"]) if left_out else "not computed"),
+        ("worst u(scale factor)", f"{worst:.2g} ppm" if worst is not None else "not stated"),
+        ("condition number", f"{fit['condition_number']:.3g}"),
+    ]
+    items: list[Figure | Table] = [_residuals(record), _parameters(record)]
+    if fit["orders"]:
+        items.append(_orders(record))
+    items.append(_sphere(record))
+    if "trace" in record.data:
+        items.append(_trace(record))
+    if record.covariance.names:
+        items.append(_correlation(record))
+    aside = f"; {bad} more {'was' if bad == 1 else 'were'} down-weighted" if bad else ""
+    return Exhibits(
+        headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
+        f"{_small_g(_rms(used))} rms (before: {_small_g(_rms(data['residual_before']))}){aside}.",
+        facts=facts,
+        items=items,
+    )
+
+
+def _small_g(value: float) -> str:
+    """Return an acceleration in µg or mg, three significant digits."""
+    micro = _micro_g(value)
+    return (
+        f"{micro:.3g} µg"
+        if abs(micro) < 999.5
+        else f"{micro / 1e3:.4g} mg"
+        if abs(micro) < 1e6
+        else f"{micro / 1e6:.3g} g"
+    )
+
+
+def _micro_g(value: float) -> float:
+    return float(from_si(value, "ug"))
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _worst_scale_uncertainty(record: Calibration) -> float | None:
+    found = [record.parameters[f"scale_factor_{axis}"] for axis in AXES]
+    relative = [1e6 * p.standard_uncertainty / abs(p.value) for p in found if p.standard_uncertainty is not None]
+    return max(relative) if relative else None
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
+
+
+def _residuals(record: Calibration) -> Figure:
+    data = record.data["attitudes"]
+    number = list(range(1, len(data["residual"]) + 1))
+    after = [_micro_g(value) for value in data["residual"]]
+    sigma = data["standard_uncertainty"]
+    excess = record.fit["excess"]["value"]
+    bars = None if sigma is None else [_micro_g(float(np.hypot(value, excess))) for value in sigma]
+    colours = [BAD if weight < _ALARM else GOOD for weight in data["down_weight"]]
+    marker = {"color": colours, "size": 8}
+    trace: dict[str, Any] = {
+        "type": "scatter",
+        "mode": "markers",
+        "x": number,
+        "y": after,
+        "marker": marker,
+        "xaxis": "x",
+        "yaxis": "y",
+        "text": data["label"],
+        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
+        "name": "after",
+    }
+    if bars is not None:
+        trace["error_y"] = {"type": "data", "array": bars, "thickness": 1, "width": 2, "color": QUIET}
+    before = [_micro_g(value) / 1e3 for value in data["residual_before"]]
+    bad = sum(weight < _ALARM for weight in data["down_weight"])
+    span = _span([value for value, colour in zip(after, colours, strict=True) if colour == GOOD] or after, bars)
+    return Figure(
+        title="Residual |f| − g of each attitude",
+        caption="Above: with the nominal sensor. Below: with this calibration"
+        + ("; bars are one standard uncertainty of |f|" if bars else "")
+        + (f"; {bad} down-weighted attitude{'s' if bad > 1 else ''} in red" if bad else "")
+        + ". A pattern in the lower plot is an error that the model does not know.",
+        traces=[
+            {
+                "type": "bar",
+                "x": number,
+                "y": before,
+                "marker": {"color": QUIET},
+                "xaxis": "x",
+                "yaxis": "y2",
+                "hovertemplate": "attitude %{x}<br>%{y:.2f} mg<extra></extra>",
+                "name": "before",
+            },
+            trace,
+        ],
+        layout={
+            "xaxis": _axis("attitude", dtick=max(1, round(len(number) / 20)), anchor="y"),
+            "yaxis": _axis("after, µg", domain=[0, 0.6], range=[-span, span]),
+            "yaxis2": _axis("before, mg", domain=[0.68, 1]),
+            "showlegend": False,
+            "annotations": [
+                {
+                    "x": x,
+                    "y": span if y > 0 else -span,
+                    "text": f"{y / 1e3:+.2f} mg",
+                    "showarrow": True,
+                    "ax": 34,
+                    "ay": 14 if y > 0 else -14,
+                    "arrowcolor": BAD,
+                    "font": {"color": BAD},
+                    "xref": "x",
+                    "yref": "y",
+                }
+                for x, y in zip(number, after, strict=True)
+                if abs(y) > span
+            ],
+        },
+        height=460,
+    )
+
+
+def _span(values: list[float], bars: list[float] | None) -> float:
+    """Half the height of the residual plot: what the attitudes that count need."""
+    return 1.25 * (max(map(abs, values)) + (float(np.median(bars)) if bars else 0.0)) or 1.0
+
+
+def _parameters(record: Calibration) -> Table:
+    factor = record.fit["coverage_factor_95"]
+    rows = []
+    for row in engineering_rows(record):
+        value, uncertainty = row.text()
+        interval = "not stated"
+        if row.standard_uncertainty is not None and factor is not None:
+            half = factor * row.standard_uncertainty
+            interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
+        rows.append([row.name, value, uncertainty, interval, row.unit])
+    known = record.fit["noise"] == "known" and record.fit["excess"]["value"] == 0
+    freedom = record.fit["degrees_of_freedom"]
+    basis = (
+        "Noise known from the attitudes' own scatter; normal quantiles."
+        if known
+        else f"Noise estimated from the residuals; Student's t with {freedom} degrees of freedom."
+    )
+    return Table(
+        title="Parameters",
+        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.",
+        columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit"],
+        rows=rows,
+    )
+
+
+def _orders(record: Calibration) -> Table:
+    rows, highlight = [], None
+    for index, row in enumerate(record.fit["orders"]):
+        if row["order"] == record.model["order"]:
+            highlight = index
+        probability = row["f_probability"]
+        rows.append(
+            [
+                str(row["order"]),
+                str(row["parameters"]),
+                f"{_micro_g(row['rms']):.4g}",
+                f"{_micro_g(row['leave_one_out']):.4g}" if row["leave_one_out"] is not None else "–",
+                f"{probability:.2g}" if probability is not None else "–",
+                f"{row['bic']:.1f}" if row["bic"] is not None else "–",
+                f"{row['condition_number']:.3g}",
+                "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
+            ]
+        )
+    return Table(
+        title="Choice of the order",
+        caption="A higher order always fits closer (rms). It is taken only if it also predicts attitudes it has not "
+        "seen (leave-one-out), if the F-test finds the gain significant, and if the attitudes can observe it.",
+        columns=[
+            "order",
+            "parameters",
+            "rms, µg",
+            "leave-one-out, µg",
+            "F-test p",
+            "BIC",
+            "condition",
+            "observable",
+        ],
+        rows=rows,
+        highlight=highlight,
+    )
+
+
+def _sphere(record: Calibration) -> Figure:
+    data = record.data["attitudes"]
+    force = np.array(data["force"])
+    u = force / np.linalg.norm(force, axis=1, keepdims=True)
+    residual = np.array([_micro_g(value) for value in data["residual"]])
+    weight = np.array(data["down_weight"])
+    limit = float(np.quantile(np.abs(residual[weight >= _ALARM]), 0.95)) if (weight >= _ALARM).any() else 1.0
+    up = u[:, 2] >= 0
+    traces: list[dict[str, Any]] = []
+    for upper, axes in ((True, ("x", "y")), (False, ("x2", "y2"))):
+        traces += _graticule(axes)
+        chosen = up if upper else ~up
+        x, y = _equal_area(u[chosen], upper)
+        traces.append(
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "x": x.tolist(),
+                "y": y.tolist(),
+                "xaxis": axes[0],
+                "yaxis": axes[1],
+                "showlegend": False,
+                "marker": {
+                    "size": 12,
+                    "color": residual[chosen].tolist(),
+                    "cmin": -limit,
+                    "cmax": limit,
+                    "colorscale": [[0, GOOD], [0.5, "#f4efe6"], [1, BAD]],
+                    "line": {"color": INK, "width": 1},
+                    "showscale": upper,
+                    "colorbar": {"title": {"text": "|f| − g, µg"}, "thickness": 12},
+                },
+                "text": [label for label, c in zip(data["label"], chosen.tolist(), strict=True) if c],
+                "customdata": u[chosen].round(3).tolist(),
+                "hovertemplate": "%{text}<br>up (%{customdata[0]}, %{customdata[1]}, %{customdata[2]})<extra></extra>",
+            }
+        )
+    hidden = {"visible": False, "range": [-1.2, 1.2], "fixedrange": True}
+    return Figure(
+        title="Attitudes on the sphere",
+        caption="Direction of the specific force (up) in the body frame, equal-area maps of the hemispheres: left seen "
+        "from +z, right from −z. Large empty regions are what the calibration has not seen.",
+        traces=traces,
+        layout={
+            "xaxis": {**hidden, "domain": [0, 0.47]},
+            "yaxis": {**hidden, "scaleanchor": "x"},
+            "xaxis2": {**hidden, "domain": [0.5, 0.97]},
+            "yaxis2": {**hidden, "scaleanchor": "x2", "anchor": "x2"},
+            "annotations": [
+                note
+                for axes, side in ((("x", "y"), "+z"), (("x2", "y2"), "−z"))
+                for note in (
+                    _label(axes, 1.1, 0, "+x"),
+                    _label(axes, -1.1, 0, "−x"),
+                    _label(axes, 0, 1.1, "+y"),
+                    _label(axes, 0, -1.1, "−y"),
+                    _label(axes, 0, 0, side),
+                )
+            ],
+        },
+        height=420,
+    )
+
+
+def _equal_area(u: Array, upper: bool) -> tuple[Array, Array]:
+    """Lambert's azimuthal equal-area map of a hemisphere onto the unit disc."""
+    z = u[:, 2] if upper else -u[:, 2]
+    radius = np.sqrt(np.maximum(1 - z, 0.0))
+    ring = np.maximum(np.hypot(u[:, 0], u[:, 1]), 1e-12)
+    return radius * u[:, 0] / ring, radius * u[:, 1] / ring
+
+
+def _graticule(axes: tuple[str, str]) -> list[dict[str, Any]]:
+    angle = np.linspace(0, 2 * np.pi, 121)
+    circles = [np.sqrt(1 - np.cos(np.radians(t))) for t in (30, 60, 90)]
+    return [
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": (r * np.cos(angle)).round(4).tolist(),
+            "y": (r * np.sin(angle)).round(4).tolist(),
+            "xaxis": axes[0],
+            "yaxis": axes[1],
+            "hoverinfo": "skip",
+            "line": {"color": INK if r == circles[-1] else "#d5dbdf", "width": 1},
+            "showlegend": False,
+        }
+        for r in circles
+    ]
+
+
+def _label(axes: tuple[str, str], x: float, y: float, text: str) -> dict[str, Any]:
+    return {
+        "xref": axes[0],
+        "yref": axes[1],
+        "x": x,
+        "y": y,
+        "text": text,
+        "showarrow": False,
+        "font": {"color": QUIET if (x, y) == (0, 0) else INK},
+    }
+
+
+def _trace(record: Calibration) -> Figure:
+    trace, data = record.data["trace"], record.data["attitudes"]
+    deviation = [max(float(from_si(value, "mg")), 1e-6) for value in trace["deviation"]]
+    return Figure(
+        title="Where the unit was at rest",
+        caption="Standard deviation within a sliding window (three axes together), the threshold below which the unit "
+        "counts as at rest, and the stretches that were used (shaded), without their settling edges.",
+        traces=[
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "x": trace["time"],
+                "y": deviation,
+                "line": {"color": GOOD, "width": 1},
+                "name": "windowed standard deviation",
+                "hovertemplate": "%{x:.1f} s<br>%{y:.3g} mg<extra></extra>",
+            },
+            {
+                "type": "scatter",
+                "mode": "lines",
+                "x": [trace["time"][0], trace["time"][-1]],
+                "y": [float(from_si(trace["threshold"], "mg"))] * 2,
+                "line": {"color": BAD, "dash": "dash"},
+                "name": "threshold",
+                "hoverinfo": "skip",
+            },
+        ],
+        layout={
+            "xaxis": _axis("time, s"),
+            "yaxis": _axis("standard deviation, mg", type="log", dtick=1, exponentformat="none"),
+            "legend": {"orientation": "h", "y": 1.12},
+            "shapes": [
+                {
+                    "type": "rect",
+                    "xref": "x",
+                    "yref": "paper",
+                    "x0": a,
+                    "x1": b,
+                    "y0": 0,
+                    "y1": 1,
+                    "fillcolor": GOOD if weight >= _ALARM else BAD,
+                    "opacity": 0.13,
+                    "line": {"width": 0},
+                }
+                for a, b, weight in zip(data["start"], data["stop"], data["down_weight"], strict=True)
+            ],
+        },
+    )
+
+
+def _correlation(record: Calibration) -> Figure:
+    matrix = record.covariance.array()
+    sigma = np.sqrt(np.diag(matrix))
+    correlation = matrix / np.outer(sigma, sigma)
+    names = list(record.covariance.names)
+    return Figure(
+        title="Correlation of the parameters",
+        caption="Far from white off the diagonal: two parameters that these attitudes hardly tell apart.",
+        traces=[
+            {
+                "type": "heatmap",
+                "z": correlation.round(3).tolist(),
+                "x": names,
+                "y": names,
+                "zmin": -1,
+                "zmax": 1,
+                "colorscale": [[0, GOOD], [0.5, "#ffffff"], [1, BAD]],
+                "xgap": 1,
+                "ygap": 1,
+                "colorbar": {"thickness": 12},
+                "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
+            }
+        ],
+        layout={
+            "xaxis": {"tickangle": -45, "automargin": True},
+            "yaxis": {"autorange": "reversed", "automargin": True},
+        },
+        height=max(420, 26 * len(names) + 130),
+    )

@@ -1,0 +1,210 @@
+"""Static attitudes to a calibration of the accelerometer triad."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.attitudes import Attitudes
+from imulab.calibration import Calibration
+from imulab.errors import DataError, ObservabilityError, OptionError
+from imulab.estimate import (
+    Observability,
+    chi_square_limit,
+    covariance,
+    coverage_factor,
+    huber_inflation,
+    observability,
+)
+from imulab.recording import Array
+from imulab.tumble.advice import helpful_attitudes
+from imulab.tumble.axes import check_axes
+from imulab.tumble.checks import check_attitudes, check_residuals
+from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
+from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
+from imulab.tumble.record import Gravity, Scaling, make_record
+from imulab.tumble.solve import Problem, Solution, forces, solve_linearised, solve_norm
+from imulab.units import STANDARD_GRAVITY, parse_unit, to_si
+
+METHODS = ("norm", "linearised")
+LOSSES = ("square", "huber")
+
+
+@dataclass(frozen=True)
+class TumbleFit:
+    """Result of a tumble fit.
+
+    Attributes
+    ----------
+    calibration
+        The record, with parameters in SI and their covariance.
+    observability
+        Rank, condition number and the combination that the attitudes determine worst.
+    orders
+        The table of orders, where the order was chosen from the data; empty otherwise.
+    residuals
+        |f| - g of each attitude, m/s^2, shape (n,).
+    down_weights
+        Factors of Huber's loss, shape (n,); ones without it.
+    """
+
+    calibration: Calibration
+    observability: Observability
+    orders: tuple[OrderRow, ...]
+    residuals: Array
+    down_weights: Array
+
+    def __repr__(self) -> str:
+        return f"TumbleFit({len(self.residuals)} attitudes, {self.calibration.fit['method']})"
+
+
+def fit_tumble(
+    attitudes: Attitudes,
+    *,
+    order: int | str = "auto",
+    gravity: float | Gravity | None = None,
+    method: str = "norm",
+    loss: str = "square",
+) -> TumbleFit:
+    """Calibrate an accelerometer triad from static attitudes.
+
+    Method ``norm`` minimises ``sum_p w_p (|f(M_p)| - g - (tr C_p - u' C_p u) / 2g)^2`` with ``w_p = 1 / u' C_p u``;
+    ``linearised`` is the published first-order iteration.
+
+    Parameters
+    ----------
+    attitudes
+        From `find_attitudes`.
+    order
+        1 to 5, or ``"auto"``: the order that predicts best among those that the attitudes can see.
+    gravity
+        Local gravity, m/s^2. Without it standard gravity is used, with a warning.
+    method
+        ``"norm"`` or ``"linearised"``.
+    loss
+        ``"square"``, or ``"huber"`` against single disturbed attitudes (method norm only).
+
+    Raises
+    ------
+    ObservabilityError
+        The attitudes cannot separate the model's parameters; the message names them and what would help.
+    DataError
+        The attitudes cannot be those of an accelerometer triad in the given unit.
+    OptionError
+        An option has an unknown value.
+    """
+    _check_options(order, method, loss)
+    local = _gravity(gravity)
+    check_attitudes(attitudes, local.value)
+    scaling = _scaling(attitudes, local.value)
+    reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
+    spread = scaling.scale[:, None] * scaling.scale
+    noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
+    problem = Problem(reading, noise, 1, robust=loss == "huber")
+    choice: OrderChoice | None = None
+    if order == "auto":
+        if len(attitudes) >= parameter_count(1):
+            choice = choose_order(problem, local.value)
+        chosen = choice.order if choice else 1
+    else:
+        chosen = int(order)
+    problem = Problem(reading, noise, chosen, robust=loss == "huber")
+    solution, seen = _solve(problem, attitudes, method)
+    check_residuals(attitudes, solution, local.value)
+    check_axes(attitudes, forces(problem, solution)[0])
+    matrix, freedom = _covariance(problem, solution)
+    record = make_record(
+        attitudes=attitudes,
+        gravity=local,
+        scaling=scaling,
+        problem=problem,
+        solution=solution,
+        covariance=matrix,
+        coverage=coverage_factor(freedom) if matrix is not None else None,
+        observability=seen,
+        orders=choice.rows if choice else (),
+        options={"order": order, "method": method, "loss": loss, "gravity": local.value},
+    )
+    return TumbleFit(
+        calibration=record,
+        observability=seen,
+        orders=choice.rows if choice else (),
+        residuals=local.value * solution.deviations[0],
+        down_weights=solution.down_weights[0],
+    )
+
+
+def _check_options(order: int | str, method: str, loss: str) -> None:
+    known = ("auto", *range(1, HIGHEST_ORDER + 1))
+    if order not in known or isinstance(order, bool):
+        raise OptionError(f"order {order!r}: expected one of {' '.join(map(str, known))}")
+    if method not in METHODS:
+        raise OptionError(f"method {method!r}: expected one of {' '.join(METHODS)}")
+    if loss not in LOSSES:
+        raise OptionError(f"loss {loss!r}: expected one of {' '.join(LOSSES)}")
+    if loss == "huber" and method == "linearised":
+        raise OptionError("loss huber needs method norm, found method linearised")
+
+
+def _gravity(gravity: float | Gravity | None) -> Gravity:
+    if gravity is None:
+        return Gravity(STANDARD_GRAVITY, "standard gravity, none given")
+    local = gravity if isinstance(gravity, Gravity) else Gravity(float(gravity), "argument")
+    if not 0.5 < local.value < 50.0:
+        raise OptionError(f"gravity {local.value:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
+    return local
+
+
+def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
+    """Nominal sensor: by its unit, or for counts and volts from the span of each axis."""
+    unit = parse_unit(attitudes.unit)
+    if unit.quantity == "acceleration":
+        return Scaling(np.zeros(3), np.full(3, gravity / to_si(1.0, unit.symbol)))
+    high, low = attitudes.mean.max(axis=0), attitudes.mean.min(axis=0)
+    return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
+
+
+def _solve(problem: Problem, attitudes: Attitudes, method: str) -> tuple[Solution, Observability]:
+    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    if method == "linearised" and n >= size:
+        solution = solve_linearised(problem, attitudes.recording.name)
+    else:
+        solution = solve_norm(problem, limit=chi_square_limit(n - size))
+    seen = observability(solution.jacobian[0], absolute_weights(problem, solution))
+    if seen.rank < size:
+        names = parameter_names(problem.order)
+        confused = seen.confused(names)
+        shown = " ".join(confused[:8]) + (f" and {len(confused) - 8} more" if len(confused) > 8 else "")
+        help_from = helpful_attitudes(problem.order, solution, count=2)
+        found = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
+        trace = f"; {attitudes.trace.describe()}" if attitudes.trace is not None and n < size else ""
+        raise ObservabilityError(
+            f"{attitudes.recording.name}: {n} attitudes{found} determine {seen.rank} of the {size} parameters of "
+            f"order {problem.order}; they cannot separate {shown}; attitudes with the upward direction near "
+            f"{help_from} would help most{trace}"
+        )
+    if not solution.converged[0]:
+        raise DataError(
+            f"{attitudes.recording.name}: the fit of order {problem.order} does not converge on these {n} attitudes "
+            f"(condition number {seen.condition:.0f}); use a lower order or more attitudes"
+        )
+    return solution, seen
+
+
+def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
+    """Covariance of theta, shape (p, p), and the degrees of freedom of its scale (None: noise known)."""
+    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    freedom = n - size
+    base = covariance(solution.jacobian, 1 / solution.variance)[0]
+    known = problem.covariance is not None
+    if problem.robust and freedom > 0:
+        factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
+        return base * factor, float(freedom)
+    if known:
+        estimated = bool(solution.excess[0] > 0)
+        return base, float(freedom) if estimated else None
+    if freedom == 0:
+        return None, None
+    chi_square = float((solution.residuals[0] ** 2 / solution.variance[0]).sum())
+    return base * (chi_square / freedom), float(freedom)

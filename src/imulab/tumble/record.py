@@ -1,0 +1,236 @@
+"""The calibration record of a tumble test: parameters in SI, and what its figures need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from imulab.attitudes import Attitudes
+from imulab.calibration import Calibration, Covariance, Parameter
+from imulab.estimate import Observability, leverage
+from imulab.recording import Array
+from imulab.tumble.model import AXES, GAUGE, parameter_names
+from imulab.tumble.orders import OrderRow
+from imulab.tumble.solve import Problem, Solution, forces
+
+_STANDS_OUT = 4.0
+_DOWN_WEIGHTED = 0.5
+_HIGH_CONDITION = 300.0
+_FEW_DEGREES = 5
+_TO_MICRO = 1e6
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Local gravity, m/s^2, and where the value comes from."""
+
+    value: float
+    origin: str
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Nominal zero and scale (output per g) of each axis, shape (3,), that the fit works relative to."""
+
+    zero: Array
+    scale: Array
+
+
+def make_record(
+    *,
+    attitudes: Attitudes,
+    gravity: Gravity,
+    scaling: Scaling,
+    problem: Problem,
+    solution: Solution,
+    covariance: Array | None,
+    coverage: float | None,
+    observability: Observability,
+    orders: tuple[OrderRow, ...],
+    options: Mapping[str, Any],
+) -> Calibration:
+    """Turn a solution in units of g into the record.
+
+    ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; `covariance` is carried along by
+    their derivatives. `coverage` is the factor of a 95 % interval.
+    """
+    g, order = gravity.value, problem.order
+    names = parameter_names(order)
+    values, derivative = _to_si(solution.theta[0], scaling, g, order)
+    matrix = None if covariance is None else derivative @ covariance @ derivative.T
+    recording = attitudes.recording
+    n, size = len(attitudes), len(names)
+    chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
+    known = problem.covariance is not None
+    if not known:
+        chi_square *= g**2
+    model: dict[str, Any] = {
+        "order": order,
+        "gravity": {"value": g, "unit": "m/s^2", "from": gravity.origin},
+        "output_unit": attitudes.unit,
+        "gauge": GAUGE,
+    }
+    if attitudes.temperature is not None:
+        model["temperature"] = {"value": attitudes.temperature, "unit": "degC"}
+    return Calibration(
+        procedure="tumble",
+        parameters={
+            name: Parameter(float(values[i]), None if matrix is None else float(np.sqrt(matrix[i, i])), unit)
+            for i, (name, unit) in enumerate(zip(names, _units(order, attitudes.unit), strict=True))
+        },
+        covariance=Covariance((), ())
+        if matrix is None
+        else Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
+        model=model,
+        fit={
+            "method": options["method"],
+            "loss": options["loss"],
+            "attitudes": n,
+            "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
+            "leave_one_out": _leave_one_out(orders, order, g),
+            "degrees_of_freedom": n - size,
+            "reduced_chi_square": chi_square / (n - size) if n > size else None,
+            "noise": "known" if known else "estimated from the residuals",
+            "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
+            "coverage_factor_95": coverage,
+            "rank": observability.rank,
+            "condition_number": observability.condition,
+            "iterations": int(solution.iterations[0]),
+            "orders": [asdict(row) for row in orders],
+        },
+        options=dict(options),
+        data=_data(attitudes, scaling, problem, solution, g),
+        sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
+        sources=(recording.source,) if recording.source else (),
+        warnings=tuple(_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(n - size, 1))),
+    )
+
+
+def zero_outputs(record: Calibration) -> dict[str, Parameter]:
+    """Return what each axis puts out at zero specific force, S b, with its uncertainty, in the output's unit."""
+    found = {}
+    for axis in AXES:
+        b, s = record.parameters[f"bias_{axis}"], record.parameters[f"scale_factor_{axis}"]
+        uncertainty = None
+        if record.covariance.names:
+            index = [record.covariance.names.index(f"{name}_{axis}") for name in ("bias", "scale_factor")]
+            block = record.covariance.array()[np.ix_(index, index)]
+            gradient = np.array([s.value, b.value])
+            uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
+        found[axis] = Parameter(s.value * b.value, uncertainty, str(record.model["output_unit"]))
+    return found
+
+
+def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
+    """Return the parameter vector in SI and its derivative with respect to theta, shape (p, p)."""
+    zero, sigma = theta[:3], theta[3:6]
+    scale_factor = scaling.scale * sigma / g
+    bias = (scaling.zero + scaling.scale * zero) / scale_factor
+    powers = np.repeat(np.arange(1, order), 3)
+    values = np.concatenate([bias, scale_factor, theta[6:9], theta[9:] / g**powers])
+    derivative = np.diag(
+        np.concatenate([scaling.scale / scale_factor, scaling.scale / g, np.ones(3), g ** -powers.astype(float)])
+    )
+    derivative[range(3), range(3, 6)] = -bias / sigma
+    return values, derivative
+
+
+def _units(order: int, output: str) -> list[str]:
+    nonlinearity = ["1/(m/s^2)" if j == 1 else f"1/(m/s^2)^{j}" for j in range(1, order)]
+    return ["m/s^2"] * 3 + [f"{output}/(m/s^2)"] * 3 + ["rad"] * 3 + [unit for unit in nonlinearity for _ in AXES]
+
+
+def _leave_one_out(orders: tuple[OrderRow, ...], order: int, g: float) -> dict[str, Any] | None:
+    for row in orders:
+        if row.order == order and row.leave_one_out is not None:
+            return {"value": row.leave_one_out, "unit": "m/s^2"}
+    return None
+
+
+def _data(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: Solution, g: float) -> dict[str, Any]:
+    known = problem.covariance is not None
+    before = np.linalg.norm(problem.reading[0], axis=1) - 1
+    uncertainty = np.sqrt(solution.own_variance[0]) * g
+    data: dict[str, Any] = {
+        "attitudes": {
+            "label": [attitudes.label(i) for i in range(len(attitudes))],
+            "start": attitudes.start.tolist(),
+            "stop": attitudes.stop.tolist(),
+            "samples": attitudes.samples.tolist(),
+            "mean": attitudes.mean.tolist(),
+            "covariance": None if attitudes.covariance is None else attitudes.covariance.tolist(),
+            "force": (g * forces(problem, solution)[0]).tolist(),
+            "residual": (g * solution.deviations[0]).tolist(),
+            "residual_before": (g * before).tolist(),
+            "standard_uncertainty": uncertainty.tolist() if known else None,
+            "down_weight": solution.down_weights[0].tolist(),
+        }
+    }
+    if attitudes.trace is not None:
+        trace = attitudes.trace
+        data["trace"] = {
+            "time": np.round(trace.time, 6).tolist(),
+            "deviation": (np.sqrt(trace.variance) / float(np.mean(scaling.scale)) * g).tolist(),
+            "threshold": float(np.sqrt(trace.threshold) / np.mean(scaling.scale) * g),
+            "unit": "m/s^2",
+        }
+    return data
+
+
+def _warnings(
+    attitudes: Attitudes,
+    gravity: Gravity,
+    problem: Problem,
+    solution: Solution,
+    observability: Observability,
+    reduced_chi_square: float,
+) -> list[str]:
+    n, size = len(attitudes), solution.theta.shape[1]
+    found = list(attitudes.recording.notes)
+    if gravity.origin.startswith("standard"):
+        found.append(
+            f"no local gravity was given: standard gravity {gravity.value} m/s^2 was used, and every scale factor "
+            "inherits its difference from the local value (0.5 % from pole to equator)"
+        )
+    if solution.excess[0] > 0:
+        found.append(
+            f"the attitudes scatter more than their own noise explains (reduced chi-square {reduced_chi_square:.1f}): "
+            f"{_TO_MICRO * solution.excess[0]:.0f} µg were added to each attitude's uncertainty"
+        )
+    standard = _standardised(problem, solution)
+    found += [
+        f"down-weighted to {solution.down_weights[0][index]:.2f}: {attitudes.label(index)}, "
+        f"residual {1e3 * solution.deviations[0][index]:+.3f} mg"
+        for index in np.flatnonzero(solution.down_weights[0] < _DOWN_WEIGHTED).tolist()
+    ]
+    found += [
+        f"{attitudes.label(index)} stands out by {abs(standard[index]):.1f} standard deviations (residual "
+        f"{1e3 * solution.deviations[0][index]:+.3f} mg); --loss huber keeps it from spoiling the rest"
+        for index in np.flatnonzero(np.abs(standard) > _STANDS_OUT).tolist()
+        if not problem.robust
+    ]
+    if observability.condition > _HIGH_CONDITION:
+        confused = observability.confused(parameter_names(problem.order))
+        found.append(
+            f"condition number {observability.condition:.0f}: these attitudes hardly separate {' '.join(confused[:6])}"
+        )
+    if n == size and problem.covariance is None:
+        found.append(
+            f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
+        )
+    elif n - size < _FEW_DEGREES and problem.covariance is None:
+        found.append(f"only {n - size} degrees of freedom: the uncertainties are themselves uncertain")
+    return found
+
+
+def _standardised(problem: Problem, solution: Solution) -> Array:
+    """Residuals over their standard deviations, shape (n,), their level from the residuals where noise is unknown."""
+    n, size = problem.reading.shape[1], solution.theta.shape[1]
+    share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
+    standard: Array = solution.residuals[0] / np.sqrt(solution.variance[0] * share)
+    if problem.covariance is None and n > size:
+        standard = standard / np.sqrt(float((solution.weights[0] * solution.residuals[0] ** 2).sum()) / (n - size))
+    return standard if n > size else np.zeros(n)

@@ -1,0 +1,310 @@
+"""The estimators of a tumble test, for batches of problems in units of g.
+
+`solve_norm` minimises ``sum_p w_p (|f(M_p)| - 1)^2`` with the model inverted exactly; `solve_linearised` is the
+published first-order iteration. Both return the same `Solution`.
+
+Sources: the method's patent (linearised); noise-length term: second-order expansion of |f + e|.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import DataError
+from imulab.estimate import (
+    Fit,
+    excess_variance,
+    huber_weights,
+    levenberg_marquardt,
+    leverage,
+    robust_scale,
+)
+from imulab.recording import Array
+from imulab.tumble.model import norm_and_jacobian, parameter_count
+
+_SCALE_CHANGE = 5e-6
+_BIAS_CHANGE = 2e-6
+_MISALIGNMENT_CHANGE = 3 / 3600 * np.pi / 180
+_LINEARISED_PASSES = 50
+_REWEIGHTING_PASSES = {False: 4, True: 30}
+_WEIGHTS_AT_REST = 1e-4
+_WORST_DEFLECTION = 0.98
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Attitudes of a batch of units, scaled: outputs less a nominal zero, over a nominal scale, in units of g.
+
+    Attributes
+    ----------
+    reading
+        Shape (b, n, 3).
+    covariance
+        Of each mean, shape (b or 1, n, 3, 3), in g^2; None where nothing is known.
+    order
+        Order of the model.
+    robust
+        Huber's loss instead of squares.
+    excess
+        Whether attitudes that scatter more than their covariances allow get a common further variance.
+    """
+
+    reading: Array
+    covariance: Array | None
+    order: int
+    robust: bool = False
+    excess: bool = True
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Solutions of a batch of problems, in units of g.
+
+    Attributes
+    ----------
+    theta
+        Zero, relative scale factor, misalignment, nonlinearity, shape (b, p).
+    residuals
+        |f| - 1 less the lengthening by noise, shape (b, n).
+    deviations
+        |f| - 1 as it is, shape (b, n).
+    jacobian
+        Of |f|, shape (b, n, p).
+    variance
+        Of |f| in each attitude, own and excess, shape (b, n); ones where noise is unknown.
+    own_variance
+        Without excess.
+    down_weights
+        Huber's factors, shape (b, n), ones without robust loss.
+    scale
+        Standard deviation that residuals were standardised with, in units of sqrt(variance), shape (b,).
+    excess
+        Standard deviation added to each attitude, shape (b,).
+    iterations, converged
+        Shape (b,).
+    """
+
+    theta: Array
+    residuals: Array
+    deviations: Array
+    jacobian: Array
+    variance: Array
+    own_variance: Array
+    down_weights: Array
+    scale: Array
+    excess: Array
+    iterations: NDArray[np.int64]
+    converged: NDArray[np.bool_]
+
+    @property
+    def weights(self) -> Array:
+        """Weights of the last pass, shape (b, n)."""
+        return self.down_weights / self.variance
+
+    def standardised(self) -> Array:
+        """Residuals over their standard deviations, shape (b, n)."""
+        return self.residuals / (np.sqrt(self.variance) * self.scale[:, None])
+
+
+def start_parameters(order: int, count: int = 1) -> Array:
+    """Return the nominal sensor as a start, shape (count, p)."""
+    theta = np.zeros((count, parameter_count(order)))
+    theta[:, 3:6] = 1.0
+    return theta
+
+
+def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.inf) -> Solution:
+    """Fit |f| = 1 by weighted least squares, or with Huber's loss.
+
+    Weights are ``1 / (q' C q)``, q = d|f|/dM: each attitude's own noise along its own vertical. They and the
+    lengthening of |f| by noise across it are recomputed at the solution and the fit repeated, twice, or until Huber's
+    weights rest.
+
+    Parameters
+    ----------
+    problem
+        The attitudes.
+    start
+        Start parameters, shape (b, p); the nominal sensor if not given.
+    limit
+        Chi-square beyond which the attitudes' own covariances are taken as too small and a common excess
+        variance is estimated (Mandel-Paule).
+    """
+    count, n, _ = problem.reading.shape
+    theta = start_parameters(problem.order, count) if start is None else start
+    size = parameter_count(problem.order)
+    lengthening, own = _noise(problem, theta)
+    variance, down, scale = own, np.ones((count, n)), np.ones(count)
+    excess = np.zeros(count)
+    iterations = np.zeros(count, dtype=np.int64)
+    repeat = problem.robust or problem.covariance is not None
+    for number in range(_REWEIGHTING_PASSES[problem.robust] if repeat else 1):
+        # The first pass only has to be good enough to weigh by.
+        fit = _least_squares(problem, theta, down / variance, lengthening, 1e-9 if number or not repeat else 1e-4)
+        iterations += fit.iterations
+        theta, before = fit.parameters, down / variance
+        lengthening, own = _noise(problem, theta)
+        residuals = fit.residuals
+        if problem.covariance is not None and problem.excess and not problem.robust:
+            too_large = (residuals**2 / own).sum(axis=1) > limit
+            found = excess_variance(residuals, own, max(n - size, 1)) if too_large.any() else np.zeros(count)
+            excess = np.where(too_large, found, 0.0)
+        variance = own + excess[:, None]
+        if problem.robust:
+            standard = residuals / np.sqrt(variance * np.maximum(1 - leverage(fit.jacobian, down / variance), 0.05))
+            measured = robust_scale(residuals / np.sqrt(variance), size)
+            scale = np.maximum(measured, 1.0) if problem.covariance is not None else measured
+            down = huber_weights(standard / np.maximum(scale, 1e-12)[:, None])
+        if np.abs(down / variance / before - 1).max() < _WEIGHTS_AT_REST:
+            break
+    if problem.covariance is None:
+        lengthening = np.repeat(_mean_square(fit, down, size)[:, None], n, axis=1)
+        fit = _least_squares(problem, theta, down / variance, lengthening)
+        theta = fit.parameters
+    return Solution(
+        theta=theta,
+        residuals=fit.residuals,
+        deviations=fit.residuals + lengthening,
+        jacobian=fit.jacobian,
+        variance=variance,
+        own_variance=own,
+        down_weights=down,
+        scale=scale,
+        excess=np.sqrt(excess),
+        iterations=iterations,
+        converged=fit.converged,
+    )
+
+
+def _least_squares(
+    problem: Problem,
+    theta: Array,
+    weights: Array,
+    lengthening: Array,
+    tolerance: float = 1e-9,
+    max_iterations: int = 40,
+) -> Fit:
+    def model(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
+        reading = problem.reading if len(index) == len(problem.reading) else problem.reading[index]
+        norm, jacobian, _, _ = norm_and_jacobian(parameters, reading, problem.order)
+        return norm - 1 - lengthening[index], jacobian
+
+    return levenberg_marquardt(model, theta, weights, tolerance=tolerance, max_iterations=max_iterations)
+
+
+def _mean_square(fit: Fit, down: Array, size: int) -> Array:
+    """Variance of |f| from the residuals, shape (b,): without better knowledge, that of every component of f."""
+    count = fit.residuals.shape[1]
+    used: Array = (down * fit.residuals**2).sum(axis=1) / max(count - size, 1)
+    return used
+
+
+def _noise(problem: Problem, theta: Array) -> tuple[Array, Array]:
+    """Lengthening ``(tr C_f - u' C_f u) / 2`` of |f| by noise, and its variance ``q' C q``, shapes (b, n)."""
+    count, n, _ = problem.reading.shape
+    if problem.covariance is None:
+        return np.zeros((count, n)), np.ones((count, n))
+    norm, _, inversion, q = norm_and_jacobian(theta, problem.reading, problem.order)
+    covariance = np.broadcast_to(problem.covariance, (count, n, 3, 3))
+    along = np.einsum("bni,bnij,bnj->bn", q, covariance, q)
+    # df/dM = T^-1 diag(1 / (slope S)); the trace of the covariance that it carries into f
+    per_axis = 1 / (inversion.slope * theta[:, None, 3:6])
+    carried = _unalign(theta[:, 6:9])[:, None] * per_axis[:, :, None, :]
+    trace = np.einsum("bnki,bnij,bnkj->bn", carried, covariance, carried)
+    return (trace - along) / (2 * norm), along
+
+
+def _unalign(misalignment: Array) -> Array:
+    """T^-1 of each problem, shape (b, 3, 3)."""
+    inverse = np.zeros((len(misalignment), 3, 3))
+    inverse[:, range(3), range(3)] = 1.0
+    yx, zx, zy = misalignment.T
+    inverse[:, 1, 0] = -yx
+    inverse[:, 2, 0] = zy * yx - zx
+    inverse[:, 2, 1] = -zy
+    return inverse
+
+
+def forces(problem: Problem, solution: Solution) -> Array:
+    """Return the specific force in each attitude, units of g, shape (b, n, 3)."""
+    return norm_and_jacobian(solution.theta, problem.reading, problem.order)[2].force
+
+
+def leave_one_out(problem: Problem, solution: Solution) -> Array:
+    """Return the error |f| - 1 of each attitude under the fit to all others, shape (n,), for a batch of one.
+
+    Each of the n refits is one problem of a batch, with the weights of the whole fit and one of them set to zero.
+    """
+    n = problem.reading.shape[1]
+    repeated = replace(problem, reading=np.broadcast_to(problem.reading[0], (n, n, 3)))
+    weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
+    lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
+    fit = _least_squares(repeated, np.repeat(solution.theta, n, axis=0), weights, lengthening, max_iterations=12)
+    errors: Array = np.diagonal(fit.residuals)
+    return errors
+
+
+def solve_linearised(problem: Problem, name: str) -> Solution:
+    """Run the published first-order iteration for a batch of one; weights and covariances as for `solve_norm`.
+
+    ``sum_i sum_j d_ji a_i^(j+1) + m_1 a_x a_y + m_2 a_y a_z + m_3 a_z a_x = (|B|^2 - 1) / 2``, solved by linear least
+    squares until every change is below 5 ppm, 2 ug and 3 arcsec.
+
+    Raises
+    ------
+    DataError
+        The iteration does not converge.
+    """
+    order = problem.order
+    _, own = _noise(problem, start_parameters(order))
+    root = 1 / np.sqrt(own[0])
+    reading = problem.reading[0]
+    bias, scale, misalignment = np.zeros(3), np.ones(3), np.zeros(3)
+    for number in range(1, _LINEARISED_PASSES + 1):
+        a = reading / scale - bias
+        x = a[:, 0]
+        y = a[:, 1] - misalignment[0] * x
+        z = a[:, 2] - misalignment[1] * x - misalignment[2] * y
+        products = np.column_stack([a[:, 0] * a[:, 1], a[:, 2] * a[:, 0], a[:, 1] * a[:, 2]])
+        design = np.column_stack([*(a ** (j + 1) for j in range(order + 1)), products])
+        right = (x * x + y * y + z * z - 1) / 2
+        solution = np.linalg.lstsq(design * root[:, None], right * root, rcond=None)[0]
+        change = solution[: 3 * (order + 1)].reshape(order + 1, 3)
+        bias = bias + change[0]
+        scale = scale * (1 + change[1])
+        misalignment = misalignment + solution[3 * (order + 1) :]
+        if not (np.abs(change[:2]).max() < _WORST_DEFLECTION and np.isfinite(solution).all()):
+            break
+        if (
+            np.abs(change[1]).max() < _SCALE_CHANGE
+            and np.abs(change[0]).max() < _BIAS_CHANGE
+            and np.abs(solution[3 * (order + 1) :]).max() < _MISALIGNMENT_CHANGE
+        ):
+            theta = np.concatenate([scale * bias, scale, misalignment, change[2:].ravel()])[None]
+            return _evaluated(problem, theta, number)
+    raise DataError(
+        f"{name}: method linearised does not converge on these attitudes (after {number} passes); use --method norm"
+    )
+
+
+def _evaluated(problem: Problem, theta: Array, iterations: int) -> Solution:
+    """Wrap given parameters as a solution."""
+    norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, problem.order)
+    lengthening, own = _noise(problem, theta)
+    n = norm.shape[1]
+    return Solution(
+        theta=theta,
+        residuals=norm - 1 - lengthening,
+        deviations=norm - 1,
+        jacobian=jacobian,
+        variance=own,
+        own_variance=own,
+        down_weights=np.ones((1, n)),
+        scale=np.ones(1),
+        excess=np.zeros(1),
+        iterations=np.array([iterations]),
+        converged=np.array([True]),
+    )

@@ -1,0 +1,150 @@
+"""Unit strings and their SI values.
+
+Inside imulab every number is in SI (s, m/s^2, rad, rad/s; temperature in degC). This module is the one place
+that knows other units. What a sensor puts out before calibration (counts, volts) has no SI value of its own:
+such units are kept as they are, with the quantity ``"output"``.
+
+Source: SI brochure, 9th edition; standard gravity: 3rd CGPM (1901), 9.80665 m/s^2 exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import UnitError
+
+STANDARD_GRAVITY = 9.80665
+"""Standard acceleration of gravity, m/s^2. A unit of measurement, not the gravity of any place."""
+
+_DEGREE = math.pi / 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit: its symbol, the quantity that it measures, and ``SI = value * factor + offset``."""
+
+    symbol: str
+    quantity: str
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+_UNITS = {
+    unit.symbol: unit
+    for unit in (
+        Unit("s", "time"),
+        Unit("ms", "time", 1e-3),
+        Unit("us", "time", 1e-6),
+        Unit("m/s^2", "acceleration"),
+        Unit("g", "acceleration", STANDARD_GRAVITY),
+        Unit("mg", "acceleration", 1e-3 * STANDARD_GRAVITY),
+        Unit("ug", "acceleration", 1e-6 * STANDARD_GRAVITY),
+        Unit("rad", "angle"),
+        Unit("mrad", "angle", 1e-3),
+        Unit("urad", "angle", 1e-6),
+        Unit("deg", "angle", _DEGREE),
+        Unit("arcsec", "angle", _DEGREE / 3600.0),
+        Unit("rad/s", "rate"),
+        Unit("deg/s", "rate", _DEGREE),
+        Unit("deg/h", "rate", _DEGREE / 3600.0),
+        Unit("degC", "temperature"),
+        Unit("K", "temperature", 1.0, -273.15),
+        Unit("count", "output"),
+        Unit("V", "output"),
+        Unit("count/(deg/s)", "output per rate", 1.0 / _DEGREE),
+        Unit("V/(deg/s)", "output per rate", 1.0 / _DEGREE),
+        Unit("m", "length"),
+        Unit("Hz", "frequency"),
+        Unit("1", "number"),
+        Unit("ppm", "number", 1e-6),
+    )
+}
+
+_SPELLINGS = {
+    "µs": "us",
+    "μs": "us",
+    "µg": "ug",
+    "μg": "ug",
+    "m/s²": "m/s^2",
+    "m/s2": "m/s^2",
+    "m/s**2": "m/s^2",
+    "°C": "degC",
+    "°/s": "deg/s",
+    "°": "deg",
+    "counts": "count",
+}
+
+
+def parse_unit(text: str) -> Unit:
+    """Return the unit that a symbol stands for.
+
+    Parameters
+    ----------
+    text
+        Symbol, e.g. ``"m/s^2"``, ``"mg"``, ``"deg/h"``, ``"count"``.
+
+    Raises
+    ------
+    UnitError
+        The symbol is not known; the message lists those that are.
+    """
+    symbol = text.strip()
+    unit = _UNITS.get(_SPELLINGS.get(symbol, symbol))
+    if unit is None:
+        raise UnitError(f"unknown unit {text!r}; known units: {' '.join(_UNITS)}")
+    return unit
+
+
+@overload
+def to_si(values: float, unit: str) -> float: ...
+@overload
+def to_si(values: NDArray[np.float64], unit: str) -> NDArray[np.float64]: ...
+def to_si(values: float | NDArray[np.float64], unit: str) -> float | NDArray[np.float64]:
+    """Convert values in `unit` to SI (counts and volts are returned as they are).
+
+    Raises
+    ------
+    UnitError
+        The unit is not known.
+    """
+    known = parse_unit(unit)
+    if known.factor == 1.0 and known.offset == 0.0:
+        return values
+    return values * known.factor + known.offset
+
+
+@overload
+def from_si(values: float, unit: str) -> float: ...
+@overload
+def from_si(values: NDArray[np.float64], unit: str) -> NDArray[np.float64]: ...
+def from_si(values: float | NDArray[np.float64], unit: str) -> float | NDArray[np.float64]:
+    """Convert SI values to `unit`; the inverse of `to_si`.
+
+    Raises
+    ------
+    UnitError
+        The unit is not known.
+    """
+    known = parse_unit(unit)
+    if known.factor == 1.0 and known.offset == 0.0:
+        return values
+    return (values - known.offset) / known.factor
+
+
+def conversion_factor(source: str, target: str) -> float:
+    """Return the factor that turns an interval in `source` into one in `target`.
+
+    Raises
+    ------
+    UnitError
+        The two do not measure the same quantity; counts and volts convert only to themselves.
+    """
+    a, b = parse_unit(source), parse_unit(target)
+    if a.quantity != b.quantity or (a.quantity.startswith("output") and a.symbol != b.symbol):
+        raise UnitError(f"cannot convert {a.symbol} ({a.quantity}) to {b.symbol} ({b.quantity})")
+    return a.factor / b.factor if a.symbol != b.symbol else 1.0
