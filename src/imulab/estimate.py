@@ -25,6 +25,10 @@ Model = Callable[[Array, Index], tuple[Array, Array]]
 _HUBER = 1.345
 """95 % efficiency for normal errors (Huber 1981)."""
 _MAX_DAMPING = 1e12
+_LEAST_DAMPING = 1e-12
+"""Keeps combinations that nothing determines in place; slows no others."""
+_SENSED = 1e-9
+"""Columns of the Jacobian shorter than this, relative to the longest, are parameters that nothing senses."""
 
 
 @dataclass(frozen=True)
@@ -116,18 +120,18 @@ def levenberg_marquardt(
 
 
 def _damped_step(normal: Array, gradient: Array, damping: Array) -> Array:
-    """Solve ``(H + damping diag H) step = -g`` in scaled parameters; a singular H gets the smallest useful damping."""
-    scale = np.sqrt(np.maximum(np.einsum("bpp->bp", normal), np.finfo(float).tiny))
+    """Solve ``(H + damping diag H) step = -g`` in scaled parameters; what nothing senses stays where it is."""
+    scale = np.sqrt(np.einsum("bpp->bp", normal))
+    idle = ~(scale > _SENSED * scale.max(axis=1, keepdims=True))
+    scale = np.where(idle, 1.0, scale)
     scaled = normal / (scale[:, :, None] * scale[:, None, :])
     size = scaled.shape[1]
-    scaled[:, range(size), range(size)] += np.maximum(damping, 1e-15)[:, None]
-    right = (-gradient / scale)[:, :, None]
-    try:
-        solution = np.linalg.solve(scaled, right)
-    except np.linalg.LinAlgError:
-        scaled[:, range(size), range(size)] += 1e-8
-        solution = np.linalg.solve(scaled, right)
-    step: Array = solution[:, :, 0] / scale
+    diagonal = np.where(idle, 1.0, np.maximum(damping, _LEAST_DAMPING)[:, None])
+    if idle.any():
+        scaled = np.where(idle[:, :, None] | idle[:, None, :], 0.0, scaled)
+        gradient = np.where(idle, 0.0, gradient)
+    scaled[:, range(size), range(size)] += diagonal
+    step: Array = np.linalg.solve(scaled, (-gradient / scale)[:, :, None])[:, :, 0] / scale
     return step
 
 
@@ -152,7 +156,7 @@ class Observability:
     condition
         Largest over smallest singular value of the weighted Jacobian with columns scaled to length 1.
     blind
-        Combinations that are not determined, as unit vectors in the parameters, shape (p - rank, p).
+        Combinations that are not determined, as unit vectors in the scaled parameters, shape (p - rank, p).
     weakest
         The combination that is determined worst, shape (p,).
     """
@@ -186,7 +190,7 @@ def observability(jacobian: Array, weights: Array) -> Observability:
     weighted = np.zeros((max(int(used.sum()), size), size))
     weighted[: int(used.sum())] = jacobian[used] * np.sqrt(weights[used])[:, None]
     scale = np.linalg.norm(weighted, axis=0)
-    scale = np.where(scale > 0, scale, np.finfo(float).tiny)
+    scale = np.where(scale > _SENSED * scale.max(), scale, scale.max())
     _, values, vectors = np.linalg.svd(weighted / scale, full_matrices=False)
     values = np.maximum(values, np.finfo(float).eps * values[0])
     directions = vectors / scale
@@ -197,8 +201,8 @@ def observability(jacobian: Array, weights: Array) -> Observability:
     return Observability(
         rank=int(determined.sum()),
         condition=float(values[0] / values[-1]),
-        blind=(directions / length[:, None])[~determined],
-        weakest=directions[-1] / length[-1],
+        blind=vectors[~determined],
+        weakest=vectors[-1],
     )
 
 

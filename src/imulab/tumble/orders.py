@@ -17,6 +17,8 @@ from imulab.tumble.model import HIGHEST_ORDER, parameter_count
 from imulab.tumble.solve import Problem, Solution, leave_one_out, solve_norm
 
 _SIGNIFICANT = 0.05
+_ROUNDING = 1e-30
+"""Smallest variance of |f| that is told from rounding, g^2."""
 _NOTHING_KNOWN = 1e12
 """Inverse variance where no residual tells the noise: only the geometry is judged then."""
 
@@ -115,7 +117,7 @@ def absolute_weights(problem: Problem, fit: Solution) -> Array:
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if problem.covariance is None and n > size and not problem.robust:
         mean_square = float((weights * fit.residuals[0] ** 2).sum()) / (n - size)
-        weights = weights / max(mean_square, np.finfo(float).tiny)
+        weights = weights / max(mean_square, _ROUNDING)
     elif problem.covariance is None and n <= size:
         weights = weights * _NOTHING_KNOWN
     return weights

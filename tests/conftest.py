@@ -1,0 +1,82 @@
+"""Fixtures: real recordings where they are, a browser where there is one, and the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from imulab.recording import Recording
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--reduced", action="store_true", help="fewer trials in the statistical tests")
+
+
+@pytest.fixture(scope="session")
+def reduced(request: pytest.FixtureRequest) -> bool:
+    return bool(request.config.getoption("--reduced"))
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of real recordings: IMULAB_DATA, by default beside the checkout."""
+    folder = Path(os.environ.get("IMULAB_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not (folder / "xsens_mti").is_dir():
+        pytest.skip(f"real recordings are not here (IMULAB_DATA or {folder.name}/)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium on this machine (Debian package chromium)")
+    return path
+
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture
+def imulab(tmp_path: Path) -> Run:
+    """Run the command line in a process of its own, in an empty folder."""
+
+    def run(*arguments: object, stdin: str | None = None) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "imulab", *map(str, arguments)],
+            cwd=tmp_path,
+            input=stdin,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+
+    return run
+
+
+def table(outputs: np.ndarray, unit: str = "m/s^2", sigma: float | np.ndarray | None = None) -> Recording:
+    """A table of attitudes as a recording."""
+    columns = {f"accel_{axis}": outputs[:, i].copy() for i, axis in enumerate("xyz")}
+    units = dict.fromkeys(columns, unit)
+    if sigma is not None:
+        stated = np.broadcast_to(sigma, outputs.shape)
+        columns |= {f"std_accel_{axis}": stated[:, i].copy() for i, axis in enumerate("xyz")}
+        units |= {f"std_accel_{axis}": unit for axis in "xyz"}
+    return Recording(columns=columns, units=units, name="table.csv", lines_before=1)
+
+
+def sap5_table(path: Path) -> np.ndarray:
+    """Attitudes of a cave-survey instrument, g, shape (n, 3): a flat list with null and NaN in unused slots."""
+    flat = [value for value in json.loads(path.read_text())["shots"]["grav"] if value is not None and value == value]
+    return np.array(flat).reshape(-1, 3)

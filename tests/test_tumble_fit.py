@@ -1,0 +1,275 @@
+"""The tumble fit against truth, an independent least-squares fit and the published first-order method."""
+
+import re
+
+import numpy as np
+import pytest
+
+import imulab as il
+from conftest import table
+from imulab.errors import DataError, ObservabilityError, OptionError
+from reference import tumble as reference
+
+G = 9.80665
+NATURAL = {"b": 0.05 * G, "s": 1.0, "m": 0.03, "2": 5e-3 / G, "3": 2e-3 / G**2, "4": 1e-3 / G**3, "5": 5e-4 / G**4}
+
+
+def natural(name: str) -> float:
+    return NATURAL[name[1] if name[0] == "k" else name[0]]
+
+
+def outputs(truth, order, directions, gravity=G):
+    return np.array([reference.forward(gravity * d, truth, order) for d in directions])
+
+
+def fit(outputs, order, *, unit="m/s^2", sigma=None, gravity=G, **options):
+    return il.fit_tumble(il.find_attitudes(table(outputs, unit, sigma)), order=order, gravity=gravity, **options)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_norm_recovers_a_noise_free_mems_triad(order):
+    rng = np.random.default_rng(100 + order)
+    for _ in range(5):
+        truth = reference.random_truth(rng, order)
+        found = fit(outputs(truth, order, reference.random_attitudes(rng, 12 * (order + 2))), order).calibration
+        for name, value in truth.items():
+            assert found.value(name) == pytest.approx(value, rel=1e-9, abs=1e-12 * natural(name)), name
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("count", 4096 / G), ("V", 0.1), ("g", 1 / G), ("mg", 1000 / G)])
+def test_every_output_unit_recovers_its_own_scale(unit, scale):
+    rng = np.random.default_rng(7)
+    truth = reference.random_truth(rng, 2, scale=scale)
+    found = fit(outputs(truth, 2, reference.random_attitudes(rng, 40)), 2, unit=unit).calibration
+    for name, value in truth.items():
+        assert found.value(name) == pytest.approx(value, rel=1e-8), name
+    assert found.parameters["scale_factor_x"].unit == f"{unit}/(m/s^2)"
+
+
+def test_a_zero_far_from_the_middle_of_the_range_is_found():
+    rng = np.random.default_rng(8)
+    truth = reference.random_truth(rng, 1, scale=414.0) | {"bias_x": 80.0, "bias_y": 78.0, "bias_z": 81.0}
+    found = fit(outputs(truth, 1, reference.random_attitudes(rng, 24)), 1, unit="count").calibration
+    for name, value in truth.items():
+        assert found.value(name) == pytest.approx(value, rel=1e-9), name
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_noisy_fit_equals_the_reference_fit(order):
+    rng = np.random.default_rng(20 + order)
+    truth = reference.random_truth(rng, order)
+    noisy = outputs(truth, order, reference.random_attitudes(rng, 30)) + 1e-3 * rng.standard_normal((30, 3))
+    found, expected = fit(noisy, order).calibration, reference.reference_fit(noisy, order, G)
+    for name, value in expected.items():
+        # The two differ by the lengthening of |f| by noise, sigma^2 / g, far below one standard uncertainty.
+        assert found.value(name) == pytest.approx(value, abs=5e-3 * found.parameters[name].standard_uncertainty), name
+
+
+def test_stated_covariances_weigh_the_attitudes():
+    rng = np.random.default_rng(31)
+    truth = reference.random_truth(rng, 1)
+    sigma = np.where(np.arange(40)[:, None] % 2 == 0, 1e-4, 1e-2) * np.ones(3)
+    noisy = outputs(truth, 1, reference.random_attitudes(rng, 40)) + sigma * rng.standard_normal((40, 3))
+    weighted, plain = fit(noisy, 1, sigma=sigma).calibration, fit(noisy, 1).calibration
+    errors = [[abs(c.value(n) - v) / natural(n) for n, v in truth.items()] for c in (weighted, plain)]
+    assert np.linalg.norm(errors[0]) < 0.1 * np.linalg.norm(errors[1])
+    for name, value in truth.items():
+        assert abs(weighted.value(name) - value) < 4 * weighted.parameters[name].standard_uncertainty
+
+
+def test_uncertainties_equal_the_cramer_rao_bound():
+    rng = np.random.default_rng(32)
+    truth = reference.random_truth(rng, 2)
+    directions = reference.random_attitudes(rng, 30)
+    sigma = rng.uniform(1e-4, 3e-4, (30, 3))
+    found = fit(outputs(truth, 2, directions), 2, sigma=sigma).calibration
+    bound = reference.bound(directions, truth, 2, G, sigma)
+    size = np.sqrt(np.outer(np.diag(bound), np.diag(bound)))
+    np.testing.assert_allclose(found.covariance.array() / size, bound / size, rtol=0, atol=1e-3)
+
+
+def test_noise_makes_single_samples_long_and_the_fit_knows():
+    rng = np.random.default_rng(33)
+    truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
+    sigma = 0.03 * G  # |f| grows by sigma^2 / g = 900 ppm
+    noisy = outputs(truth, 1, reference.random_attitudes(rng, 20_000)) + sigma * rng.standard_normal((20_000, 3))
+    for stated in (sigma, None):
+        found = fit(noisy, 1, sigma=stated).calibration
+        mean = np.mean([found.value(f"scale_factor_{a}") for a in "xyz"]) - 1
+        assert abs(mean) < 4 * sigma / G / np.sqrt(20_000) + 1e-4  # the third order, 3 sigma^4, remains
+
+
+def test_linearised_equals_its_transcription():
+    rng = np.random.default_rng(40)
+    for order in (1, 2, 4):
+        truth = reference.random_truth(rng, order)
+        nominal = {n: (1.0 if n[0] == "s" else 0.0) for n in truth}
+        small = {n: nominal[n] + 0.1 * (truth[n] - nominal[n]) for n in truth}
+        data = outputs(small, order, reference.random_attitudes(rng, 40))
+        start = {f"scale_factor_{a}": 1.0 for a in "xyz"}
+        expected = reference.linearised(data, order, G, start=start)
+        found = fit(data, order, method="linearised").calibration
+        for name, value in expected.items():
+            assert found.value(name) == pytest.approx(value, rel=1e-9, abs=1e-9 * natural(name)), name
+
+
+def test_linearised_is_biased_at_mems_size_and_norm_is_not():
+    """Method document: k2 of 50 µg/g² is off by about 1 µg/g² at MEMS size, 0.05 µg/g² at navigation size."""
+    rng = np.random.default_rng(41)
+    errors = {"mems": [], "navigation": [], "norm": []}
+    for _ in range(10):
+        mems = reference.random_truth(rng, 2) | {f"k2_{a}": 50e-6 / G for a in "xyz"}
+        nominal = {n: (1.0 if n[0] == "s" else 0.0) for n in mems}
+        # scale 1 %, bias 5 mg, misalignment 1 mrad
+        factor = {"s": 1 / 3, "b": 1 / 10, "m": 1 / 35, "k": 1.0}
+        navigation = {n: nominal[n] + factor[n[0]] * (v - nominal[n]) for n, v in mems.items()}
+        directions = reference.random_attitudes(rng, 36)
+        for name, truth, method in (
+            ("mems", mems, "linearised"),
+            ("navigation", navigation, "linearised"),
+            ("norm", mems, "norm"),
+        ):
+            found = fit(outputs(truth, 2, directions), 2, method=method).calibration
+            errors[name] += [abs(found.value(f"k2_{a}") * G * 1e6 - 50) for a in "xyz"]
+            if method == "linearised":
+                assert found.fit["iterations"] <= 6
+    assert np.median(errors["navigation"]) < 0.1
+    assert 0.2 < np.median(errors["mems"]) < 5.0
+    assert max(errors["norm"]) < 1e-6
+
+
+def test_huber_keeps_one_knocked_attitude_from_spoiling_the_rest():
+    rng = np.random.default_rng(50)
+    truth = reference.random_truth(rng, 2)
+    directions = reference.random_attitudes(rng, 30)
+    data = outputs(truth, 2, directions) + 2e-4 * rng.standard_normal((30, 3))
+    clean = fit(data, 2, sigma=2e-4).calibration
+    data[11] += 0.05 * directions[11]  # 5 mg
+    square, huber = fit(data, 2, sigma=2e-4).calibration, fit(data, 2, sigma=2e-4, loss="huber").calibration
+    shift = {
+        loss: max(abs(c.value(n) - clean.value(n)) / clean.parameters[n].standard_uncertainty for n in truth)
+        for loss, c in (("square", square), ("huber", huber))
+    }
+    assert shift["huber"] < 1.5 < 20 < shift["square"]
+    assert [w for w in huber.warnings if "down-weighted" in w and "row 12 (line 13)" in w]
+    assert any("stands out" in w or "scatter more" in w for w in square.warnings)
+
+
+@pytest.mark.parametrize("true_order", [1, 2, 3])
+def test_auto_chooses_the_order_of_the_truth(true_order):
+    rng = np.random.default_rng(60 + true_order)
+    right = 0
+    for _ in range(20):
+        truth = reference.random_truth(rng, true_order)
+        for name in truth:  # nonlinearity that 40 attitudes can see
+            if name.startswith(f"k{true_order}"):
+                truth[name] = NATURAL[str(true_order)] * np.sign(truth[name] or 1.0)
+        data = outputs(truth, true_order, reference.random_attitudes(rng, 40)) + 1e-3 * rng.standard_normal((40, 3))
+        result = fit(data, "auto")
+        right += result.calibration.model["order"] == true_order
+        assert [row.order for row in result.orders] == [1, 2, 3, 4, 5]
+    assert right >= 18  # the F-test at 5 % lets one in twenty go higher
+
+
+def test_unknown_noise_is_estimated_and_said():
+    rng = np.random.default_rng(70)
+    truth = reference.random_truth(rng, 1)
+    data = outputs(truth, 1, reference.random_attitudes(rng, 24)) + 1e-3 * rng.standard_normal((24, 3))
+    found = fit(data, 1).calibration
+    assert found.fit["noise"] == "estimated from the residuals"
+    assert found.fit["degrees_of_freedom"] == 15
+    assert found.fit["coverage_factor_95"] == pytest.approx(2.131450)  # Student's t, 15 degrees of freedom
+    assert found.fit["reduced_chi_square"] == pytest.approx(1e-6, rel=0.6)
+    known = fit(data, 1, sigma=1e-3).calibration
+    assert known.fit["noise"] == "known"
+    assert known.fit["coverage_factor_95"] == pytest.approx(1.959964)
+
+
+def test_attitudes_that_scatter_more_than_stated_get_an_excess():
+    rng = np.random.default_rng(71)
+    truth = reference.random_truth(rng, 1)
+    data = outputs(truth, 1, reference.random_attitudes(rng, 40)) + 1e-3 * rng.standard_normal((40, 3))
+    found = fit(data, 1, sigma=1e-4).calibration
+    assert found.fit["excess"]["value"] == pytest.approx(1e-3, rel=0.4)
+    assert any("scatter more than their own noise" in w for w in found.warnings)
+    for name, value in truth.items():
+        assert abs(found.value(name) - value) < 4 * found.parameters[name].standard_uncertainty
+
+
+def test_exactly_as_many_attitudes_as_parameters_state_no_uncertainty():
+    rng = np.random.default_rng(72)
+    truth = reference.random_truth(rng, 1)
+    found = fit(outputs(truth, 1, reference.random_attitudes(rng, 9)), 1).calibration
+    assert all(p.standard_uncertainty is None for p in found.parameters.values())
+    assert any("no uncertainty is stated" in w for w in found.warnings)
+
+
+FACES = np.vstack([np.eye(3), -np.eye(3)])
+EDGES = np.array([[a, b, 0] for a in (-1, 1) for b in (-1, 1)]) / np.sqrt(2)
+EIGHTEEN = np.vstack([FACES, EDGES, np.roll(EDGES, 1, axis=1), np.roll(EDGES, 2, axis=1)])
+
+
+@pytest.mark.parametrize(
+    ("directions", "order", "named"),
+    [
+        (FACES, 1, {"misalignment_yx", "misalignment_zx", "misalignment_zy"}),
+        (np.repeat(FACES, 4, axis=0), 1, {"misalignment_yx", "misalignment_zx", "misalignment_zy"}),
+        (EIGHTEEN, 4, {"k2_x", "k4_x", "k2_y", "k4_y", "k2_z", "k4_z"}),
+        (np.repeat(EIGHTEEN, 3, axis=0), 4, {"k2_x", "k4_x", "k2_y", "k4_y", "k2_z", "k4_z"}),
+    ],
+)
+def test_a_blind_fixture_is_refused_with_the_parameters_it_cannot_separate(directions, order, named):
+    truth = reference.random_truth(np.random.default_rng(80), 1)
+    truth = {n: v if n[0] == "s" else 0.0 for n, v in truth.items()} | dict.fromkeys(reference.names(order)[9:], 0.0)
+    with pytest.raises(ObservabilityError) as caught:
+        fit(outputs(truth, order, directions), order)
+    message = str(caught.value)
+    assert message.startswith("table.csv: ")
+    assert f"of the {3 * (order + 2)} parameters of order {order}" in message
+    assert named <= set(message.replace(";", " ").split())
+    assert "would help most" in message
+
+
+def test_the_attitudes_that_would_help_do_help():
+    truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
+    with pytest.raises(ObservabilityError) as caught:
+        fit(outputs(truth, 1, np.vstack([FACES, EDGES])), 1)
+    advice = str(caught.value).split("upward direction near ")[1].split(" would help")[0]
+    added = np.array([[float(x) for x in part.strip("()").split(",")] for part in advice.split(" and ")])
+    added /= np.linalg.norm(added, axis=1, keepdims=True)
+    found = fit(outputs(truth, 1, np.vstack([FACES, EDGES, added])), 1)
+    assert found.observability.rank == 9
+    assert found.observability.condition < 20
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"order": 6}, "expected one of auto 1 2 3 4 5"),
+        ({"order": "best"}, "expected one of auto 1 2 3 4 5"),
+        ({"method": "magic"}, "expected one of norm linearised"),
+        ({"loss": "cauchy"}, "expected one of square huber"),
+        ({"gravity": 981.0}, "expected the local value in m/s^2"),
+        ({"method": "linearised", "loss": "huber"}, "needs method norm"),
+    ],
+)
+def test_unknown_options_are_refused_with_what_there_is(options, message):
+    rng = np.random.default_rng(90)
+    data = outputs(reference.random_truth(rng, 1), 1, reference.random_attitudes(rng, 24))
+    with pytest.raises(OptionError, match=re.escape(message)):
+        fit(data, **({"order": 1} | options))
+
+
+def test_linearised_that_does_not_converge_says_so():
+    rng = np.random.default_rng(91)
+    truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)} | {"bias_x": 0.9 * G}
+    with pytest.raises(DataError, match=r"linearised does not converge.*--method norm"):
+        fit(outputs(truth, 1, reference.random_attitudes(rng, 24)), 1, method="linearised")
+
+
+def test_without_gravity_the_standard_value_is_used_and_warned_of():
+    rng = np.random.default_rng(92)
+    data = outputs(reference.random_truth(rng, 1), 1, reference.random_attitudes(rng, 24))
+    found = fit(data, 1, gravity=None).calibration
+    assert found.model["gravity"]["value"] == 9.80665
+    assert any("no local gravity" in w and "scale factor" in w for w in found.warnings)

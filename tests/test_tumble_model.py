@@ -1,0 +1,62 @@
+"""The inverse model and its derivatives against equations transcribed apart."""
+
+import numpy as np
+import pytest
+
+from imulab.tumble.model import invert, norm_and_jacobian, parameter_names
+from reference import tumble as reference
+
+G = 9.80665
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_names_are_those_of_the_record(order):
+    assert parameter_names(order) == list(reference.names(order))
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_inversion_undoes_the_transcribed_forward_model(order):
+    rng = np.random.default_rng(order)
+    truth = reference.random_truth(rng, order)
+    force = G * reference.random_attitudes(rng, 50)
+    output = np.array([reference.forward(f, truth, order) for f in force])
+    scale = np.array([truth[f"scale_factor_{a}"] for a in "xyz"])
+    bias = np.array([truth[f"bias_{a}"] for a in "xyz"])
+    misalignment = np.array([truth[f"misalignment_{p}"] for p in ("yx", "zx", "zy")])
+    k = np.array([[truth[f"k{j}_{a}"] for a in "xyz"] for j in range(2, order + 1)]).reshape(order - 1, 3)
+    found = invert(output / scale - bias, misalignment, k).force
+    np.testing.assert_allclose(found, force, rtol=0, atol=1e-13 * G)
+
+
+def test_nan_stays_in_the_components_it_touches():
+    reading = np.array([[1.0, 2.0, np.nan], [1.0, np.nan, 3.0], [np.nan, 2.0, 3.0], [1.0, 2.0, 3.0]])
+    found = invert(reading, np.array([0.01, 0.02, 0.03]), np.full((1, 3), 1e-3)).force
+    expected = [[False, False, True], [False, True, True], [True, True, True], [False, False, False]]
+    assert np.isnan(found).tolist() == expected
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_jacobian_equals_central_differences(order):
+    rng = np.random.default_rng(10 + order)
+    reading = reference.random_attitudes(rng, 20)[None] * 1.02
+    theta = np.zeros((1, 3 * (order + 2)))
+    theta[:, 3:6] = 1.0
+    theta += 0.02 * rng.standard_normal(theta.shape)
+    jacobian = norm_and_jacobian(theta, reading, order)[1][0]
+    for index in range(theta.shape[1]):
+        step = np.zeros_like(theta)
+        step[0, index] = 1e-6
+        up, down = (norm_and_jacobian(theta + s * step, reading, order)[0][0] for s in (1, -1))
+        np.testing.assert_allclose(jacobian[:, index], (up - down) / 2e-6, rtol=0, atol=1e-9)
+
+
+def test_a_batch_gives_each_problem_what_it_gets_alone():
+    rng = np.random.default_rng(5)
+    reading = reference.random_attitudes(rng, 4 * 12).reshape(4, 12, 3)
+    theta = np.tile([0.0] * 3 + [1.0] * 3 + [0.0] * 6, (4, 1)) + 0.01 * rng.standard_normal((4, 12))
+    norm, jacobian, _, q = norm_and_jacobian(theta, reading, 2)
+    for i in range(4):
+        alone = norm_and_jacobian(theta[i : i + 1], reading[i : i + 1], 2)
+        np.testing.assert_allclose(norm[i], alone[0][0], rtol=1e-15)
+        np.testing.assert_allclose(jacobian[i], alone[1][0], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(q[i], alone[3][0], rtol=1e-14)
