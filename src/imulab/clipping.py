@@ -33,6 +33,8 @@ def check_clipping(recording: Recording, names: list[str], pieces: NDArray[np.in
     """
     for column in names:
         values = recording.column(column)
+        if values.min() == values.max():
+            continue  # not clipped but dead, which is for the procedure to say
         for extreme, side in ((values.max(), "largest"), (values.min(), "smallest")):
             ties = values == extreme
             if np.count_nonzero(ties) < _FEWEST_SAMPLES:
@@ -64,11 +66,12 @@ def check_clipped_rows(recording: Recording, names: list[str]) -> None:
     """
     for column in names:
         values = recording.column(column)
+        if values.min() == values.max():
+            continue
         for extreme, side in ((values.max(), "largest"), (values.min(), "smallest")):
             rows = np.flatnonzero(values == extreme)
             others = np.unique(values[values != extreme], return_counts=True)[1]
-            usual = others.max() if others.size else len(values)
-            if len(rows) >= _FEWEST_ROWS and len(rows) > _USUAL_TIES * usual:
+            if len(rows) >= _FEWEST_ROWS and len(rows) > _USUAL_TIES * others.max():
                 raise DataError(
                     f"{recording.name}: {recording.place(int(rows[0]))}, column {column}: clipped: "
                     f"{len(rows)} attitudes have exactly the {side} value {extreme:.9g} {recording.units[column]}"

@@ -31,7 +31,7 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
         It is no number with a unit of this kind.
     """
     match = _QUANTITY.fullmatch(text)
-    expected = f"{option} {text!r}: expected a number with a unit of {kind}, such as 1 {default_unit}"
+    expected = f"{option} {text!r}: expected a number, or one with a unit of {kind} such as 1 {default_unit}"
     if match is None:
         raise OptionError(expected)
     try:
@@ -43,13 +43,27 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     return to_si(float(match[1]), unit.symbol)
 
 
-def refuse_overwriting(outputs: list[str | None], inputs: list[str]) -> None:
-    """Check that no output is an input, nor two outputs the same file.
+def whole_number(text: str, option: str) -> int:
+    """Return a text as a whole number.
 
     Raises
     ------
     OptionError
-        One would overwrite another.
+        It is none.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        raise OptionError(f"{option} {text!r}: expected a whole number") from None
+
+
+def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
+    """Check before the work that each output has a folder to go to, and is no input nor another output.
+
+    Raises
+    ------
+    OptionError
+        An output cannot be written, or would overwrite another file of this command.
     """
     taken = {Path(name).resolve(): name for name in inputs if name != "-"}
     for name in outputs:
@@ -57,6 +71,8 @@ def refuse_overwriting(outputs: list[str | None], inputs: list[str]) -> None:
             continue
         if Path(name).resolve() in taken:
             raise OptionError(f"{name}: would overwrite {taken[Path(name).resolve()]}; expected another name")
+        if not Path(name).resolve().parent.is_dir():
+            raise OptionError(f"{name}: cannot be written: no such folder")
         taken[Path(name).resolve()] = name
 
 

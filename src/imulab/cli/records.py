@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, refuse_overwriting, warn
+from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, check_outputs, warn
 from imulab.errors import OptionError, ReadError
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def apply(
     if len(files) < 2:
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
     *names, file = files
-    refuse_overwriting([output], files)
+    check_outputs([output], files)
     records = [load(name) for name in names]
     blocks = apply_blocks(records, _warned(records, read_blocks(file, layout)))
     if output:
@@ -100,7 +100,7 @@ def report(
     from imulab.calibration import load
     from imulab.present import write_report
 
-    refuse_overwriting([output], [file])
+    check_outputs([output], [file])
     write_report(load(file), output)
     print(f"report: {output}")
 

@@ -14,9 +14,10 @@ from imulab.cli.options import (
     OutputFile,
     RecordingFile,
     ReportFile,
+    check_outputs,
     quantity,
-    refuse_overwriting,
     warn,
+    whole_number,
 )
 from imulab.errors import OptionError
 
@@ -34,33 +35,32 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
 
 def simulate(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.csv", help="Recording to write.")],
-    attitudes: Annotated[int, typer.Option(help="Number of static attitudes.")] = 24,
-    order: Annotated[int, typer.Option(help="Order of the true nonlinearity, 1 to 5.")] = 2,
+    attitudes: Annotated[str, typer.Option(help="Number of static attitudes.")] = "24",
+    order: Annotated[str, typer.Option(help="Order of the true nonlinearity, 1 to 5.")] = "2",
     rate: Annotated[str, typer.Option(help="Sample rate.")] = "100 Hz",
     hold: Annotated[str, typer.Option(help="Duration of an attitude.")] = "5 s",
     move: Annotated[str, typer.Option(help="Duration of the motion between two.")] = "2 s",
     noise: Annotated[str, typer.Option(help="Standard deviation of one sample.")] = "0.7 mg",
     unit: Annotated[str, typer.Option(help="Unit of the outputs: m/s^2 g mg count V.")] = "m/s^2",
-    gravity: Annotated[float | None, typer.Option(help="Local gravity, m/s^2.")] = None,
-    knock: Annotated[int | None, typer.Option(help="Number of an attitude that is knocked.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the random numbers.")] = 1,
+    gravity: Annotated[str, typer.Option(help="Local gravity.")] = "9.80665 m/s^2",
+    knock: Annotated[str | None, typer.Option(help="Number of an attitude that is knocked.")] = None,
+    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate a tumble recording of a random MEMS triad, with its truth in the head of the file."""
     from imulab.tumble.simulate import simulate_tumble
-    from imulab.units import STANDARD_GRAVITY
     from imulab.writers import write_csv
 
     recording = simulate_tumble(
-        attitudes=attitudes,
-        order=order,
+        attitudes=whole_number(attitudes, "--attitudes"),
+        order=whole_number(order, "--order"),
         sample_rate=quantity(rate, "--rate", "frequency", "Hz"),
         hold=quantity(hold, "--hold", "time", "s"),
         move=quantity(move, "--move", "time", "s"),
         noise=quantity(noise, "--noise", "acceleration", "mg"),
         unit=unit,
-        gravity=STANDARD_GRAVITY if gravity is None else gravity,
-        knock=knock,
-        seed=seed,
+        gravity=quantity(gravity, "--gravity", "acceleration", "m/s^2"),
+        knock=None if knock is None else whole_number(knock, "--knock"),
+        seed=whole_number(seed, "--seed"),
     )
     write_csv(recording, output)
     print(f"{output}: {len(recording)} samples, {attitudes} attitudes, serial {recording.metadata['serial']}")
@@ -72,9 +72,9 @@ def fit(
     order: Annotated[str, typer.Option(help="auto, or 1 to 5.")] = "auto",
     method: Annotated[str, typer.Option(help="norm or linearised.")] = "norm",
     loss: Annotated[str, typer.Option(help="square, or huber against single disturbed attitudes.")] = "square",
-    gravity: Annotated[float | None, typer.Option(help="Local gravity, m/s^2.")] = None,
-    latitude: Annotated[float | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
-    height: Annotated[float | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
+    gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2.")] = None,
+    latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
+    height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -90,7 +90,7 @@ def fit(
     from imulab.segment import find_attitudes
     from imulab.tumble.fit import fit_tumble
 
-    refuse_overwriting([output, report], [file] + ([layout] if layout else []))
+    check_outputs([output, report], [file] + ([layout] if layout else []))
     local = _gravity(gravity, latitude, height)
     result = fit_tumble(
         find_attitudes(read(file, layout)),
@@ -125,17 +125,19 @@ def _order(text: str) -> int | str:
     return int(text) if text.isdecimal() and len(text) < 3 else text
 
 
-def _gravity(gravity: float | None, latitude: float | None, height: float | None) -> Gravity | float | None:
+def _gravity(gravity: str | None, latitude: str | None, height: str | None) -> Gravity | float | None:
     from imulab.gravity import normal_gravity
     from imulab.tumble.record import Gravity
 
     if gravity is not None:
         if latitude is not None or height is not None:
             raise OptionError("--gravity together with --latitude or --height: expected one or the other")
-        return gravity
+        return quantity(gravity, "--gravity", "acceleration", "m/s^2")
     if latitude is None:
         if height is not None:
             raise OptionError("--height without --latitude: expected both")
         return None
-    value = normal_gravity(math.radians(latitude), height or 0.0)
-    return Gravity(value, f"normal gravity at latitude {latitude:g} deg, height {height or 0.0:g} m (WGS 84)")
+    angle = quantity(latitude, "--latitude", "angle", "deg")
+    above = quantity(height, "--height", "length", "m") if height is not None else 0.0
+    value = normal_gravity(angle, above)
+    return Gravity(value, f"normal gravity at latitude {math.degrees(angle):.6g} deg, height {above:g} m (WGS 84)")

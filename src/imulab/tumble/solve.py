@@ -242,7 +242,7 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     repeated = replace(problem, reading=np.broadcast_to(problem.reading[0], (n, n, 3)))
     weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
     lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
-    fit = _least_squares(repeated, np.repeat(solution.theta, n, axis=0), weights, lengthening, max_iterations=12)
+    fit = _least_squares(repeated, np.repeat(solution.theta, n, axis=0), weights, lengthening)
     errors: Array = np.diagonal(fit.residuals)
     return errors
 
