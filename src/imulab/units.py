@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import overload
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, overload
 
 from imulab.errors import UnitError
+
+if TYPE_CHECKING:  # the command line parses units before it needs NumPy
+    import numpy as np
+    from numpy.typing import NDArray
 
 STANDARD_GRAVITY = 9.80665
 """Standard acceleration of gravity, m/s^2. A unit of measurement, not the gravity of any place."""

@@ -73,7 +73,7 @@ def show(
 
     if layout is None and _is_json(file):
         record = load(file)
-        print(record.to_json() if json else describe_record(record))
+        print(record.to_json().rstrip("\n") if json else describe_record(record))
         return
     if json:
         raise OptionError(f"{file}: --json prints records; expected a record")

@@ -146,7 +146,7 @@ def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.i
         fit = _least_squares(problem, theta, down / variance, lengthening, 1e-9 if number or not repeat else 1e-4)
         iterations += fit.iterations
         theta, before = fit.parameters, down / variance
-        lengthening, own = _noise(problem, theta)
+        lengthening, own = _noise(problem, theta, fit.jacobian)
         residuals = fit.residuals
         if problem.covariance is not None and problem.excess and not problem.robust:
             too_large = (residuals**2 / own).sum(axis=1) > limit
@@ -202,19 +202,23 @@ def _mean_square(fit: Fit, down: Array, size: int) -> Array:
     return used
 
 
-def _noise(problem: Problem, theta: Array) -> tuple[Array, Array]:
-    """Lengthening ``(tr C_f - u' C_f u) / 2`` of |f| by noise, and its variance ``q' C q``, shapes (b, n)."""
+def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tuple[Array, Array]:
+    """Lengthening ``(tr C_f - u' C_f u) / 2`` of |f| by noise, and its variance ``q' C q``, shapes (b, n).
+
+    ``q = d|f|/d reading`` is the negative of the Jacobian's columns for the zero; |f| is 1 to first order.
+    """
     count, n, _ = problem.reading.shape
     if problem.covariance is None:
         return np.zeros((count, n)), np.ones((count, n))
-    norm, _, inversion, q = norm_and_jacobian(theta, problem.reading, problem.order)
+    if jacobian is None:
+        jacobian = norm_and_jacobian(theta, problem.reading, problem.order)[1]
+    q = -jacobian[:, :, 0:3]
     covariance = np.broadcast_to(problem.covariance, (count, n, 3, 3))
     along = np.einsum("bni,bnij,bnj->bn", q, covariance, q)
-    # df/dM = T^-1 diag(1 / (slope S)); the trace of the covariance that it carries into f
-    per_axis = 1 / (inversion.slope * theta[:, None, 3:6])
-    carried = _unalign(theta[:, 6:9])[:, None] * per_axis[:, :, None, :]
-    trace = np.einsum("bnki,bnij,bnkj->bn", carried, covariance, carried)
-    return (trace - along) / (2 * norm), along
+    # df/dM = T^-1 diag(1 / (slope S)); the nonlinearity's slope is 1 to the order that matters here
+    carried = _unalign(theta[:, 6:9]) / theta[:, None, 3:6]
+    trace = np.einsum("bij,bnij->bn", carried.transpose(0, 2, 1) @ carried, covariance)
+    return (trace - along) / 2, along
 
 
 def _unalign(misalignment: Array) -> Array:
@@ -293,7 +297,7 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
 def _evaluated(problem: Problem, theta: Array, iterations: int) -> Solution:
     """Wrap given parameters as a solution."""
     norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, problem.order)
-    lengthening, own = _noise(problem, theta)
+    lengthening, own = _noise(problem, theta, jacobian)
     n = norm.shape[1]
     return Solution(
         theta=theta,

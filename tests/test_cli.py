@@ -1,0 +1,152 @@
+"""The command line as a user meets it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import imulab as il
+from conftest import REPOSITORY
+
+G = "9.80665"
+
+
+def test_version(imulab):
+    assert imulab("--version").stdout == f"imulab {il.__version__}\n"
+
+
+@pytest.mark.parametrize("arguments", [[], ["tumble"], ["tumble", "fit"], ["apply"], ["show"], ["report"], ["demo"]])
+def test_every_command_has_help(imulab, arguments):
+    done = imulab(*arguments, "--help")
+    assert done.returncode == 0
+    assert done.stdout.startswith("Usage: imulab")
+
+
+def test_importing_imulab_imports_nothing_heavy():
+    code = (
+        "import sys, imulab; print(sorted({m.split('.')[0] for m in sys.modules} & "
+        "{'numpy','scipy','polars','plotly','pydantic','dask','rosbags','typer','rich','jinja2'}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_help_imports_no_numerics():
+    code = (
+        "import sys; from imulab.cli import main; main(['--help']); "
+        "print({'numpy','scipy','pydantic','jinja2'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("set()\n")
+
+
+def test_public_names_all_resolve():
+    for name in il.__all__:
+        assert getattr(il, name) is not None
+    assert set(il.__all__) <= set(dir(il))
+    with pytest.raises(AttributeError, match="no attribute 'frob'"):
+        il.frob  # noqa: B018
+
+
+def test_simulate_fit_apply_show_report(imulab, tmp_path):
+    """The whole way, and the corrected data against the simulated truth."""
+    assert imulab("tumble", "simulate", "-o", "t.csv", "--seed", "5", "--attitudes", "20").returncode == 0
+    done = imulab("tumble", "fit", "t.csv", "--gravity", G, "-o", "t.json", "--report", "t.html")
+    assert done.returncode == 0, done.stderr
+    assert "record: t.json" in done.stdout
+    assert "report: t.html" in done.stdout
+    shown = imulab("show", "t.json").stdout
+    assert "tumble calibration of SIM-0005" in shown
+    assert "source t.csv SHA-256" in shown
+    assert imulab("report", "t.json", "-o", "again.html").returncode == 0
+    assert (tmp_path / "again.html").read_bytes() == (tmp_path / "t.html").read_bytes()
+    assert imulab("apply", "t.json", "t.csv", "-o", "c.csv").returncode == 0
+    raw, corrected = il.read(tmp_path / "t.csv"), il.read(tmp_path / "c.csv")
+    assert list(corrected.columns) == list(raw.columns)
+    assert corrected.metadata == raw.metadata
+    np.testing.assert_array_equal(corrected.column("gyro_x"), raw.column("gyro_x"))
+    pieces = il.find_attitudes(raw).pieces
+    error = corrected.triad("accel") - raw.triad("truth_accel")
+    means = np.array([error[a:b].mean(axis=0) for a, b, _ in pieces])
+    assert np.abs(means).max() < 5e-4 * 9.80665
+
+
+def test_apply_writes_to_standard_output_what_it_writes_to_a_file(imulab, tmp_path):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    imulab("tumble", "fit", "t.csv", "--gravity", G, "-o", "t.json", "--order", "1")
+    imulab("apply", "t.json", "t.csv", "-o", "c.csv")
+    text = (tmp_path / "c.csv").read_text()
+    assert imulab("apply", "t.json", "t.csv").stdout == text
+    assert imulab("apply", "t.json", "-", stdin=(tmp_path / "t.csv").read_text()).stdout == text
+
+
+def test_json_prints_the_record_alone(imulab, tmp_path):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    done = imulab("tumble", "fit", "t.csv", "--gravity", G, "--order", "1", "-o", "t.json", "--json")
+    assert json.loads(done.stdout) == json.loads((tmp_path / "t.json").read_text())
+    assert imulab("show", "t.json", "--json").stdout == (tmp_path / "t.json").read_text()
+
+
+def test_normal_gravity_is_recorded_with_its_origin(imulab):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    done = imulab("tumble", "fit", "t.csv", "--latitude", "-33.9", "--height", "40", "--order", "1", "--json")
+    gravity = json.loads(done.stdout)["model"]["gravity"]
+    assert gravity["value"] == pytest.approx(il.normal_gravity(np.radians(-33.9), 40.0), rel=1e-15)
+    assert gravity["from"] == "normal gravity at latitude -33.9 deg, height 40 m (WGS 84)"
+
+
+def test_without_gravity_a_warning_goes_to_standard_error(imulab):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    done = imulab("tumble", "fit", "t.csv", "--order", "1")
+    assert done.returncode == 0
+    assert done.stderr.startswith("imulab: warning: no local gravity was given")
+    assert done.stderr.count("\n") == 1
+
+
+def test_show_describes_a_recording(imulab):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2")
+    shown = imulab("show", "t.csv").stdout
+    assert "t.csv: 6200 samples" in shown
+    assert "duration 61.99 s, rate 100 Hz, gaps 0" in shown
+    assert "serial: SIM-0001" in shown
+    assert "temperature" in shown
+
+
+def test_a_reader_that_closes_the_pipe_ends_the_command_quietly(tmp_path):
+    run = [sys.executable, "-m", "imulab"]
+    for command in (["tumble", "simulate", "-o", "t.csv"], ["tumble", "fit", "t.csv", "--gravity", G, "-o", "t.json"]):
+        subprocess.run([*run, *command], cwd=tmp_path, check=True, capture_output=True)
+    with subprocess.Popen(
+        [*run, "apply", "t.json", "t.csv"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        process.stdout.readline()
+        process.stdout.close()
+        error = process.stderr.read()
+    assert error == ""
+    assert process.returncode == 141
+
+
+def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
+    done = imulab("demo", "here")
+    assert done.returncode == 0, done.stderr
+    names = {p.name for p in (tmp_path / "here").iterdir()}
+    assert {"tumble.csv", "tumble.json", "tumble.html", "tumble_corrected.csv"} <= names
+    assert "order 2 chosen" in done.stdout
+    assert "±" in done.stdout
+    assert "down-weighted" in done.stdout
+    assert done.stdout.rstrip().splitlines()[-1].startswith("open here")
+    record = il.load(tmp_path / "here" / "tumble.json")
+    truth = il.read(tmp_path / "here" / "tumble.csv").metadata
+    for name, parameter in record.parameters.items():
+        error = (parameter.value - float(truth[f"truth_{name}"])) / parameter.standard_uncertainty
+        assert abs(error) < 4, name
+
+
+def test_no_path_of_a_machine_is_in_the_sources():
+    import os
+
+    home = os.path.expanduser("~") + "/"  # noqa: PTH111
+    for path in [*(REPOSITORY / "src").rglob("*.py"), *(REPOSITORY / "docs").rglob("*.md")]:
+        assert home not in path.read_text(), path

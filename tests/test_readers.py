@@ -1,0 +1,462 @@
+"""Files to recordings: native CSV, foreign text through layouts, and the parser of numbers."""
+
+import hashlib
+import io
+import sys
+from pathlib import Path
+
+import numpy as np
+import polars
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from imulab.errors import ImulabError, ReadError, UnitError
+from imulab.readers import Layout, _text, load_layout, read, read_blocks
+from imulab.readers.layout import LayoutColumn
+
+FIXED = settings(derandomize=True, database=None, deadline=None, max_examples=150)
+HEAD = b"time [s],accel_x [m/s^2],temperature [degC]\n"
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(content: bytes, name: str = "unit 7.csv") -> Path:
+        path = tmp_path / name
+        path.write_bytes(content)
+        return path
+
+    return write
+
+
+def parse(tokens: list[str], delimiter: str = ",") -> tuple[tuple[int, int, int], list[float]]:
+    """Each token a row of one column; the parser's answer and the numbers."""
+    out = np.full((1, len(tokens)), -77.0)
+    answer = _text.parse("\n".join(tokens).encode(), delimiter, np.zeros(1, np.int32), out, len(tokens))
+    return answer, out[0].tolist()
+
+
+def bits(values):
+    return np.asarray(values, dtype=np.float64).view(np.uint64).tolist()
+
+
+# --- the parser of numbers against Python's correctly rounded float() ------------------------------------------
+
+
+@FIXED
+@given(st.lists(st.floats(), min_size=1, max_size=30))
+def test_every_double_reads_back_exactly(values):
+    answer, found = parse([repr(value) for value in values])
+    assert answer[:2] == (len(values), 0)
+    np.testing.assert_array_equal(found, values)  # NaN as NaN
+    assert [np.signbit(x) for x, y in zip(found, values, strict=True) if y == y] == [
+        np.signbit(y) for y in values if y == y
+    ]
+
+
+@FIXED
+@given(st.from_regex(r"[+-]?[0-9]{0,22}(\.[0-9]{0,22})?([eE][+-]?[0-9]{0,3})?", fullmatch=True))
+def test_a_decimal_is_rounded_or_refused_as_float_does(token):
+    answer, found = parse([token])
+    try:
+        expected = float(token)
+    except ValueError:
+        if token == "":  # an empty field is a missing reading
+            assert np.isnan(found[0])
+        else:
+            assert answer == (0, 1, 0)
+    else:
+        assert answer[:2] == (1, 0)
+        assert bits(found) == bits([expected])
+
+
+@FIXED
+@given(st.integers(2**50, 2**53 - 1), st.integers(-1, 1), st.integers(0, 19), st.sampled_from("+-"))
+def test_halfway_cases_and_their_neighbours_are_rounded_to_even(whole, nudge, point, sign):
+    # whole + 1/2, 1/4, 1/8 lie halfway between doubles; one more or less in the 19th digit lies beside.
+    for fraction in (125, 250, 375, 500, 625, 750, 875):
+        digits = str(whole * 1000 + fraction + nudge)[:19]
+        token = f"{sign}{digits[: len(digits) - point]}.{digits[len(digits) - point :]}" if point else sign + digits
+        assert bits(parse([token])[1]) == bits([float(token)])
+
+
+def test_a_hundred_thousand_decimals_of_every_length_are_rounded_as_float_does():
+    rng = np.random.default_rng(20261120)
+    count = 100_000
+    digits = [
+        str(n)[:k]
+        for n, k in zip(rng.integers(10**18, 10**19, count, np.uint64), rng.integers(1, 20, count), strict=True)
+    ]
+    point = rng.integers(0, 20, count)
+    power = rng.integers(-30, 30, count)
+    tokens = [
+        f"{d[:p]}.{d[p:]}" + (f"e{e}" if e % 3 == 0 else "")
+        for d, p, e in zip(digits, point.tolist(), power.tolist(), strict=True)
+    ]
+    answer, found = parse(tokens)
+    assert answer[:2] == (count, 0)
+    assert bits(found) == bits([float(token) for token in tokens])
+
+
+@pytest.mark.parametrize("token", [" 1.5", "1.5\t", "\t 1.5 ", "1.5\r", "+1.5", "01.5", "1.5e0", "15E-1"])
+def test_blanks_signs_and_zeros_around_a_number_do_not_matter(token):
+    assert parse([token]) == ((1, 0, 1), [1.5])
+
+
+@pytest.mark.parametrize("token", ["nan", "NaN", "inf", "-inf", "Infinity", "1e400", "-1e-400", "0e99999", "9" * 400])
+def test_what_is_no_plain_decimal_reads_as_float_does(token):
+    np.testing.assert_array_equal(parse([token])[1], [float(token)])
+
+
+@pytest.mark.parametrize(
+    "token",
+    ["-", "+", ".", "e5", "1e", "1e+", "--1", "+-1", "1.2.3", "0x10", "1_000", "1 2", "one", "1,5", "\xa0", "1\0"],
+)
+def test_what_is_no_number_is_not_read(token):
+    assert parse([token], ";")[0] == (0, 1, 0)
+
+
+def test_the_parser_writes_wanted_fields_into_their_columns():
+    out = np.full((2, 3), -1.0)
+    slots = np.array([1, -1, 0], np.int32)
+    assert _text.parse(b"1,x,3\n4,,6\n", ",", slots, out, 3) == (2, 0, 3)
+    assert out.tolist() == [[3, 6, -1], [1, 4, -1]]
+    assert _text.parse(b"1,x,3\n4,5\n", ",", slots, out, 3) == (1, 2, 2)
+    assert _text.parse(b"1,x,3\n4,5,6,7\n", ",", slots, out, 3) == (1, 2, 4)
+    assert _text.parse(b"", ",", slots, out, 3) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(("slot", "rows", "delimiter"), [(2, 3, ","), (0, 2, ","), (0, 3, "é")])
+def test_the_parser_never_writes_beyond_its_buffer(slot, rows, delimiter):
+    with pytest.raises(ValueError, match="output buffer is too small"):
+        _text.parse(b"1\n2\n3\n", delimiter, np.array([slot], np.int32), np.empty((2, rows)), rows)
+
+
+# --- native CSV ------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_read_with_its_units_metadata_and_hash(file):
+    content = b"# serial: SN 42\n# made in 2026\n#note : a: b\n\n" + HEAD + b"0,1.5,20\n0.01,-2e-1,\n"
+    path = file(content)
+    recording = read(path)
+    assert {name: column.tolist() for name, column in recording.columns.items() if name != "temperature"} == {
+        "time": [0, 0.01],
+        "accel_x": [1.5, -0.2],
+    }
+    np.testing.assert_array_equal(recording.column("temperature"), [20, np.nan])
+    assert dict(recording.units) == {"time": "s", "accel_x": "m/s^2", "temperature": "degC"}
+    assert dict(recording.metadata) == {"serial": "SN 42", "note": "a: b"}
+    assert recording.source is not None
+    assert recording.source.file == recording.name == str(path)
+    assert recording.source.sha256 == hashlib.sha256(content).hexdigest()
+    assert recording.place(0) == "row 1 (line 6)"
+
+
+ROWS = b"0,1,20\n1,2,21\n2,3,22\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        HEAD + ROWS[:-1],
+        HEAD + ROWS + b"\n \n\t\n\r\n\n",
+        (HEAD + ROWS).replace(b"\n", b"\r\n"),
+        (HEAD + ROWS).replace(b"\n", b"\r\n") + b"\r\n\r\n",
+        b"\xef\xbb\xbf" + HEAD + ROWS,
+        b"\xef\xbb\xbf# serial: 7\n" + HEAD + ROWS,
+        b"\n\n" + HEAD + ROWS,
+        (HEAD + ROWS).replace(b",", b" , "),
+        b'"time [s]","accel_x [m/s^2]","temperature [degC]"\n' + ROWS,
+    ],
+    ids="no-last-newline trailing-blanks crlf crlf-blanks bom bom-comment leading-blanks spaces quotes".split(),
+)
+def test_the_usual_variants_of_text_read_alike(file, content):
+    recording = read(file(content))
+    assert {name: column.tolist() for name, column in recording.columns.items()} == {
+        "time": [0, 1, 2],
+        "accel_x": [1, 2, 3],
+        "temperature": [20, 21, 22],
+    }
+    assert recording.source.sha256 == hashlib.sha256(content).hexdigest()
+
+
+def test_numbers_equal_those_of_another_reader(file):
+    rng = np.random.default_rng(3)
+    values = rng.standard_normal((2000, 3)) * 10.0 ** rng.integers(-12, 12, (2000, 3))
+    path = file(HEAD + "\n".join(",".join(f"{x:.{k}g}" for x, k in zip(row, (17, 9, 4))) for row in values).encode())
+    other = polars.read_csv(path, schema_overrides=[polars.Float64] * 3)
+    recording = read(path)
+    for name, theirs in zip(recording.columns, other.iter_columns(), strict=True):
+        assert bits(recording.column(name)) == bits(theirs.to_numpy())
+
+
+FIFTY = b"".join(b"%d,1,20\n" % k for k in range(49))
+REFUSED = {
+    "letters": (HEAD + FIFTY + b"0.5,x1,20\n", "row 50 (line 51), column accel_x: expected a number, found 'x1'"),
+    "quoted": (
+        HEAD + FIFTY + b'0.5,1,"20"\n',
+        "row 50 (line 51), column temperature: expected a number, found '\"20\"'",
+    ),
+    "comments above": (
+        b"# a\n# b: c\n\n" + HEAD + FIFTY + b"?,1,2\n",
+        "row 50 (line 54), column time: expected a number",
+    ),
+    "long": (HEAD + b"1,%s,2\n" % (b"z" * 500), "row 1 (line 2), column accel_x: expected a number, found 'zzz"),
+    "ragged short": (HEAD + FIFTY + b"0.5,1\n0.6,1,20\n", "row 50 (line 51): expected 3 fields, found 2"),
+    "ragged long": (HEAD + FIFTY + b"0.5,1,20,4\n", "row 50 (line 51): expected 3 fields, found 4"),
+    "blank": (HEAD + FIFTY + b"\n9,1,20\n", "row 50 (line 51): expected 3 fields, found an empty line"),
+    "blanks": (HEAD + FIFTY + b" \t \r\n\n9,1,20\n", "row 50 (line 51): expected 3 fields, found an empty line"),
+    "decimal comma": (HEAD + b"0;1;2\n", "row 1 (line 2): expected 3 fields, found 1"),
+    "comment below": (HEAD + b"0,1,2\n# end\n", "row 2 (line 3), column time: expected a number, found '# end'"),
+    "no rows": (HEAD, "no rows of data"),
+    "no rows, blank": (HEAD + b"\n\n", "no rows of data"),
+    "comments only": (b"# serial: 1\n# model: 2\n", "only comments; expected a line of titles"),
+    "empty": (b"", "the file is empty"),
+    "blank only": (b"\n \n\r\n", "the file is empty"),
+    "binary": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "expected text, found binary data"),
+    "utf-16": ("time [s],x\n1,2\n".encode("utf-16"), "expected text, found binary data"),
+    "latin-1": ("time [s],temperature [°C]\n0,1\n".encode("latin-1"), "line 1: expected UTF-8 text"),
+    "numbers": (b"# c\n0.1, 2e3\n", "line 2: expected titles such as 'time [s],accel_x [m/s^2]', found numbers"),
+    "twice": (b"#\ntime [s],accel_x [g],accel_x [g]\n", "line 2: column accel_x appears twice"),
+    "nameless": (b"time [s],,accel_x [g]\n0,1,2\n", "line 1: a column without a name"),
+}
+REFUSED_UNITS = {
+    "none": (b"time [s],accel_x\n0,1\n", "column accel_x has no unit; expected a title such as 'accel_x ["),
+    "wrong": (b"time [s],accel_x [deg/s]\n0,1\n", "column accel_x: expected a unit of acceleration or output, found"),
+    "unknown": (b"time [sec],accel_x [g]\n0,1\n", "column time: unknown unit 'sec'; known units: s ms us"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), REFUSED.values(), ids=REFUSED)
+def test_a_file_that_is_not_native_csv_is_refused_with_the_place(file, content, message):
+    path = file(content)
+    with pytest.raises(ReadError) as caught:
+        read(path)
+    assert str(caught.value).startswith(str(path))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 160
+
+
+@pytest.mark.parametrize(("content", "message"), REFUSED_UNITS.values(), ids=REFUSED_UNITS)
+def test_a_title_with_a_missing_or_wrong_unit_is_refused(file, content, message):
+    path = file(content)
+    with pytest.raises(UnitError) as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: {message}")
+
+
+def test_a_file_that_is_not_there_or_no_file_is_refused(tmp_path):
+    with pytest.raises(ReadError, match=r"absent\.csv: no such file"):
+        read(tmp_path / "absent.csv")
+    with pytest.raises(ReadError, match="expected a file, found a folder"):
+        read(tmp_path)
+    with pytest.raises(ReadError, match="no such file"):
+        next(read_blocks(tmp_path / "absent.csv"))
+
+
+def test_a_dash_reads_standard_input(monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(HEAD + ROWS)))
+    recording = read("-")
+    assert recording.column("accel_x").tolist() == [1, 2, 3]
+    assert recording.name == recording.source.file == "standard input"
+    assert recording.source.sha256 == hashlib.sha256(HEAD + ROWS).hexdigest()
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(HEAD + b"0,1\n")))
+    with pytest.raises(ReadError, match=r"^standard input: row 1 \(line 2\): expected 3 fields, found 2"):
+        read("-")
+
+
+# --- blocks ----------------------------------------------------------------------------------------------------
+
+LONG = b"# serial: SN42\n" + HEAD + b"".join(b"%d,%d.25,2e1\r\n" % (k, 3 * k) for k in range(200)) + b"\n\r\n\n"
+SIZES = [1, 2, 3, 7, 16, 61, 200, 1024]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_file_of_many_blocks_equals_the_file_read_whole(file, monkeypatch, size):
+    path = file(LONG)
+    whole = read(path)
+    assert len(whole) == 200
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
+    joined, blocks = read(path), list(read_blocks(path))
+    assert len(blocks) > 3
+    assert joined.source == whole.source
+    assert [block.first_row for block in blocks] == [1, *(1 + np.cumsum([len(b) for b in blocks])[:-1])]
+    for name, column in whole.columns.items():
+        assert bits(joined.column(name)) == bits(column)
+        assert bits(np.concatenate([block.column(name) for block in blocks])) == bits(column)
+    for block in blocks:
+        assert (block.units, block.metadata, block.lines_before) == (whole.units, whole.metadata, 2)
+    assert blocks[-1].place(len(blocks[-1]) - 1) == whole.place(199) == "row 200 (line 202)"
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (b"1,oops,3", "row 150 (line 152), column accel_x: expected a number, found 'oops'"),
+        (b"1,2", "row 150 (line 152): expected 3 fields, found 2"),
+        (b"\n\n", "row 150 (line 152): expected 3 fields, found an empty line"),
+    ],
+)
+def test_rows_are_numbered_through_all_blocks(file, monkeypatch, size, line, message):
+    lines = LONG.split(b"\r\n")  # the first holds the head and row 1
+    lines[149] = line
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
+    with pytest.raises(ReadError) as caught:
+        read(file(b"\n".join(lines)))
+    assert message in str(caught.value)
+
+
+# --- layouts ---------------------------------------------------------------------------------------------------
+
+
+def toml(file, text: str) -> Path:
+    return file(text.encode(), "foreign.toml")
+
+
+COLUMNS = '[columns]\ntime = { from = 0, unit = "ms" }\naccel_x = { from = 2, unit = "count" }\n'
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "content"),
+    [
+        ("whitespace", b"0  7 -1.5\n\t10 \t8 2.5 \r\n20 9 0\n\n"),
+        (",", b"0,7,-1.5\n10,x,2.5\n20,,0\n"),
+        (";", b"0;7;-1.5\r\n10;1,5;2.5\r\n20;9; 0"),
+        ("\\t", b"0\t7\t-1.5\n10\t\t2.5\n20\t9\t0\n \n"),
+    ],
+)
+def test_a_layout_takes_columns_by_number(file, delimiter, content):
+    layout = toml(file, f'delimiter = "{delimiter}"\n{COLUMNS}[metadata]\nserial = "SN42"\nyear = 2026\n')
+    recording = read(file(content, "log.txt"), layout)
+    assert {k: v.tolist() for k, v in recording.columns.items()} == {"time": [0, 10, 20], "accel_x": [-1.5, 2.5, 0]}
+    assert dict(recording.units) == {"time": "ms", "accel_x": "count"}
+    assert dict(recording.metadata) == {"serial": "SN42", "year": "2026"}
+    assert recording.source.sha256 == hashlib.sha256(content).hexdigest()
+    assert recording.place(1) == "row 2 (line 2)"
+
+
+@pytest.mark.parametrize("head", ["a,Time (s),b,Acc X", '"a","Time (s)","b","Acc X"', "# a, Time (s), b, Acc X"])
+def test_a_layout_takes_columns_by_name_below_skipped_lines(file, head):
+    layout = toml(
+        file,
+        'delimiter = ","\nskip_lines = 2\n[columns]\naccel_x = { from = "Acc X", unit = "mg" }\n'
+        'time = { from = "Time (s)", unit = "s" }\ngyro_x = { from = 2, unit = "deg/s" }\n',
+    )
+    recording = read(file(f"logger 3\nfree text, with commas\n{head}\n9,0.5,8,7\n".encode()), layout)
+    assert {k: v.tolist() for k, v in recording.columns.items()} == {"accel_x": [7], "time": [0.5], "gyro_x": [8]}
+    assert recording.place(0) == "row 1 (line 4)"
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_head_comments_above_foreign_rows_are_skipped(file, monkeypatch, size):
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
+    recording = read(file(b"# a\n#b c\n#\n" + b"10 1 2\n" * 5), toml(file, COLUMNS))
+    assert recording.column("accel_x").tolist() == [2] * 5
+    assert recording.place(0) == "row 1 (line 4)"
+
+
+def test_a_byte_order_mark_above_foreign_rows_is_skipped(file):
+    recording = read(file(b"\xef\xbb\xbf10 1 2\n20 1 3\n"), toml(file, COLUMNS))
+    assert recording.column("time").tolist() == [10, 20]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_sample_rate_makes_the_time_through_all_blocks(file, monkeypatch, size):
+    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
+    head = 'sample_rate = { value = 62.5, unit = "Hz" }\n'
+    layout = toml(file, head + '[columns]\naccel_x = { from = 0, unit = "V" }\n')
+    recording = read(file(b"".join(b"%d\n" % k for k in range(100))), layout)
+    assert list(recording.columns) == ["time", "accel_x"]
+    assert recording.units["time"] == "s"
+    assert recording.time.tolist() == [k * 0.016 for k in range(100)]  # 0.016 is not dyadic, 62.5 is
+    assert recording.column("accel_x").tolist() == list(range(100))
+
+
+@pytest.mark.parametrize("field", ["\u00a0", "\x0c5", "5\u00a0g", "\x0b"])
+def test_a_field_with_an_odd_blank_in_it_is_refused_as_it_stands(file, field):
+    with pytest.raises(ReadError) as caught:
+        read(file(f"0 1 2\n10 1 {field}\n".encode()), toml(file, COLUMNS))
+    assert f"row 2 (line 2), column accel_x: expected a number, found {field!r}" in str(caught.value)
+
+
+LAYOUTS = {
+    "unknown key": ('delimeter = ","\n' + COLUMNS, "unknown key 'delimeter'; known keys: columns delimiter header"),
+    "delimiter": ('delimiter = "|"\n' + COLUMNS, "delimiter '|'; expected 'whitespace' ',' ';' or a tab"),
+    "delimiters": ('delimiter = [","]\n' + COLUMNS, "delimiter [',']; expected 'whitespace' ',' ';' or a tab"),
+    "no columns": ('delimiter = ","\n', "no [columns]; expected lines such as accel_x = { from = 1"),
+    "empty columns": ("[columns]\n", "no [columns]"),
+    "skip_lines": ("skip_lines = -1\n" + COLUMNS, "skip_lines = -1; expected a number of lines"),
+    "header": ('header = "yes"\n' + COLUMNS, "header = 'yes'; expected true or false"),
+    "metadata": ("metadata = 3\n" + COLUMNS, "metadata = 3; expected a table"),
+    "two times": ("sample_rate = 100\n" + COLUMNS, "both a time column and sample_rate; expected one of them"),
+    "no unit": ("[columns]\naccel_x = { from = 1 }\n", "column accel_x: expected accel_x = { from = 1, unit ="),
+    "column key": ('[columns]\ntime = { from = 0, unit = "s", scale = 2 }\n', "column time: unknown key 'scale'"),
+    "from": (
+        '[columns]\ntime = { from = -1, unit = "s" }\n',
+        "column time: from = -1; expected a column number from 0",
+    ),
+    "rate": (
+        'sample_rate = { value = 1, unit = "kHz" }\n[columns]\nfog = { from = 0, unit = "V" }',
+        "sample_rate: exp",
+    ),
+    "rate 0": (
+        "sample_rate = 0\n[columns]\nfog = { from = 0, unit = 'V' }",
+        "expected a positive number of Hz, found 0",
+    ),
+    "rate true": (
+        'sample_rate = { value = true, unit = "Hz" }\n[columns]\nfog = { from = 0, unit = "V" }',
+        "sample_rate: expected a positive number of Hz, found True",
+    ),
+    "not TOML": ("columns = [", "the layout is not TOML"),
+    "bad unit": (
+        '[columns]\naccel_x = { from = 0, unit = "gee" }\n',
+        "column accel_x: unknown unit 'gee'; known units",
+    ),
+    "wrong unit": (
+        '[columns]\naccel_x = { from = 0, unit = "s" }\n',
+        "column accel_x: expected a unit of acceleration",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), LAYOUTS.values(), ids=LAYOUTS)
+def test_a_layout_that_is_none_is_refused(file, text, message):
+    path = toml(file, text)
+    with pytest.raises(
+        UnitError if "unit" in message.split(";")[0].split(" of ")[0] and "unit =" not in message else ReadError
+    ) as caught:
+        load_layout(path)
+    assert str(caught.value).startswith(f"{path}: {message}") or message in str(caught.value)
+
+
+def test_a_layout_that_cannot_be_read_is_refused(tmp_path, file):
+    with pytest.raises(ReadError, match=r"absent\.toml: no such layout file"):
+        load_layout(tmp_path / "absent.toml")
+    with pytest.raises(ReadError, match="the layout cannot be read"):
+        load_layout(file(b"\xff\xfe", "latin.toml"))
+
+
+@pytest.mark.parametrize(
+    ("origins", "content", "message"),
+    [
+        ((0, 3), "1 2 3\n", "foreign takes accel_x from column 3, found 3 columns"),
+        ((1, 1), "1 2 3\n", "foreign takes both time and accel_x from column 1"),
+        (("t", "ax"), "t ay\n1 2\n", "foreign takes accel_x from a column named 'ax', found t ay"),
+        (("t", 5), "t ay\n1 2\n", "foreign takes accel_x from column 5, found 2 columns"),
+        ((0, 1), "1 2 3\n1 2\n", "row 2 (line 2): expected 3 fields, found 2"),
+        ((0, 1), "1 2 3\n\n4 5 6\n", "row 2 (line 2): expected 3 fields, found an empty line"),
+        ((0, 2), "1 ? 3\n1 ? n/a\n", "row 2 (line 2), column accel_x: expected a number, found 'n/a'"),
+        ((0, 1), "# nothing\n", "no rows of data"),
+    ],
+)
+def test_a_file_that_does_not_fit_its_layout_is_refused(file, origins, content, message):
+    columns = {"time": LayoutColumn(origins[0], "s"), "accel_x": LayoutColumn(origins[1], "g")}
+    layout = Layout(columns, header=isinstance(origins[0], str), name="foreign")
+    path = file(content.encode())
+    with pytest.raises(ImulabError) as caught:
+        read(path, layout)
+    assert isinstance(caught.value, ReadError)
+    assert str(caught.value).startswith(str(path))
+    assert message in str(caught.value)

@@ -1,0 +1,133 @@
+"""The report: complete, self-contained, safe, and drawn by a real browser without a network."""
+
+import re
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imulab as il
+from conftest import table
+from imulab.errors import RecordError
+from imulab.exhibit import Figure, Table, format_uncertain
+from imulab.present import exhibits_of
+from reference import tumble as reference
+
+G = 9.80665
+
+
+@pytest.fixture(scope="module")
+def record():
+    recording = il.simulate_tumble(attitudes=24, order=2, knock=7, seed=4)
+    return il.fit_tumble(il.find_attitudes(recording), gravity=G, loss="huber").calibration
+
+
+def browse(chromium, tmp_path, page, *options):
+    """Run headless Chromium on a file, cut off from any network."""
+    return subprocess.run(
+        [
+            chromium, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync",
+            "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}",
+            "--window-size=1100,3600", "--virtual-time-budget=15000", *options, page.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=120, check=True,
+    ).stdout  # fmt: skip
+
+
+def test_a_browser_draws_every_figure_without_a_network(record, chromium, tmp_path):
+    il.write_report(record, tmp_path / "r.html")
+    dom = browse(chromium, tmp_path, tmp_path / "r.html", "--dump-dom")
+    figures = [item for item in exhibits_of(record).items if isinstance(item, Figure)]
+    assert f'data-drawn="{len(figures)}"' in dom
+    assert dom.count('class="plot-container') == len(figures)
+    for title in ("attitude", "after, µg", "before, mg", "time, s", "standard deviation, mg"):
+        assert f">{title}<" in dom  # axis titles are drawn as SVG text
+
+
+def test_the_page_refers_to_nothing_outside(record, tmp_path):
+    il.write_report(record, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    own = re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+    assert not re.search(r"""(?:src|href|@import|url\()\s*=?\s*["']?(?:https?:)?//""", own)
+    assert page.count("</html>") == 1
+
+
+def test_the_report_says_what_the_record_holds(record, tmp_path):
+    il.write_report(record, tmp_path / "r.html")
+    page = re.sub(r"<script>.*?</script>", "", (tmp_path / "r.html").read_text(), flags=re.DOTALL)
+    assert "SIM-0004" in page
+    assert "down-weighted" in page
+    assert page.index('class="warnings"') < page.index("Residual |f|")
+    assert page.index("Provenance") > page.index("Correlation of the parameters")
+    assert record.to_dict()["content_sha256"] in page
+    for name in ("bias_x", "scale_factor_error_z", "misalignment_zy", "k2_y"):
+        assert name in page
+
+
+def test_user_text_is_escaped_everywhere(record, chromium, tmp_path):
+    evil = "<script>document.title='owned'</script><img src=x onerror=\"document.title='owned'\">"
+    hostile = replace(
+        record,
+        sensor={"serial": evil, "model": evil},
+        warnings=(evil,),
+        options={**record.options, evil: evil},
+        data={**record.data, "attitudes": {**record.data["attitudes"], "label": [evil] * record.fit["attitudes"]}},
+    )
+    il.write_report(hostile, tmp_path / "r.html")
+    dom = browse(chromium, tmp_path, tmp_path / "r.html", "--dump-dom")
+    assert "<title>owned" not in dom
+    assert 'data-drawn="4"' in dom
+
+
+def test_a_report_needs_nothing_but_the_saved_record(record, tmp_path):
+    record.save(tmp_path / "r.json")
+    il.write_report(record, tmp_path / "now.html")
+    il.write_report(il.load(tmp_path / "r.json"), tmp_path / "later.html")
+    assert (tmp_path / "now.html").read_bytes() == (tmp_path / "later.html").read_bytes()
+
+
+def test_a_record_without_the_data_for_its_figures_is_refused(record, tmp_path):
+    with pytest.raises(RecordError, match="lacks data that its report needs"):
+        il.write_report(replace(record, data={}), tmp_path / "r.html")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_table_of_attitudes_without_uncertainties_has_a_report(tmp_path):
+    rng = np.random.default_rng(1)
+    truth = reference.random_truth(rng, 1)
+    data = np.array([reference.forward(G * u, truth, 1) for u in reference.random_attitudes(rng, 9)])
+    record = il.fit_tumble(il.find_attitudes(table(data)), order=1, gravity=G).calibration
+    il.write_report(record, tmp_path / "r.html")
+    assert "not stated" in (tmp_path / "r.html").read_text()
+
+
+def test_engineering_units_of_the_parameter_table(record):
+    rows = {row[0]: row for item in exhibits_of(record).items if isinstance(item, Table) for row in item.rows}
+    mg, ppm = 9.80665e-3, 1e-6
+    assert float(rows["bias_x"][1]) == pytest.approx(record.value("bias_x") / mg, abs=1e-3)
+    assert float(rows["scale_factor_error_y"][1]) == pytest.approx((record.value("scale_factor_y") - 1) / ppm, abs=1)
+    assert float(rows["misalignment_zx"][1]) == pytest.approx(record.value("misalignment_zx") * 1e3, abs=1e-3)
+    assert float(rows["k2_z"][1]) == pytest.approx(record.value("k2_z") * 9.80665 * 1e6, abs=1)
+    assert [rows[n][4] for n in ("bias_x", "scale_factor_error_x", "misalignment_yx", "k2_x")] == [
+        "mg", "ppm", "mrad", "µg/g²",
+    ]  # fmt: skip
+    low, high = map(float, rows["bias_x"][3].split(" to "))
+    half = record.fit["coverage_factor_95"] * record.parameters["bias_x"].standard_uncertainty / mg
+    assert high - low == pytest.approx(2 * half, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "expected"),
+    [
+        (12.34567, 0.0321, ("12.346", "0.032")),
+        (12.34567, 0.0996, ("12.35", "0.10")),
+        (-7153.4, 21.3, ("-7153", "21")),
+        (123456.7, 1234.0, ("123500", "1200")),
+        (1.5, None, ("1.5", "not stated")),
+        (1.5, 0.0, ("1.5", "not stated")),
+    ],
+)
+def test_values_are_written_to_the_second_digit_of_their_uncertainty(value, uncertainty, expected):
+    assert format_uncertain(value, uncertainty) == expected
