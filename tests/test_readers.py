@@ -3,6 +3,7 @@
 import hashlib
 import io
 import sys
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imulab.errors import ImulabError, ReadError, UnitError
+from imulab.errors import ReadError, UnitError
 from imulab.readers import Layout, _text, load_layout, read, read_blocks
 from imulab.readers.layout import LayoutColumn
 
@@ -48,51 +49,39 @@ def bits(values):
 def test_every_double_reads_back_exactly(values):
     answer, found = parse([repr(value) for value in values])
     assert answer[:2] == (len(values), 0)
-    np.testing.assert_array_equal(found, values)  # NaN as NaN
-    assert [np.signbit(x) for x, y in zip(found, values, strict=True) if y == y] == [
-        np.signbit(y) for y in values if y == y
-    ]
+    assert [repr(value) for value in found] == [repr(value) for value in values]  # the sign of zero included
 
 
 @FIXED
 @given(st.from_regex(r"[+-]?[0-9]{0,22}(\.[0-9]{0,22})?([eE][+-]?[0-9]{0,3})?", fullmatch=True))
 def test_a_decimal_is_rounded_or_refused_as_float_does(token):
-    answer, found = parse([token])
+    answer, found = parse([token, "0"])
     try:
-        expected = float(token)
+        expected = float(token or "nan")  # an empty field is a missing reading
     except ValueError:
-        if token == "":  # an empty field is a missing reading
-            assert np.isnan(found[0])
-        else:
-            assert answer == (0, 1, 0)
+        assert answer == (0, 1, 0)
     else:
-        assert answer[:2] == (1, 0)
-        assert bits(found) == bits([expected])
+        assert answer[:2] == (2, 0)
+        np.testing.assert_array_equal(found, [expected, 0.0])
+        assert token == "" or np.signbit(found[0]) == np.signbit(expected)
 
 
 @FIXED
-@given(st.integers(2**50, 2**53 - 1), st.integers(-1, 1), st.integers(0, 19), st.sampled_from("+-"))
-def test_halfway_cases_and_their_neighbours_are_rounded_to_even(whole, nudge, point, sign):
-    # whole + 1/2, 1/4, 1/8 lie halfway between doubles; one more or less in the 19th digit lies beside.
-    for fraction in (125, 250, 375, 500, 625, 750, 875):
-        digits = str(whole * 1000 + fraction + nudge)[:19]
-        token = f"{sign}{digits[: len(digits) - point]}.{digits[len(digits) - point :]}" if point else sign + digits
-        assert bits(parse([token])[1]) == bits([float(token)])
+@given(st.integers(2**50, 2**53 - 1), st.integers(2**52, 2**53 - 1), st.integers(0, 9), st.integers(-1, 1))
+def test_halfway_cases_and_their_neighbours_are_rounded_to_even(whole, half, shift, nudge):
+    # Odd halves, quarters and eighths lie halfway between doubles of this size; so do odd integers of 54 bits.
+    tokens = [f"{whole}.{fraction + nudge:03d}" for fraction in (125, 250, 375, 500, 625, 750, 875)]
+    tokens.append(str(((2 * half + 1) << shift) + nudge))
+    assert bits(parse(tokens)[1]) == bits([float(token) for token in tokens])
 
 
 def test_a_hundred_thousand_decimals_of_every_length_are_rounded_as_float_does():
     rng = np.random.default_rng(20261120)
     count = 100_000
-    digits = [
-        str(n)[:k]
-        for n, k in zip(rng.integers(10**18, 10**19, count, np.uint64), rng.integers(1, 20, count), strict=True)
-    ]
-    point = rng.integers(0, 20, count)
-    power = rng.integers(-30, 30, count)
-    tokens = [
-        f"{d[:p]}.{d[p:]}" + (f"e{e}" if e % 3 == 0 else "")
-        for d, p, e in zip(digits, point.tolist(), power.tolist(), strict=True)
-    ]
+    numbers, lengths = rng.integers(10**18, 10**19, count, np.uint64), rng.integers(1, 20, count)
+    digits = [str(number)[:length] for number, length in zip(numbers, lengths, strict=True)]
+    points, powers = rng.integers(0, 20, count), rng.integers(-60, 30, count)
+    tokens = [f"{d[:p]}.{d[p:]}" + (f"e{e}" if e > -30 else "") for d, p, e in zip(digits, points, powers, strict=True)]
     answer, found = parse(tokens)
     assert answer[:2] == (count, 0)
     assert bits(found) == bits([float(token) for token in tokens])
@@ -168,7 +157,6 @@ ROWS = b"0,1,20\n1,2,21\n2,3,22\n"
         (HEAD + ROWS).replace(b",", b" , "),
         b'"time [s]","accel_x [m/s^2]","temperature [degC]"\n' + ROWS,
     ],
-    ids="no-last-newline trailing-blanks crlf crlf-blanks bom bom-comment leading-blanks spaces quotes".split(),
 )
 def test_the_usual_variants_of_text_read_alike(file, content):
     recording = read(file(content))
@@ -183,7 +171,7 @@ def test_the_usual_variants_of_text_read_alike(file, content):
 def test_numbers_equal_those_of_another_reader(file):
     rng = np.random.default_rng(3)
     values = rng.standard_normal((2000, 3)) * 10.0 ** rng.integers(-12, 12, (2000, 3))
-    path = file(HEAD + "\n".join(",".join(f"{x:.{k}g}" for x, k in zip(row, (17, 9, 4))) for row in values).encode())
+    path = file(HEAD + b"\n".join(b"%.17g,%.9g,%.4g" % tuple(row) for row in values))
     other = polars.read_csv(path, schema_overrides=[polars.Float64] * 3)
     recording = read(path)
     for name, theirs in zip(recording.columns, other.iter_columns(), strict=True):
@@ -193,20 +181,14 @@ def test_numbers_equal_those_of_another_reader(file):
 FIFTY = b"".join(b"%d,1,20\n" % k for k in range(49))
 REFUSED = {
     "letters": (HEAD + FIFTY + b"0.5,x1,20\n", "row 50 (line 51), column accel_x: expected a number, found 'x1'"),
-    "quoted": (
-        HEAD + FIFTY + b'0.5,1,"20"\n',
-        "row 50 (line 51), column temperature: expected a number, found '\"20\"'",
-    ),
-    "comments above": (
-        b"# a\n# b: c\n\n" + HEAD + FIFTY + b"?,1,2\n",
-        "row 50 (line 54), column time: expected a number",
-    ),
+    "quoted": (HEAD + FIFTY + b'0.5,1,"2"\n', "row 50 (line 51), column temperature: expected a number, found '\"2\"'"),
+    "comments": (b"# a\n# b: c\n\n" + HEAD + FIFTY + b"?,1,2\n", "row 50 (line 54), column time: expected a number"),
     "long": (HEAD + b"1,%s,2\n" % (b"z" * 500), "row 1 (line 2), column accel_x: expected a number, found 'zzz"),
     "ragged short": (HEAD + FIFTY + b"0.5,1\n0.6,1,20\n", "row 50 (line 51): expected 3 fields, found 2"),
     "ragged long": (HEAD + FIFTY + b"0.5,1,20,4\n", "row 50 (line 51): expected 3 fields, found 4"),
     "blank": (HEAD + FIFTY + b"\n9,1,20\n", "row 50 (line 51): expected 3 fields, found an empty line"),
     "blanks": (HEAD + FIFTY + b" \t \r\n\n9,1,20\n", "row 50 (line 51): expected 3 fields, found an empty line"),
-    "decimal comma": (HEAD + b"0;1;2\n", "row 1 (line 2): expected 3 fields, found 1"),
+    "decimal comma": (HEAD + b"0;1;2\n", "row 1 (line 2), column time: expected a number, found '0;1;2'"),
     "comment below": (HEAD + b"0,1,2\n# end\n", "row 2 (line 3), column time: expected a number, found '# end'"),
     "no rows": (HEAD, "no rows of data"),
     "no rows, blank": (HEAD + b"\n\n", "no rows of data"),
@@ -219,31 +201,22 @@ REFUSED = {
     "numbers": (b"# c\n0.1, 2e3\n", "line 2: expected titles such as 'time [s],accel_x [m/s^2]', found numbers"),
     "twice": (b"#\ntime [s],accel_x [g],accel_x [g]\n", "line 2: column accel_x appears twice"),
     "nameless": (b"time [s],,accel_x [g]\n0,1,2\n", "line 1: a column without a name"),
-}
-REFUSED_UNITS = {
-    "none": (b"time [s],accel_x\n0,1\n", "column accel_x has no unit; expected a title such as 'accel_x ["),
-    "wrong": (b"time [s],accel_x [deg/s]\n0,1\n", "column accel_x: expected a unit of acceleration or output, found"),
-    "unknown": (b"time [sec],accel_x [g]\n0,1\n", "column time: unknown unit 'sec'; known units: s ms us"),
+    "unit missing": (b"time [s],accel_x\n0,1\n", "column accel_x has no unit; expected a title such as 'accel_x ["),
+    "unit wrong": (b"time [s],accel_x [deg/s]\n0,1\n", "column accel_x: expected a unit of acceleration or output"),
+    "unit unknown": (b"time [sec],accel_x [g]\n0,1\n", "column time: unknown unit 'sec'; known units: s ms us"),
 }
 
 
-@pytest.mark.parametrize(("content", "message"), REFUSED.values(), ids=REFUSED)
-def test_a_file_that_is_not_native_csv_is_refused_with_the_place(file, content, message):
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_file_that_is_not_native_csv_is_refused_with_the_place(file, case):
+    content, message = REFUSED[case]
     path = file(content)
-    with pytest.raises(ReadError) as caught:
+    with pytest.raises(UnitError if case.startswith("unit") else ReadError) as caught:
         read(path)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < len(str(path)) + 160
-
-
-@pytest.mark.parametrize(("content", "message"), REFUSED_UNITS.values(), ids=REFUSED_UNITS)
-def test_a_title_with_a_missing_or_wrong_unit_is_refused(file, content, message):
-    path = file(content)
-    with pytest.raises(UnitError) as caught:
-        read(path)
-    assert str(caught.value).startswith(f"{path}: {message}")
+    assert "z" * 41 not in str(caught.value)
 
 
 def test_a_file_that_is_not_there_or_no_file_is_refused(tmp_path):
@@ -370,7 +343,7 @@ def test_a_sample_rate_makes_the_time_through_all_blocks(file, monkeypatch, size
     recording = read(file(b"".join(b"%d\n" % k for k in range(100))), layout)
     assert list(recording.columns) == ["time", "accel_x"]
     assert recording.units["time"] == "s"
-    assert recording.time.tolist() == [k * 0.016 for k in range(100)]  # 0.016 is not dyadic, 62.5 is
+    assert recording.time.tolist() == [float(k * Decimal("0.016")) for k in range(100)]
     assert recording.column("accel_x").tolist() == list(range(100))
 
 
@@ -381,6 +354,7 @@ def test_a_field_with_an_odd_blank_in_it_is_refused_as_it_stands(file, field):
     assert f"row 2 (line 2), column accel_x: expected a number, found {field!r}" in str(caught.value)
 
 
+FOG = '[columns]\nfog = { from = 0, unit = "V" }\n'
 LAYOUTS = {
     "unknown key": ('delimeter = ","\n' + COLUMNS, "unknown key 'delimeter'; known keys: columns delimiter header"),
     "delimiter": ('delimiter = "|"\n' + COLUMNS, "delimiter '|'; expected 'whitespace' ',' ';' or a tab"),
@@ -392,43 +366,33 @@ LAYOUTS = {
     "metadata": ("metadata = 3\n" + COLUMNS, "metadata = 3; expected a table"),
     "two times": ("sample_rate = 100\n" + COLUMNS, "both a time column and sample_rate; expected one of them"),
     "no unit": ("[columns]\naccel_x = { from = 1 }\n", "column accel_x: expected accel_x = { from = 1, unit ="),
-    "column key": ('[columns]\ntime = { from = 0, unit = "s", scale = 2 }\n', "column time: unknown key 'scale'"),
-    "from": (
-        '[columns]\ntime = { from = -1, unit = "s" }\n',
-        "column time: from = -1; expected a column number from 0",
-    ),
-    "rate": (
-        'sample_rate = { value = 1, unit = "kHz" }\n[columns]\nfog = { from = 0, unit = "V" }',
-        "sample_rate: exp",
-    ),
-    "rate 0": (
-        "sample_rate = 0\n[columns]\nfog = { from = 0, unit = 'V' }",
-        "expected a positive number of Hz, found 0",
-    ),
+    "column key": ('[columns]\nfog = { from = 0, unit = "V", scale = 2 }\n', "column fog: unknown key 'scale'"),
+    "from": ('[columns]\nfog = { from = -1, unit = "V" }\n', "column fog: from = -1; expected a column number from 0"),
+    "rate unit": ('sample_rate = { value = 1, unit = "kHz" }\n' + FOG, "sample_rate: expected { value = 100, unit ="),
+    "rate 0": ("sample_rate = 0\n" + FOG, "sample_rate: expected a positive number of Hz, found 0"),
     "rate true": (
-        'sample_rate = { value = true, unit = "Hz" }\n[columns]\nfog = { from = 0, unit = "V" }',
-        "sample_rate: expected a positive number of Hz, found True",
+        'sample_rate = { value = true, unit = "Hz" }\n' + FOG,
+        "sample_rate: expected a positive number of Hz",
     ),
     "not TOML": ("columns = [", "the layout is not TOML"),
-    "bad unit": (
-        '[columns]\naccel_x = { from = 0, unit = "gee" }\n',
-        "column accel_x: unknown unit 'gee'; known units",
+    "unit unknown": (
+        '[columns]\nfog = { from = 0, unit = "vo" }\n',
+        "column fog: unknown unit 'vo'; known units: s ms",
     ),
-    "wrong unit": (
-        '[columns]\naccel_x = { from = 0, unit = "s" }\n',
-        "column accel_x: expected a unit of acceleration",
+    "unit wrong": (
+        '[columns]\nfog = { from = 0, unit = "s" }\n',
+        "column fog: expected a unit of rate or output, found",
     ),
 }
 
 
-@pytest.mark.parametrize(("text", "message"), LAYOUTS.values(), ids=LAYOUTS)
-def test_a_layout_that_is_none_is_refused(file, text, message):
+@pytest.mark.parametrize("case", LAYOUTS)
+def test_a_layout_that_is_none_is_refused(file, case):
+    text, message = LAYOUTS[case]
     path = toml(file, text)
-    with pytest.raises(
-        UnitError if "unit" in message.split(";")[0].split(" of ")[0] and "unit =" not in message else ReadError
-    ) as caught:
+    with pytest.raises(UnitError if case.startswith("unit") else ReadError) as caught:
         load_layout(path)
-    assert str(caught.value).startswith(f"{path}: {message}") or message in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: {message}")
 
 
 def test_a_layout_that_cannot_be_read_is_refused(tmp_path, file):
@@ -455,8 +419,7 @@ def test_a_file_that_does_not_fit_its_layout_is_refused(file, origins, content, 
     columns = {"time": LayoutColumn(origins[0], "s"), "accel_x": LayoutColumn(origins[1], "g")}
     layout = Layout(columns, header=isinstance(origins[0], str), name="foreign")
     path = file(content.encode())
-    with pytest.raises(ImulabError) as caught:
+    with pytest.raises(ReadError) as caught:
         read(path, layout)
-    assert isinstance(caught.value, ReadError)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)

@@ -244,7 +244,7 @@ def excess_variance(residuals: Array, variance: Array, freedom: int) -> Array:
     """
     squares = residuals**2
     # With all variances as large as the largest the root would be here: the real one lies above.
-    tau = np.maximum(squares.sum(axis=1) / freedom - variance.max(axis=1), 0.0)
+    tau: Array = np.maximum(squares.sum(axis=1) / freedom - variance.max(axis=1), 0.0)
     for _ in range(60):
         total = variance + tau[:, None]
         excess = (squares / total).sum(axis=1) - freedom

@@ -51,6 +51,14 @@ class Exhibits:
     items: list[Figure | Table]
 
 
+def plain_number(value: float, digits: int) -> str:
+    """Return a number with at least `digits` significant digits, never in powers of ten."""
+    if value == 0 or not math.isfinite(value):
+        return f"{value:.0f}"
+    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{places}f}"
+
+
 def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -> tuple[str, str]:
     """Return a value and its uncertainty as text, both to the last of `digits` significant digits of the latter."""
     if uncertainty is None or not uncertainty > 0 or not math.isfinite(uncertainty):

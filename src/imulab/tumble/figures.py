@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.exhibit import BAD, GOOD, INK, QUIET, Exhibits, Figure, Table, format_uncertain
+from imulab.exhibit import BAD, GOOD, INK, QUIET, Exhibits, Figure, Table, format_uncertain, plain_number
 from imulab.recording import Array
 from imulab.tumble.engineering import engineering_rows
 from imulab.tumble.model import AXES
@@ -27,10 +27,10 @@ def exhibits(record: Calibration) -> Exhibits:
     facts = [
         ("attitudes", str(fit["attitudes"])),
         ("order", str(model["order"])),
-        ("rms of |f| − g", _small_g(fit["rms"]["value"])),
+        (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", _small_g(_rms(used))),
         ("leave-one-out", _small_g(left_out["value"]) if left_out else "not computed"),
         ("worst u(scale factor)", f"{worst:.2g} ppm" if worst is not None else "not stated"),
-        ("condition number", f"{fit['condition_number']:.3g}"),
+        ("condition number", plain_number(fit["condition_number"], 3)),
     ]
     items: list[Figure | Table] = [_residuals(record), _parameters(record)]
     if fit["orders"]:
@@ -125,7 +125,9 @@ def _residuals(record: Calibration) -> Figure:
             trace,
         ],
         layout={
-            "xaxis": _axis("attitude", dtick=max(1, round(len(number) / 20)), anchor="y"),
+            "xaxis": _axis(
+                "attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6], anchor="y"
+            ),
             "yaxis": _axis("after, µg", domain=[0, 0.6], range=[-span, span]),
             "yaxis2": _axis("before, mg", domain=[0.68, 1]),
             "showlegend": False,
@@ -190,11 +192,11 @@ def _orders(record: Calibration) -> Table:
             [
                 str(row["order"]),
                 str(row["parameters"]),
-                f"{_micro_g(row['rms']):.4g}",
-                f"{_micro_g(row['leave_one_out']):.4g}" if row["leave_one_out"] is not None else "–",
+                plain_number(_micro_g(row["rms"]), 4),
+                plain_number(_micro_g(row["leave_one_out"]), 4) if row["leave_one_out"] is not None else "–",
                 f"{probability:.2g}" if probability is not None else "–",
                 f"{row['bic']:.1f}" if row["bic"] is not None else "–",
-                f"{row['condition_number']:.3g}",
+                plain_number(row["condition_number"], 3),
                 "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
             ]
         )
@@ -254,13 +256,14 @@ def _sphere(record: Calibration) -> Figure:
                 "hovertemplate": "%{text}<br>up (%{customdata[0]}, %{customdata[1]}, %{customdata[2]})<extra></extra>",
             }
         )
-    hidden = {"visible": False, "range": [-1.2, 1.2], "fixedrange": True}
+    hidden = {"visible": False, "range": [-1.25, 1.25], "fixedrange": True}
     return Figure(
         title="Attitudes on the sphere",
-        caption="Direction of the specific force (up) in the body frame, equal-area maps of the hemispheres: left seen "
-        "from +z, right from −z. Large empty regions are what the calibration has not seen.",
+        caption="Direction of the specific force (up) in the body frame, equal-area maps: left the "
+        "hemisphere around +z, right that around −z. Large empty regions are what the calibration has not seen.",
         traces=traces,
         layout={
+            "margin": {"l": 10, "r": 10, "t": 20, "b": 10},
             "xaxis": {**hidden, "domain": [0, 0.47]},
             "yaxis": {**hidden, "scaleanchor": "x"},
             "xaxis2": {**hidden, "domain": [0.5, 0.97]},
@@ -269,10 +272,10 @@ def _sphere(record: Calibration) -> Figure:
                 note
                 for axes, side in ((("x", "y"), "+z"), (("x2", "y2"), "−z"))
                 for note in (
-                    _label(axes, 1.1, 0, "+x"),
-                    _label(axes, -1.1, 0, "−x"),
-                    _label(axes, 0, 1.1, "+y"),
-                    _label(axes, 0, -1.1, "−y"),
+                    _label(axes, 1.15, 0, "+x"),
+                    _label(axes, -1.15, 0, "−x"),
+                    _label(axes, 0, 1.12, "+y"),
+                    _label(axes, 0, -1.12, "−y"),
                     _label(axes, 0, 0, side),
                 )
             ],
