@@ -147,8 +147,8 @@ def main() -> None:
         "|---|---|---|",
         *(f"| {what} | {found} | {asked} |" for what, found, asked in ROWS),
         "",
-        "Accuracy is measured by the tests: `make test-all` checks, over 5,000 trials a case, each parameter's rms error",
-        "against the Cramér-Rao bound and the coverage of the 95 % intervals (tests/test_tumble_statistics.py).",
+        "Accuracy is measured by the tests: `make test-all` checks, over 5,000 trials a case, the rms error of each",
+        "parameter against the Cramér-Rao bound and the coverage of the 95 % intervals.",
     ]
     (HERE / "RESULTS.md").write_text("\n".join(lines) + "\n")
 

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-
 from imulab.calibration import Calibration
-from imulab.errors import RecordError, UnitError
+from imulab.errors import RecordError
 from imulab.recording import Recording
 from imulab.tumble.apply import apply_tumble
-from imulab.units import conversion_factor, to_si
 
 _FAR_IN_TEMPERATURE = 20.0
 
@@ -49,23 +46,10 @@ def apply_blocks(records: Iterable[Calibration], blocks: Iterable[Recording]) ->
 def warnings_of(record: Calibration, recording: Recording) -> list[str]:
     """Return what a user should know about applying this record to this recording."""
     made = record.model.get("temperature")
-    here = recording_temperature(recording)
+    here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
         return []
     return [
         f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
         f"{made['value']:.1f} degC at which the record was made"
     ]
-
-
-def recording_temperature(recording: Recording) -> float | None:
-    """Return the mean temperature of a recording, degC, if known."""
-    if "temperature" in recording:
-        try:
-            unit = recording.units["temperature"]
-            conversion_factor(unit, "K")
-        except UnitError:
-            return None
-        values = to_si(recording.column("temperature"), unit)
-        return float(np.nanmean(values)) if np.isfinite(values).any() else None
-    return None

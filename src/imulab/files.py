@@ -25,7 +25,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     if target.is_dir():
         raise OptionError(f"{target}: expected the name of a file to write, found a folder")
     try:
-        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        descriptor, name = tempfile.mkstemp(prefix=".imulab.", suffix=".part", dir=target.parent)
     except OSError as error:
         raise OptionError(f"{target}: cannot be written: {error.strerror}") from None
     part = Path(name)

@@ -51,7 +51,7 @@ class Recording:
     columns
         Name to samples, each of shape (n,), in file order.
     units
-        Name to unit symbol.
+        Name to unit symbol, in the same order; ``1`` where a column outside the vocabulary came without.
     metadata
         ``key: value`` comments at the head of the file (serial, model, power_on_temperature, ...).
     name
@@ -81,6 +81,7 @@ class Recording:
             raise DataError(f"{self.name}: columns of different length: {sorted(lengths)}")
         for name in self.columns:
             check_unit(name, self.units.get(name, ""), self.name)
+        object.__setattr__(self, "units", {name: self.units.get(name, "1") for name in self.columns})
 
     def __len__(self) -> int:
         for column in self.columns.values():
@@ -144,6 +145,22 @@ class Recording:
             raise UnitError(f"{self.name}: the axes of a triad must share one unit, found {found}")
         return units[names[0]]
 
+    def mean_temperature(self) -> float | None:
+        """Return the mean temperature, degC: of the column, or else as the head of the file states it."""
+        if "temperature" in self.columns:
+            if parse_unit(self.units["temperature"]).quantity != "temperature":
+                return None
+            values = self.si("temperature")
+            values = values[np.isfinite(values)]
+            return float(values.mean()) if values.size else None
+        for key in ("temperature", "power_on_temperature"):
+            number, _, unit = self.metadata.get(key, "").partition(" ")
+            try:
+                return to_si(float(number), unit.strip() or "degC")
+            except (ValueError, UnitError):
+                continue
+        return None
+
     def with_columns(self, columns: Mapping[str, Array], units: Mapping[str, str]) -> Recording:
         """Return a copy in which some columns are replaced (or added at the end)."""
         return replace(self, columns={**self.columns, **columns}, units={**self.units, **units})
@@ -154,7 +171,12 @@ class Recording:
         columns, units = {}, {}
         for title in frame.columns:
             key, unit = parse_column_title(str(title), name)
-            columns[key] = np.asarray(frame[title].to_numpy(), dtype=np.float64)
+            if key in columns:
+                raise DataError(f"{name}: column {key} appears twice")
+            values = frame[title].to_numpy()
+            if not np.issubdtype(values.dtype, np.number):
+                raise DataError(f"{name}: column {key}: expected numbers, found {values.dtype}")
+            columns[key] = np.asarray(values, dtype=np.float64)
             units[key] = unit
         return cls(columns=columns, units=units, name=name)
 
@@ -259,6 +281,6 @@ def check_time(recording: Recording) -> Array:
         unit = recording.units["time"]
         raise DataError(
             f"{recording.name}: {recording.place(index)}, column time: time {verb}: "
-            f"expected more than {raw[index - 1]:.9g} {unit}, found {raw[index]:.9g} {unit}"
+            f"expected more than {raw[index - 1]:.15g} {unit}, found {raw[index]:.15g} {unit}"
         )
     return time

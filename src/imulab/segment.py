@@ -96,7 +96,7 @@ def find_attitudes(
     unit = recording.triad_unit(sensor)
     names = [f"{sensor}_{axis}" for axis in "xyz"]
     check_finite(recording, names)
-    temperature = _temperature(recording)
+    temperature = recording.mean_temperature()
     if "time" not in recording:
         check_clipped_rows(recording, names)
         return Attitudes(
@@ -146,20 +146,6 @@ def find_attitudes(
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
     )
-
-
-def _temperature(recording: Recording) -> float | None:
-    """Mean temperature of the test, degC, where the recording knows one."""
-    if "temperature" in recording and recording.units["temperature"] in ("degC", "K"):
-        values = recording.si("temperature")
-        values = values[np.isfinite(values)]
-        return float(values.mean()) if values.size else None
-    for key in ("temperature", "power_on_temperature"):
-        try:
-            return float(recording.metadata[key].split()[0])
-        except (KeyError, ValueError, IndexError):
-            continue
-    return None
 
 
 def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:

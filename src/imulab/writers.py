@@ -44,6 +44,13 @@ def write_csv_to(blocks: Recording | Iterable[Recording], stream: BinaryIO) -> N
 
 
 def _head(recording: Recording) -> str:
-    comments = "".join(f"# {key}: {value}\n" for key, value in recording.metadata.items())
+    for name in recording.columns:
+        if not name or set(name) & set(',"[]#\r\n') or name != name.strip():
+            raise OptionError(f"{recording.name}: column name {name!r} cannot be written to CSV")
+    comments = "".join(f"# {_one_line(key)}: {_one_line(value)}\n" for key, value in recording.metadata.items())
     titles = ",".join(f"{name} [{unit}]" if unit != "1" else name for name, unit in recording.units.items())
     return f"{comments}{titles}\n"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.splitlines())

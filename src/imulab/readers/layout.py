@@ -77,7 +77,7 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
     if unknown:
         raise ReadError(f"{path}: unknown key {unknown[0]!r}; known keys: {' '.join(sorted(_KEYS))}")
     delimiter = table.get("delimiter", "whitespace")
-    if delimiter not in _DELIMITERS:
+    if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:
         raise ReadError(f"{path}: delimiter {delimiter!r}; expected 'whitespace' ',' ';' or a tab")
     columns = table.get("columns")
     if not isinstance(columns, dict) or not columns:
@@ -131,6 +131,6 @@ def _sample_rate(entry: Any, path: str) -> float | None:
     if not isinstance(entry, dict) or set(entry) != {"value", "unit"} or entry["unit"] != "Hz":
         raise ReadError(f'{path}: sample_rate: expected {{ value = 100, unit = "Hz" }}, found {entry!r}')
     value = entry["value"]
-    if not isinstance(value, int | float) or not 0 < value < 1e9:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
         raise ReadError(f"{path}: sample_rate: expected a positive number of Hz, found {value!r}")
     return to_si(float(value), "Hz")

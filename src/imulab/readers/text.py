@@ -7,6 +7,8 @@ The numbers are read by the C module `_text` in blocks of whole lines.
 from __future__ import annotations
 
 import hashlib
+import re
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from typing import BinaryIO
 
@@ -34,6 +36,11 @@ class TextFile:
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
         self._lines_before = 0
         self._read_more()
+        while len(self._rest) < len(BOM_UTF8) and not self._ended:
+            self._read_more()
+        self._rest = self._rest.removeprefix(BOM_UTF8)
+        while not self._rest.strip() and not self._ended:
+            self._read_more()
         if not self._rest.strip():
             raise ReadError(f"{name}: the file is empty")
         if b"\0" in self._rest[:4096]:
@@ -86,16 +93,20 @@ class TextFile:
         lines, self._rest = self._rest.rstrip(self._blanks), b""
         return lines or None
 
-    def _line(self) -> str | None:
-        """Take one line of the head."""
+    def _fill_line(self) -> None:
+        """Read on until a whole line is there, or the end of the file."""
         while b"\n" not in self._rest and not self._ended and len(self._rest) < _LONGEST_LINE:
             self._read_more()
+
+    def _line(self) -> str | None:
+        """Take one line of the head."""
+        self._fill_line()
         if not self._rest:
             return None
         line, _, self._rest = self._rest.partition(b"\n")
         self._lines_before += 1
         try:
-            return line.decode("utf-8-sig" if self._lines_before == 1 else "utf-8").rstrip("\r")
+            return line.decode("utf-8").rstrip("\r")
         except UnicodeDecodeError:
             raise ReadError(f"{self._name}: line {self._lines_before}: expected UTF-8 text") from None
 
@@ -139,12 +150,14 @@ class TextFile:
             header = self._line() or ""
             present = [title.strip().strip('"') for title in _fields(header.lstrip("# "), layout.delimiter)]
         else:
+            self._fill_line()
             while self._rest.startswith(b"#"):
                 self._line()
-            while b"\n" not in self._rest and not self._ended:
-                self._read_more()
+                self._fill_line()
             first = self._rest.partition(b"\n")[0].decode("utf-8", "replace")
             present = [str(number) for number in range(len(_fields(first, layout.delimiter)))]
+        if not self._rest.strip():
+            raise ReadError(f"{self._name}: no rows of data below the header")
         slots = np.full(len(present), -1, dtype=np.int32)
         for slot, (name, column) in enumerate(layout.columns.items()):
             origin = column.origin
@@ -186,18 +199,19 @@ class TextFile:
         number = row + index
         place = f"{self._name}: row {number} (line {number + self._lines_before})"
         line = block.split(b"\n", index + 1)[index].decode("utf-8", "replace").rstrip("\r")
-        if not line.strip():
+        if not line.strip(" \t"):
             raise ReadError(f"{place}: expected {len(self._slots)} fields, found an empty line")
         if problem == 2:
             raise ReadError(f"{place}: expected {len(self._slots)} fields, found {field}")
-        found = _fields(line, self._delimiter)[field].strip()
+        found = _fields(line, self._delimiter)[field].strip(" \t\r")
         slot = int(self._slots[field])
         shown = found if len(found) <= 40 else found[:37] + "..."
         raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}")
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
-    return line.split() if delimiter == " " else line.split(delimiter)
+    """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
+    return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
 
 
 def _is_number(text: str) -> bool:

@@ -21,6 +21,7 @@ MISALIGNMENTS = ("yx", "zx", "zy")
 HIGHEST_ORDER = 5
 GAUGE = "x input axis along body x, y input axis in the body xy plane"
 _NEWTON_STEPS = 12
+_CLOSE = 1e-15
 
 
 def parameter_count(order: int) -> int:
@@ -65,9 +66,10 @@ def invert(reading: Array, misalignment: Array, nonlinearity: Array) -> Inversio
         k2 ... ke, shape (..., e - 1, 3), in the inverse powers of the unit of `reading`.
     """
     sensed, slope = _solve_polynomial(reading, nonlinearity)
-    x = sensed[..., 0]
-    y = sensed[..., 1] - misalignment[..., 0] * x
-    z = sensed[..., 2] - misalignment[..., 1] * x - misalignment[..., 2] * y
+    with np.errstate(over="ignore", invalid="ignore"):
+        x = sensed[..., 0]
+        y = sensed[..., 1] - misalignment[..., 0] * x
+        z = sensed[..., 2] - misalignment[..., 1] * x - misalignment[..., 2] * y
     return Inversion(np.stack([x, y, z], axis=-1), sensed, slope)
 
 
@@ -77,13 +79,17 @@ def _solve_polynomial(reading: Array, nonlinearity: Array) -> tuple[Array, Array
     if powers == 0:
         return reading, np.ones_like(reading)
     s = reading
-    for _ in range(_NEWTON_STEPS):
-        value, slope = _polynomial(s, nonlinearity)
-        step = (value - reading) / slope
-        s = s - step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-15 * max(1.0, np.nanmax(np.abs(reading), initial=0.0)):
-            break
-    return s, _polynomial(s, nonlinearity)[1]
+    size = _CLOSE * np.maximum(np.abs(reading), 1.0)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            value, slope = _polynomial(s, nonlinearity)
+            step = (value - reading) / slope
+            # Each element stops by itself, so that its result does not depend on its neighbours.
+            moving = np.abs(step) > size
+            s = np.where(moving | np.isnan(step), s - step, s)
+            if not moving.any():
+                break
+        return s, _polynomial(s, nonlinearity)[1]
 
 
 def _polynomial(s: Array, nonlinearity: Array) -> tuple[Array, Array]:

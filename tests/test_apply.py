@@ -1,0 +1,227 @@
+"""Records applied to recordings: the transcribed forward model undone, units, missing readings, blocks, warnings."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from imulab.apply import apply, apply_blocks, warnings_of
+from imulab.calibration import Calibration, Covariance, Parameter
+from imulab.errors import DataError, RecordError, UnitError
+from imulab.recording import Recording
+from reference import tumble as reference
+
+G = 9.80665
+PER_SI = {"m/s^2": 1.0, "g": 1 / G, "mg": 1000 / G, "ug": 1e6 / G, "count": 4096 / G, "V": 0.1}  # output per m/s^2
+AXES = ["accel_x", "accel_y", "accel_z"]
+
+
+def record(truth, order: int, unit: str, **model) -> Calibration:
+    parameters = {name: Parameter(value, None, "1") for name, value in truth.items()}
+    return Calibration("tumble", parameters, Covariance((), ()), {"order": order, "output_unit": unit, **model}, {})
+
+
+def recording(outputs, unit: str, **columns) -> Recording:
+    made = {name: np.array(outputs[:, i]) for i, name in enumerate(AXES)}
+    extra = {name: np.asarray(values, dtype=float) for name, (values, _) in columns.items()}
+    units = dict.fromkeys(AXES, unit) | {name: unit for name, (_, unit) in columns.items()}
+    return Recording({**made, **extra}, units, name="flight.csv", metadata={"serial": "SN42"}, lines_before=2)
+
+
+def simulated(order: int, unit: str, count: int = 200):
+    """Specific forces within +-2 g, m/s^2, and what a random unit of MEMS size makes of them."""
+    rng = np.random.default_rng(100 * order + len(unit))
+    truth = reference.random_truth(rng, order, PER_SI[unit])
+    forces = rng.uniform(-2 * G, 2 * G, (count, 3))
+    return truth, forces, np.array([reference.forward(force, truth, order) for force in forces])
+
+
+@pytest.mark.parametrize("unit", ["m/s^2", "g", "mg", "count", "V"])
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_applying_a_record_undoes_the_forward_model(order, unit):
+    truth, forces, outputs = simulated(order, unit)
+    corrected = apply(record(truth, order, unit), recording(outputs, unit))
+    assert [corrected.units[name] for name in AXES] == ["m/s^2"] * 3
+    np.testing.assert_allclose(corrected.triad("accel"), forces, rtol=0, atol=1e-12 * 2 * G)
+
+
+@pytest.mark.parametrize("made_in", ["m/s^2", "g", "mg"])
+@pytest.mark.parametrize("logged_in", ["m/s^2", "g", "mg", "ug"])
+def test_a_recording_in_another_unit_of_acceleration_is_converted(made_in, logged_in):
+    truth, forces, outputs = simulated(3, made_in)
+    logged = outputs * (PER_SI[logged_in] / PER_SI[made_in])
+    corrected = apply(record(truth, 3, made_in), recording(logged, logged_in))
+    np.testing.assert_allclose(corrected.triad("accel"), forces, rtol=0, atol=1e-12 * 2 * G)
+
+
+@pytest.mark.parametrize(("made_in", "logged_in"), [("count", "m/s^2"), ("g", "count"), ("V", "count"), ("m/s^2", "V")])
+def test_a_unit_that_cannot_be_converted_is_refused_naming_both(made_in, logged_in):
+    truth, _, outputs = simulated(1, made_in)
+    with pytest.raises(UnitError) as caught:
+        apply(record(truth, 1, made_in), recording(outputs, logged_in))
+    message = str(caught.value)
+    assert message.startswith("flight.csv: ")
+    assert f"are in {logged_in}," in message
+    assert message.endswith(f"outputs in {made_in}")
+
+
+def test_axes_in_different_units_are_refused():
+    truth, _, outputs = simulated(1, "g")
+    mixed = recording(outputs, "g").with_columns({}, {"accel_y": "mg"})
+    with pytest.raises(UnitError, match=r"share one unit, found accel_x \[g\], accel_y \[mg\], accel_z \[g\]"):
+        apply(record(truth, 1, "g"), mixed)
+
+
+def test_a_recording_without_the_triad_is_refused():
+    truth, _, outputs = simulated(1, "g")
+    whole = recording(outputs, "g")
+    lame = Recording({name: whole.column(name) for name in AXES[:2]}, whole.units, name="flight.csv")
+    with pytest.raises(DataError, match=r"flight\.csv: no column accel_z; found accel_x accel_y"):
+        apply(record(truth, 1, "g"), lame)
+
+
+@pytest.mark.parametrize("procedure", ["warmup", "gyro_array", "centrifuge"])
+def test_a_record_with_nothing_to_apply_here_is_refused(procedure):
+    other = Calibration(procedure, {}, Covariance((), ()), {}, {})
+    with pytest.raises(RecordError, match=f"a {procedure} record cannot be applied"):
+        apply(other, recording(np.zeros((2, 3)), "g"))
+
+
+# The misalignment is lower triangular: x reaches y and z, y reaches z, z reaches nothing else.
+TOUCHED = {"accel_x": [True, True, True], "accel_y": [False, True, True], "accel_z": [False, False, True]}
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("order", [1, 2, 3, 5])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_reading_that_is_no_number_stays_in_the_channels_it_touches(order, axis, bad):
+    truth, forces, outputs = simulated(order, "g")
+    outputs[17, AXES.index(axis)] = bad
+    with np.errstate(all="ignore"):
+        corrected = apply(record(truth, order, "g"), recording(outputs, "g")).triad("accel")
+    lost = np.zeros((len(forces), 3), dtype=bool)
+    lost[17] = TOUCHED[axis]
+    assert np.array_equal(~np.isfinite(corrected), lost)
+    np.testing.assert_allclose(corrected[~lost], forces[~lost], rtol=0, atol=1e-12 * 2 * G)
+
+
+@pytest.mark.parametrize("order", [1, 3])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
+def test_a_wild_reading_is_corrected_without_a_warning_of_numpy(order, bad):
+    truth, _, outputs = simulated(order, "g")
+    outputs[[17, 18, 19], [0, 1, 2]] = bad
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        apply(record(truth, order, "g"), recording(outputs, "g"))
+
+
+def test_a_wild_reading_does_not_spoil_the_others():
+    truth, forces, outputs = simulated(3, "g")
+    outputs[17, 2] = 1e300
+    with np.errstate(all="ignore"):
+        corrected = apply(record(truth, 3, "g"), recording(outputs, "g")).triad("accel")
+    others = np.arange(len(forces)) != 17
+    np.testing.assert_allclose(corrected[others], forces[others], rtol=0, atol=1e-12 * 2 * G)
+
+
+def test_columns_that_the_record_does_not_touch_pass_unchanged():
+    truth, _, outputs = simulated(2, "g", count=50)
+    rng = np.random.default_rng(4)
+    before = recording(
+        outputs,
+        "g",
+        time=(np.arange(50), "ms"),
+        gyro_x=(rng.standard_normal(50), "deg/s"),
+        truth_accel_x=(rng.standard_normal(50), "m/s^2"),
+        pressure=(np.full(50, np.nan), "1"),
+    )
+    after = apply(record(truth, 2, "g"), before)
+    assert list(after.columns) == list(before.columns)
+    for name in ("time", "gyro_x", "truth_accel_x", "pressure"):
+        assert after.column(name).tobytes() == before.column(name).tobytes()
+        assert after.units[name] == before.units[name]
+    assert (after.name, after.metadata, after.lines_before) == (before.name, before.metadata, 2)
+    np.testing.assert_array_equal(before.triad("accel"), outputs)
+
+
+@pytest.mark.parametrize("size", [1, 7, 64, 500])
+@pytest.mark.parametrize("order", [1, 4])
+def test_blocks_are_corrected_as_the_whole(size, order):
+    truth, _, outputs = simulated(order, "count", count=300)
+    outputs[100, 1] = np.nan
+    made = record(truth, order, "count")
+    whole = apply(made, recording(outputs, "count")).triad("accel")
+    blocks = (recording(outputs[start : start + size], "count") for start in range(0, 300, size))
+    joined = np.vstack([block.triad("accel") for block in apply_blocks([made], blocks)])
+    assert joined.tobytes() == whole.tobytes()
+
+
+def test_records_are_applied_in_the_order_given():
+    first, forces, outputs = simulated(2, "g")
+    second = reference.random_truth(np.random.default_rng(9), 1, 1.0)
+    chain = [record(first, 2, "g"), record(second, 1, "m/s^2")]
+    (corrected,) = apply_blocks(chain, [recording(outputs, "g")])
+    expected = np.array([reference.inverse(force, second, 1) for force in forces])
+    np.testing.assert_allclose(corrected.triad("accel"), expected, rtol=0, atol=2e-12 * 2 * G)
+    with pytest.raises(UnitError, match=r"are in m/s\^2,"):
+        list(apply_blocks([chain[1], record(first, 2, "count")], [recording(outputs, "g")]))
+
+
+# --- temperature -----------------------------------------------------------------------------------------------
+
+
+def at(values, unit="degC", **metadata) -> Recording:
+    made = recording(np.zeros((len(values), 3)), "g", temperature=(values, unit))
+    return Recording(made.columns, made.units, name="flight.csv", metadata=metadata)
+
+
+MADE = {"temperature": {"value": 24.0, "unit": "degC"}}
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "mean"),
+    [
+        ([-1.0, 3.0], "degC", 1.0),
+        ([274.15, np.nan], "K", 1.0),
+        ([np.nan, np.nan], "degC", None),
+        ([2048, 2050], "count", None),
+    ],
+)
+def test_the_temperature_of_a_recording_is_its_mean_in_degrees_celsius(values, unit, mean):
+    found = at(values, unit).mean_temperature()
+    assert found is None if mean is None else found == pytest.approx(mean, abs=1e-12)
+
+
+def test_a_recording_without_temperature_has_none():
+    assert recording(np.zeros((3, 3)), "g").mean_temperature() is None
+
+
+@pytest.mark.parametrize("mean", [3.9, 44.1, -40.0])
+def test_a_record_made_far_from_the_recordings_temperature_is_warned_of(mean):
+    truth, _, _ = simulated(1, "g")
+    (message,) = warnings_of(record(truth, 1, "g", **MADE), at([mean - 1, mean + 1]))
+    assert message.startswith(
+        f"flight.csv: temperature {mean:.1f} degC is {abs(mean - 24):.0f} K away from the 24.0 degC"
+    )
+
+
+def test_a_temperature_in_the_head_of_the_recording_counts_too():
+    truth, _, outputs = simulated(1, "g")
+    warm = Recording(
+        {name: outputs[:, i] for i, name in enumerate(AXES)}, dict.fromkeys(AXES, "g"), {"temperature": "61.5 degC"}
+    )
+    (message,) = warnings_of(record(truth, 1, "g", **MADE), warm)
+    assert "temperature 61.5 degC" in message
+
+
+@pytest.mark.parametrize("mean", [4.0, 24.0, 44.0])
+def test_twenty_kelvin_are_not_far(mean):
+    truth, _, _ = simulated(1, "g")
+    assert warnings_of(record(truth, 1, "g", **MADE), at([mean])) == []
+
+
+def test_an_unknown_temperature_is_not_warned_of():
+    truth, _, _ = simulated(1, "g")
+    assert warnings_of(record(truth, 1, "g"), at([90.0])) == []
+    assert warnings_of(record(truth, 1, "g", **MADE), recording(np.zeros((2, 3)), "g")) == []
+    assert warnings_of(record(truth, 1, "g", **MADE), at([np.nan])) == []

@@ -1,0 +1,391 @@
+"""The batched solver and its statistics against scipy, certified results and formulas transcribed."""
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from imulab.estimate import (
+    bayesian_information,
+    chi_square_limit,
+    covariance,
+    coverage_factor,
+    excess_variance,
+    f_test,
+    huber_inflation,
+    huber_weights,
+    levenberg_marquardt,
+    leverage,
+    observability,
+    robust_scale,
+)
+
+# --- Levenberg-Marquardt ---------------------------------------------------------------------------------------
+
+TIMES = np.linspace(0, 3, 25)
+
+
+def decay(p):
+    """``a exp(-b t) + c`` and its Jacobian for parameters (k, 3)."""
+    a, b, c = (p[:, i, None] for i in range(3))
+    e = np.exp(-b * TIMES)
+    return a * e + c, np.stack([e, -a * TIMES * e, np.ones_like(e)], axis=-1)
+
+
+def decays(count: int, noise: float, seed: int = 1):
+    """Noisy decays, a batch of problems; random weights, some of them zero."""
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform([1, 0.5, -1], [3, 2, 1], (count, 3))
+    data = decay(truth)[0] + noise * rng.standard_normal((count, len(TIMES)))
+    weights = rng.uniform(0.5, 2.0, data.shape) / max(noise, 1e-3) ** 2
+    weights[rng.uniform(size=weights.shape) < 0.1] = 0.0
+
+    def model(p, index):
+        value, jacobian = decay(p)
+        return value - data[index], jacobian
+
+    return model, np.tile([1.5, 1.0, 0.0], (count, 1)), weights, data
+
+
+@pytest.fixture(scope="module")
+def solved():
+    model, start, weights, data = decays(40, 0.05)
+    return levenberg_marquardt(model, start, weights), weights, data
+
+
+def test_each_problem_of_a_batch_has_the_solution_of_scipy(solved):
+    fit, weights, data = solved
+    assert fit.converged.all()
+    for r, w, ours, mine in zip(data, weights, fit.parameters, fit.residuals, strict=True):
+        root = np.sqrt(w)
+        theirs = optimize.least_squares(
+            lambda p, root=root, r=r: root * (decay(p[None])[0][0] - r),
+            [1.5, 1.0, 0.0],
+            jac=lambda p, root=root: root[:, None] * decay(p[None])[1][0],
+            method="lm",
+        )
+        assert (w * mine**2).sum() == pytest.approx(2 * theirs.cost, rel=1e-12)
+        # MINPACK stops where the cost is flat to rounding; the root of its gradient is sharper.
+        gradient = lambda p, w=w, r=r: decay(p[None])[1][0].T @ (w * (decay(p[None])[0][0] - r))  # noqa: E731
+        exact = optimize.root(gradient, theirs.x, tol=1e-14).x
+        np.testing.assert_allclose(ours, exact, rtol=0, atol=1e-9)  # the tolerance that ours stops at
+
+
+def test_the_covariance_is_that_of_scipys_curve_fit(solved):
+    fit, weights, data = solved
+    ours = covariance(fit.jacobian, weights)
+    for i in range(len(data)):
+        used = weights[i] > 0
+        _, theirs = optimize.curve_fit(
+            lambda t, a, b, c: a * np.exp(-b * t) + c,
+            TIMES[used],
+            data[i, used],
+            p0=fit.parameters[i],
+            sigma=1 / np.sqrt(weights[i, used]),
+            absolute_sigma=True,
+            jac=lambda t, a, b, c: decay(np.array([[a, b, c]]))[1][0][used],  # noqa: B023
+        )
+        np.testing.assert_allclose(ours[i], theirs, rtol=1e-6)
+        jacobian = fit.jacobian[i]
+        np.testing.assert_allclose(ours[i], np.linalg.inv(jacobian.T @ (weights[i][:, None] * jacobian)), rtol=1e-10)
+
+
+def test_exact_data_give_back_the_truth():
+    model, start, weights, _ = decays(40, 0.0)
+    truth = np.random.default_rng(1).uniform([1, 0.5, -1], [3, 2, 1], (40, 3))
+    np.testing.assert_allclose(levenberg_marquardt(model, start, weights).parameters, truth, rtol=0, atol=1e-12)
+
+
+def test_a_problem_is_solved_in_a_batch_as_alone(solved):
+    fit, weights, data = solved
+    for i in (0, 17, 39):
+        alone = levenberg_marquardt(
+            lambda p, _, i=i: (decay(p)[0] - data[i], decay(p)[1]), np.array([[1.5, 1.0, 0.0]]), weights[i : i + 1]
+        )
+        np.testing.assert_allclose(alone.parameters[0], fit.parameters[i], rtol=0, atol=1e-13)
+        assert alone.iterations[0] == fit.iterations[i]
+
+
+def test_weight_zero_leaves_an_observation_out():
+    model, start, weights, data = decays(5, 0.05)
+    with_outlier = levenberg_marquardt(model, start, weights).parameters
+    data[weights == 0] = 1e3
+    np.testing.assert_array_equal(levenberg_marquardt(model, start, weights).parameters, with_outlier)
+
+
+def test_a_problem_that_cannot_be_evaluated_has_not_converged_and_spoils_no_other(solved):
+    fit, weights, data = solved
+    broken = data.copy()
+    broken[3] = np.nan
+    found = levenberg_marquardt(
+        lambda p, index: (decay(p)[0] - broken[index], decay(p)[1]), np.tile([1.5, 1.0, 0.0], (40, 1)), weights
+    )
+    others = np.arange(40) != 3
+    assert not found.converged[3]
+    assert found.converged[others].all()
+    np.testing.assert_array_equal(found.parameters[others], fit.parameters[others])
+
+
+def test_too_few_iterations_are_not_called_converged():
+    model, start, weights, _ = decays(5, 0.05)
+    fit = levenberg_marquardt(model, start, weights, max_iterations=2)
+    assert not fit.converged.any()
+    assert fit.iterations.tolist() == [2] * 5
+
+
+# Moré, Garbow, Hillstrom, Testing unconstrained optimization software, ACM TOMS 7 (1981) 17, problems 1, 8 and 15:
+# start and minimum sum of squares as printed there.
+BARD_Y = np.array([0.14, 0.18, 0.22, 0.25, 0.29, 0.32, 0.35, 0.39, 0.37, 0.58, 0.73, 0.96, 1.34, 2.10, 4.39])
+KOWALIK_Y = np.array([0.1957, 0.1947, 0.1735, 0.1600, 0.0844, 0.0627, 0.0456, 0.0342, 0.0323, 0.0235, 0.0246])
+KOWALIK_U = np.array([4, 2, 1, 0.5, 0.25, 0.167, 0.125, 0.1, 0.0833, 0.0714, 0.0625])
+
+
+def rosenbrock(x):
+    return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+
+def bard(x):
+    u = np.arange(1, 16)
+    v = 16 - u
+    return BARD_Y - (x[0] + u / (v * x[1] + np.minimum(u, v) * x[2]))
+
+
+def kowalik_osborne(x):
+    u = KOWALIK_U
+    return KOWALIK_Y - x[0] * (u**2 + u * x[1]) / (u**2 + u * x[2] + x[3])
+
+
+def differenced(function):
+    """A batch model whose Jacobian is by complex steps, exact to rounding."""
+
+    def model(p, _):
+        steps = 1e-30j * np.eye(p.shape[1])
+        values = np.array([function(x) for x in p])
+        slopes = np.array([np.stack([function(x + s).imag / 1e-30 for s in steps], axis=-1) for x in p])
+        return values, slopes
+
+    return model
+
+
+@pytest.mark.parametrize(
+    ("function", "start", "minimum", "last_digit"),
+    [
+        (rosenbrock, [-1.2, 1.0], 0.0, 1e-20),
+        (bard, [1.0, 1.0, 1.0], 8.21487e-3, 1e-8),
+        (kowalik_osborne, [0.25, 0.39, 0.415, 0.39], 3.07505e-4, 1e-9),
+    ],
+)
+def test_published_problems_reach_their_published_minimum(function, start, minimum, last_digit):
+    model = differenced(function)
+    fit = levenberg_marquardt(
+        model, np.array([start]), np.ones((1, len(function(np.array(start))))), max_iterations=200
+    )
+    assert fit.converged[0]
+    assert (fit.residuals[0] ** 2).sum() == pytest.approx(minimum, rel=0, abs=last_digit)
+
+
+def test_misra1a_has_the_certified_parameters_and_deviations():
+    # NIST Statistical Reference Datasets, Misra1a: y = b1 (1 - exp(-b2 x)), certified to 11 digits.
+    x = [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0]
+    y = [10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01, 66.40, 75.47, 81.78]
+    scale = np.array([100.0, 1e-4])
+
+    def model(p, _):
+        b1, b2 = (p[:, i, None] * scale[i] for i in range(2))
+        e = np.exp(-b2 * np.array(x))
+        return b1 * (1 - e) - y, np.stack([scale[0] * (1 - e), scale[1] * b1 * x * e], axis=-1)
+
+    fit = levenberg_marquardt(model, np.array([[500.0, 1e-4]]) / scale, np.ones((1, 14)), max_iterations=200)
+    assert fit.converged[0]
+    np.testing.assert_allclose(fit.parameters[0] * scale, [2.3894212918e2, 5.5015643181e-4], rtol=1e-10)
+    squares = (fit.residuals[0] ** 2).sum()
+    assert squares == pytest.approx(1.2455138894e-1, rel=1e-10)
+    deviations = np.sqrt(np.diag(covariance(fit.jacobian, fit.weights)[0]) * squares / 12) * scale
+    np.testing.assert_allclose(deviations, [2.7070075241, 7.2668688436e-6], rtol=1e-9)
+
+
+# --- observability and leverage --------------------------------------------------------------------------------
+
+NAMES = ["bias_x", "bias_y", "scale_x", "scale_y", "k2_x"]
+KNOWN = np.full(60, 1e16)  # noise so small that only the geometry counts
+
+
+def design(seed=3):
+    return np.random.default_rng(seed).standard_normal((60, 5))
+
+
+def test_independent_columns_are_all_determined_with_the_condition_of_numpy():
+    jacobian = design() * [1, 1e3, 1e-3, 1, 1]
+    weights = KNOWN * np.random.default_rng(4).uniform(0.5, 2, 60)
+    seen = observability(jacobian, weights)
+    weighted = jacobian * np.sqrt(weights)[:, None]
+    assert (seen.rank, seen.blind.shape) == (5, (0, 5))
+    assert seen.condition == pytest.approx(np.linalg.cond(weighted / np.linalg.norm(weighted, axis=0)), rel=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 1e4])
+@pytest.mark.parametrize(
+    ("make", "rank", "confused"),
+    [
+        (lambda j: {2: 3 * j[:, 0]}, 4, {"bias_x", "scale_x"}),
+        (lambda j: {4: j[:, 1] + j[:, 3]}, 4, {"bias_y", "scale_y", "k2_x"}),
+        (lambda j: {1: 0 * j[:, 0]}, 4, {"bias_y"}),
+        (lambda j: {1: 0 * j[:, 0], 4: 0 * j[:, 0]}, 3, {"bias_y", "k2_x"}),
+        (lambda j: {0: -j[:, 3], 2: j[:, 1]}, 3, {"bias_x", "scale_y", "bias_y", "scale_x"}),
+    ],
+)
+def test_what_cannot_be_told_apart_is_named(make, rank, confused, scale):
+    jacobian = design()
+    for column, values in make(jacobian).items():
+        jacobian[:, column] = scale * values
+    seen = observability(jacobian, KNOWN)
+    assert seen.rank == rank
+    assert seen.blind.shape == (5 - rank, 5)
+    assert set(seen.confused(NAMES)) == confused
+
+
+def test_fewer_observations_than_parameters_determine_no_more_than_there_are():
+    seen = observability(design()[:3], KNOWN[:3])
+    assert seen.rank == 3
+    weights = KNOWN.copy()
+    weights[3:] = 0
+    assert observability(design(), weights).rank == 3
+
+
+def test_the_weakest_combination_is_named_where_all_are_determined():
+    jacobian = design()
+    jacobian[:, 2] = jacobian[:, 0] + 0.01 * jacobian[:, 2]
+    seen = observability(jacobian, KNOWN)
+    assert seen.rank == 5
+    assert set(seen.confused(NAMES)) == {"bias_x", "scale_x"}
+
+
+@pytest.mark.parametrize(("sigma", "rank"), [(0.99 * 16, 1), (1.01 * 16, 0)])
+def test_a_parameter_whose_curvature_drowns_in_noise_is_not_determined(sigma, rank):
+    # Four observations of one parameter: its uncertainty is sigma / 2, and (sigma / 2)^2 / 2 = 2 sigma at sigma = 16.
+    assert observability(np.ones((4, 1)), np.full(4, sigma**-2.0)).rank == rank
+
+
+def test_leverage_is_the_diagonal_of_the_hat_matrix():
+    jacobian = np.stack([design(1), design(2) * [1, 1e-6, 1e6, 1, 1]])
+    weights = np.random.default_rng(5).uniform(0, 3, (2, 60))
+    found = leverage(jacobian, weights)
+    for j, w, h in zip(jacobian, weights, found, strict=True):
+        x = np.sqrt(w)[:, None] * j / np.linalg.norm(j, axis=0)
+        np.testing.assert_allclose(h, np.diag(x @ np.linalg.pinv(x)), atol=1e-13)
+    np.testing.assert_allclose(found.sum(axis=1), 5, rtol=1e-13)
+
+
+# --- robust loss and excess ------------------------------------------------------------------------------------
+
+
+def test_huber_weights_fall_beyond_1_345():
+    z = np.array([0.0, 0.5, -1.345, 1.345 * 2, -13.45, 1e6])
+    np.testing.assert_allclose(huber_weights(z), [1, 1, 1, 0.5, 0.1, 1.345e-6], rtol=1e-15)
+
+
+def test_huber_inflation_is_hubers_formula():
+    # As statsmodels' robust linear model forms it (cov "H1"): Huber 1981, 7.6.12, with var(psi') in K.
+    z = np.random.default_rng(6).standard_t(3, (4, 30))
+    for size in (3, 12):
+        expected = []
+        for row in z:
+            psi = [max(-1.345, min(1.345, value)) for value in row]
+            slope = [1.0 if abs(value) <= 1.345 else 0.0 for value in row]
+            m = np.mean(slope)
+            k = 1 + size / 30 * np.var(slope) / m**2
+            expected.append(k**2 * sum(value**2 for value in psi) / (30 - size) / m**2)
+        np.testing.assert_allclose(huber_inflation(z, size), expected, rtol=1e-13)
+
+
+def test_huber_inflation_of_normal_errors_is_the_price_of_95_percent_efficiency():
+    count, c = 1_000_000, 1.345
+    z = np.random.default_rng(7).standard_normal((1, count))
+    inside = stats.norm.cdf(c) - stats.norm.cdf(-c)
+    square = inside - 2 * c * stats.norm.pdf(c) + c**2 * (1 - inside)  # E psi^2
+    fourth = 3 * inside - 2 * (c**3 + 3 * c) * stats.norm.pdf(c) + c**4 * (1 - inside)  # E psi^4
+    spread = np.hypot(np.sqrt(fourth - square**2) / square, 2 * np.sqrt(inside * (1 - inside)) / inside)
+    found = huber_inflation(z, 1)[0]
+    assert found == pytest.approx(square / inside**2, rel=4 * spread / np.sqrt(count))
+    assert 1 / (square / inside**2) == pytest.approx(0.95, abs=5e-4)
+
+
+def test_huber_inflation_states_the_scatter_of_contaminated_fits():
+    # Straight lines through 60 points, a tenth of them with five times the noise; 4000 trials tell 2.2 % of a variance.
+    rng = np.random.default_rng(8)
+    trials, n = 4000, 60
+    x = np.column_stack([np.ones(n), np.linspace(-1, 1, n)])
+    y = rng.standard_normal((trials, n)) * np.where(rng.uniform(size=(trials, n)) < 0.1, 5.0, 1.0)
+    z = y
+    for _ in range(30):
+        w = huber_weights(z)
+        normal = np.einsum("np,bn,nq->bpq", x, w, x)
+        beta = np.linalg.solve(normal, np.einsum("np,bn,bn->bp", x, w, y)[:, :, None])[:, :, 0]
+        z = y - beta @ x.T
+    stated = huber_inflation(z, 2).mean() * np.diag(np.linalg.inv(x.T @ x))
+    np.testing.assert_allclose(beta.var(axis=0), stated, rtol=4 * np.sqrt(2 / trials))
+    assert np.all(np.linalg.inv(x.T @ x).diagonal() < 0.8 * beta.var(axis=0))  # without it the variance is too small
+
+
+def test_the_excess_makes_chi_square_what_it_should_be():
+    rng = np.random.default_rng(9)
+    variance = rng.uniform(0.5, 2, (50, 30)) * np.repeat(10.0 ** rng.uniform(-14, 4, 50), 30).reshape(50, 30)
+    residuals = rng.standard_normal((50, 30)) * np.sqrt(variance + 1.0)
+    found = excess_variance(residuals, variance, 25)
+    for r, v, tau in zip(residuals, variance, found, strict=True):
+        if (r**2 / v).sum() <= 25:
+            assert tau == 0
+        else:
+            root = optimize.brentq(lambda t, r=r, v=v: (r**2 / (v + t)).sum() - 25, 0, 100, xtol=1e-300, rtol=1e-14)
+            assert tau == pytest.approx(root, rel=1e-11)
+    assert 5 < np.count_nonzero(found == 0) < 25
+
+
+def test_robust_scale_is_the_median_deviation_about_zero():
+    z = np.random.default_rng(10).standard_normal((3, 41)) + 0.3
+    theirs = stats.median_abs_deviation(z, axis=1, center=lambda a, axis: np.zeros(3), scale="normal")
+    # 1.4826 is 1 / 0.67449 = 1.482602 rounded.
+    np.testing.assert_allclose(robust_scale(z, 9), theirs * np.sqrt(41 / 32), rtol=2e-6)
+
+
+# --- tests and quantiles ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cost", "size", "larger", "larger_size", "count"),
+    [(10, 9, 4, 12, 30), (10, 9, 9.9, 12, 30), (1e-9, 3, 1e-12, 4, 9)],
+)
+def test_the_f_test_is_that_of_scipy(cost, size, larger, larger_size, count):
+    ratio = (cost - larger) / (larger_size - size) / (larger / (count - larger_size))
+    expected = stats.f.sf(ratio, larger_size - size, count - larger_size)
+    assert f_test(cost, size, larger, larger_size, count) == pytest.approx(expected, rel=1e-10)
+
+
+def test_the_f_test_at_its_ends():
+    assert f_test(10.0, 9, 5.0, 12, 12) == 1.0  # nothing left to judge the noise by
+    assert f_test(10.0, 9, 0.0, 12, 20) == 0.0
+    assert f_test(0.0, 9, 0.0, 12, 20) == 1.0
+    assert f_test(10.0, 9, 10.0 + 1e-12, 12, 20) == 1.0
+
+
+def test_the_bayesian_information_is_that_of_normal_residuals():
+    r = np.random.default_rng(11).standard_normal(40)
+    cost = float((r**2).sum())
+    likelihood = stats.norm.logpdf(r, scale=np.sqrt(cost / 40)).sum()
+    expected = -2 * likelihood + 7 * np.log(40) - 40 * (1 + np.log(2 * np.pi))  # constants that no order changes
+    assert bayesian_information(cost, 7, 40) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 29, 1000])
+@pytest.mark.parametrize("probability", [0.05, 1e-3])
+def test_the_chi_square_limit_is_that_of_scipy(freedom, probability):
+    assert chi_square_limit(freedom, probability) == pytest.approx(stats.chi2.isf(probability, freedom), rel=1e-10)
+    assert chi_square_limit(0) == np.inf
+
+
+def test_coverage_factors_are_students_and_the_normal_ones():
+    # GUM (JCGM 100:2008), table G.2: t_95 for 1, 10 and 50 degrees of freedom; 1.96 and 2.576 for infinitely many.
+    for freedom, printed in ((1, 12.71), (10, 2.23), (50, 2.01), (None, 1.960)):
+        assert round(coverage_factor(freedom), 2) == printed
+    assert round(coverage_factor(None, 0.99), 3) == 2.576
+    for freedom in (1, 2.5, 29, 1000):
+        assert coverage_factor(freedom, 0.9) == pytest.approx(stats.t.ppf(0.95, freedom), rel=1e-10)
