@@ -178,24 +178,6 @@ def at(values, unit="degC", **metadata) -> Recording:
 MADE = {"temperature": {"value": 24.0, "unit": "degC"}}
 
 
-@pytest.mark.parametrize(
-    ("values", "unit", "mean"),
-    [
-        ([-1.0, 3.0], "degC", 1.0),
-        ([274.15, np.nan], "K", 1.0),
-        ([np.nan, np.nan], "degC", None),
-        ([2048, 2050], "count", None),
-    ],
-)
-def test_the_temperature_of_a_recording_is_its_mean_in_degrees_celsius(values, unit, mean):
-    found = at(values, unit).mean_temperature()
-    assert found is None if mean is None else found == pytest.approx(mean, abs=1e-12)
-
-
-def test_a_recording_without_temperature_has_none():
-    assert recording(np.zeros((3, 3)), "g").mean_temperature() is None
-
-
 @pytest.mark.parametrize("mean", [3.9, 44.1, -40.0])
 def test_a_record_made_far_from_the_recordings_temperature_is_warned_of(mean):
     truth, _, _ = simulated(1, "g")

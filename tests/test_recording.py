@@ -1,7 +1,7 @@
 """Recordings: columns with units, what may be in them, and how messages name the place."""
 
 import sys
-from datetime import datetime
+from datetime import datetime, timedelta
 
 import numpy as np
 import polars
@@ -198,6 +198,30 @@ def test_rising_time_is_returned_in_seconds():
     assert check_time(make(time=[-1, 0, 5], units={"time": "s"})).tolist() == [-1, 0, 5]
 
 
+@pytest.mark.parametrize(
+    ("values", "unit", "metadata", "expected"),
+    [
+        ([20.0, np.nan, 22.0], "degC", {}, 21.0),
+        ([293.15, 295.15, 297.15], "K", {"temperature": "5"}, 22.0),
+        ([295.15, np.inf], "K", {}, 22.0),
+        ([1, 2, 3], "count", {"temperature": "23.5 degC"}, 23.5),  # the column cannot tell, the head can
+        ([np.nan], "degC", {"temperature": "23.5"}, 23.5),
+        ([np.nan], "degC", {}, None),
+        ([2048], "count", {}, None),
+        (None, None, {"power_on_temperature": "-10"}, -10.0),
+        (None, None, {"power_on_temperature": "-10", "temperature": "296.65 K"}, 23.5),
+        (None, None, {"temperature": "warm", "power_on_temperature": "4 °C"}, 4.0),
+        (None, None, {"temperature": "nan"}, None),
+        (None, None, {"temperature": "2048 count"}, None),
+        (None, None, {}, None),
+    ],
+)
+def test_the_temperature_is_the_mean_of_the_column_or_else_that_of_the_head(values, unit, metadata, expected):
+    columns = {} if values is None else {"temperature": np.array(values, dtype=float)}
+    found = Recording(columns, {"temperature": unit} if columns else {}, metadata).mean_temperature()
+    assert found is None if expected is None else found == pytest.approx(expected, abs=1e-12)
+
+
 def test_a_polars_frame_becomes_a_recording():
     frame = polars.DataFrame({"time [ms]": [0, 1], "accel_x [m/s²]": [1.5, None], "pressure": [7.0, 8.0]})
     recording = Recording.from_frame(frame, name="frame 3")
@@ -225,7 +249,7 @@ def test_a_frame_that_names_a_column_twice_is_refused():
         Recording.from_frame(frame)
 
 
-@pytest.mark.parametrize("values", [["a", "b"], [datetime(2026, 1, 1), datetime(2026, 1, 2)]])
+@pytest.mark.parametrize("values", [["a", "b"], [datetime(2026, 1, 1)], [timedelta(seconds=1)]])
 def test_a_frame_whose_column_holds_no_numbers_is_refused(values):
     with pytest.raises(DataError, match="column time"):
         Recording.from_frame(polars.DataFrame({"time [s]": values}))

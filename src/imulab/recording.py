@@ -147,18 +147,19 @@ class Recording:
 
     def mean_temperature(self) -> float | None:
         """Return the mean temperature, degC: of the column, or else as the head of the file states it."""
-        if "temperature" in self.columns:
-            if parse_unit(self.units["temperature"]).quantity != "temperature":
-                return None
+        if "temperature" in self.columns and parse_unit(self.units["temperature"]).quantity == "temperature":
             values = self.si("temperature")
             values = values[np.isfinite(values)]
-            return float(values.mean()) if values.size else None
+            if values.size:
+                return float(values.mean())
         for key in ("temperature", "power_on_temperature"):
-            number, _, unit = self.metadata.get(key, "").partition(" ")
+            number, _, symbol = self.metadata.get(key, "").partition(" ")
             try:
-                return to_si(float(number), unit.strip() or "degC")
+                value, unit = float(number), parse_unit(symbol.strip() or "degC")
             except (ValueError, UnitError):
                 continue
+            if unit.quantity == "temperature" and np.isfinite(value):
+                return to_si(value, unit.symbol)
         return None
 
     def with_columns(self, columns: Mapping[str, Array], units: Mapping[str, str]) -> Recording:
@@ -174,7 +175,7 @@ class Recording:
             if key in columns:
                 raise DataError(f"{name}: column {key} appears twice")
             values = frame[title].to_numpy()
-            if not np.issubdtype(values.dtype, np.number):
+            if values.dtype.kind not in "iufb":
                 raise DataError(f"{name}: column {key}: expected numbers, found {values.dtype}")
             columns[key] = np.asarray(values, dtype=np.float64)
             units[key] = unit

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from imulab.attitudes import Attitudes, Trace
 from imulab.clipping import check_clipped_rows, check_clipping
-from imulab.errors import SegmentError
+from imulab.errors import SegmentError, UnitError
 from imulab.recording import Array, Recording, check_finite, check_time
-from imulab.units import to_si
+from imulab.units import conversion_factor
 
 _BLOCK_SECONDS = 0.1
 _SMALLEST_BLOCK = 4
@@ -95,6 +95,8 @@ def find_attitudes(
     """
     unit = recording.triad_unit(sensor)
     names = [f"{sensor}_{axis}" for axis in "xyz"]
+    if not len(recording):
+        raise SegmentError(f"{recording.name}: no samples")
     check_finite(recording, names)
     temperature = recording.mean_temperature()
     if "time" not in recording:
@@ -155,8 +157,11 @@ def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Arr
         return None
     stated = [f"std_{name}" for name in names]
     check_finite(recording, stated)
-    scale = to_si(1.0, unit)
-    std = np.column_stack([recording.si(name) for name in stated]) / scale
+    try:
+        factors = [conversion_factor(recording.units[name], unit) for name in stated]
+    except UnitError as error:
+        raise UnitError(f"{recording.name}: columns {' '.join(stated)}: {error}") from None
+    std = np.column_stack([recording.column(name) for name in stated]) * factors
     if not (std > 0).all():
         row, axis = np.argwhere(std <= 0)[0]
         raise SegmentError(
