@@ -1,6 +1,7 @@
 """Records applied to recordings: the transcribed forward model undone, units, missing readings, blocks, warnings."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,6 +46,14 @@ def test_applying_a_record_undoes_the_forward_model(order, unit):
     np.testing.assert_allclose(corrected.triad("accel"), forces, rtol=0, atol=1e-12 * 2 * G)
 
 
+def test_strong_forces_far_from_the_linear_range_are_found_as_well():
+    truth, forces, _ = simulated(2, "g")
+    truth |= {f"k2_{axis}": -1e-2 / G for axis in "xyz"}  # 10 mg/g^2: 16 % at 16 g
+    outputs = np.array([reference.forward(8 * force, truth, 2) for force in forces])
+    corrected = apply(record(truth, 2, "g"), recording(outputs, "g"))
+    np.testing.assert_allclose(corrected.triad("accel"), 8 * forces, rtol=0, atol=1e-12 * 16 * G)
+
+
 @pytest.mark.parametrize("made_in", ["m/s^2", "g", "mg"])
 @pytest.mark.parametrize("logged_in", ["m/s^2", "g", "mg", "ug"])
 def test_a_recording_in_another_unit_of_acceleration_is_converted(made_in, logged_in):
@@ -85,6 +94,19 @@ def test_a_record_with_nothing_to_apply_here_is_refused(procedure):
     other = Calibration(procedure, {}, Covariance((), ()), {}, {})
     with pytest.raises(RecordError, match=f"a {procedure} record cannot be applied"):
         apply(other, recording(np.zeros((2, 3)), "g"))
+
+
+@pytest.mark.parametrize("lacking", ["order", "output_unit", "scale_factor_y", "misalignment_zx", "k2_z"])
+def test_a_record_that_lacks_what_is_applied_is_refused_naming_it(lacking):
+    truth, _, outputs = simulated(2, "g")
+    whole = record(truth, 2, "g")
+    lame = replace(
+        whole,
+        parameters={name: value for name, value in whole.parameters.items() if name != lacking},
+        model={name: value for name, value in whole.model.items() if name != lacking},
+    )
+    with pytest.raises(RecordError, match=lacking):
+        apply(lame, recording(outputs, "g"))
 
 
 # The misalignment is lower triangular: x reaches y and z, y reaches z, z reaches nothing else.

@@ -409,6 +409,7 @@ def test_a_layout_that_cannot_be_read_is_refused(tmp_path, file):
         ((1, 1), "1 2 3\n", "foreign takes both time and accel_x from column 1"),
         (("t", "ax"), "t ay\n1 2\n", "foreign takes accel_x from a column named 'ax', found t ay"),
         (("t", 5), "t ay\n1 2\n", "foreign takes accel_x from column 5, found 2 columns"),
+        (("t", "ax"), "t ax ax\n1 2 3\n", "foreign takes accel_x from a column named 'ax', found"),
         ((0, 1), "1 2 3\n1 2\n", "row 2 (line 2): expected 3 fields, found 2"),
         ((0, 1), "1 2 3\n\n4 5 6\n", "row 2 (line 2): expected 3 fields, found an empty line"),
         ((0, 2), "1 ? 3\n1 ? n/a\n", "row 2 (line 2), column accel_x: expected a number, found 'n/a'"),

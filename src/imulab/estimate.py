@@ -256,9 +256,12 @@ def excess_variance(residuals: Array, variance: Array, freedom: int) -> Array:
 
 
 def robust_scale(standardised: Array, size: int) -> Array:
-    """Return the scale of standardised residuals from their median absolute value, shape (b,)."""
-    count = standardised.shape[1]
-    scale: Array = 1.4826 * np.median(np.abs(standardised), axis=1) * np.sqrt(count / max(count - size, 1))
+    """Return the scale of standardised residuals from their median absolute value, shape (b,).
+
+    As many residuals as there are parameters are near zero by construction: the median is that of the others.
+    """
+    largest = np.sort(np.abs(standardised), axis=1)[:, min(size, standardised.shape[1] - 1) :]
+    scale: Array = 1.4826 * np.median(largest, axis=1)
     return scale
 
 
@@ -280,7 +283,7 @@ def bayesian_information(cost: float, size: int, count: int) -> float:
     return float(count * np.log(max(cost, np.finfo(float).tiny) / count) + size * np.log(count))
 
 
-def chi_square_limit(freedom: int, probability: float = 1e-3) -> float:
+def chi_square_limit(freedom: int, probability: float = 1e-2) -> float:
     """Return the value that chi-square exceeds with the given probability; infinite without degrees of freedom."""
     from scipy.special import chdtri
 

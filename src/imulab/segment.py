@@ -24,6 +24,10 @@ from imulab.units import conversion_factor
 
 _BLOCK_SECONDS = 0.1
 _SMALLEST_BLOCK = 4
+_GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
+"""A step in time that is longer than both is a gap; no window reaches across it."""
+_BATCHES = 4
+"""Batches per attitude: few, so that they are long against the correlation of the noise, which is pooled."""
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
 _SAME_ATTITUDE = 2e-3
 """Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
@@ -121,7 +125,8 @@ def find_attitudes(
         )
     variance = _window_variance(blocks, width)
     finite = variance[np.isfinite(variance) & (variance > 0)]
-    quiet = float(np.quantile(finite, 0.05)) if finite.size else 1.0
+    resolution = np.array([_resolution(recording.column(name)) for name in names])
+    quiet = max(float(np.quantile(finite, 0.05)) if finite.size else 0.0, float((resolution**2).sum()) / 12)
     trim = int(np.ceil(settling / blocks.duration))
     fewest = max(2, int(np.ceil(shortest / blocks.duration)))
     candidates = [_merge(_stretches(variance <= factor * quiet, width, trim, fewest), blocks) for factor in _THRESHOLDS]
@@ -132,7 +137,7 @@ def find_attitudes(
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
     stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
     check_clipping(recording, names, stretches)
-    mean, covariance, samples = _statistics(pieces, blocks, recording, names)
+    mean, covariance, samples = _statistics(pieces, blocks, resolution)
     first = np.unique(pieces.attitude, return_index=True)[1]
     last = np.append(first[1:], len(pieces.start)) - 1
     return Attitudes(
@@ -174,7 +179,10 @@ def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Arr
 
 
 def _form_blocks(recording: Recording, names: list[str], time: Array, window: float) -> _Blocks:
-    step = float(np.median(np.diff(time[:100_000]))) if len(time) > 1 else 1.0
+    steps = np.diff(time)
+    # The mean, not the median: stamps come in bursts, rates change, samples get lost; long pauses are left out.
+    usual = steps[steps <= np.quantile(steps, 0.99)] if steps.size else np.ones(1)
+    step = float(usual.mean())
     length = max(_SMALLEST_BLOCK, round(min(_BLOCK_SECONDS, window / 3) / step))
     count = len(time) // length
     mean, scatter = np.empty((count, 3)), np.empty((count, 3))
@@ -183,9 +191,8 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
         mean[:, axis] = samples.mean(axis=1)
         deviation = samples - mean[:, axis, None]
         scatter[:, axis] = np.einsum("ij,ij->i", deviation, deviation) / length
-    begins = time[: count * length : length]
-    spans = np.diff(begins, append=2 * begins[-1] - begins[-2] if count > 1 else 0.0)
-    return _Blocks(mean, scatter, length, length * step, spans > 1.5 * length * step)
+    largest = np.append(steps, 0.0)[: count * length].reshape(count, length).max(axis=1, initial=0.0)
+    return _Blocks(mean, scatter, length, length * step, largest > max(_GAP_SECONDS, _GAP_STEPS * step))
 
 
 def _window_variance(blocks: _Blocks, width: int) -> Array:
@@ -271,15 +278,13 @@ def _ellipsoid_error(mean: Array) -> float:
     return float(np.sqrt(np.mean((residual / np.maximum(1 - leverage, 1e-9)) ** 2)) / 2)
 
 
-def _statistics(
-    pieces: _Pieces, blocks: _Blocks, recording: Recording, names: list[str]
-) -> tuple[Array, Array, NDArray[np.int64]]:
+def _statistics(pieces: _Pieces, blocks: _Blocks, resolution: Array) -> tuple[Array, Array, NDArray[np.int64]]:
     """Mean, covariance of the mean by batch means, and number of samples of each attitude."""
     mean = _attitude_means(pieces, blocks)
     count = len(mean)
     size = pieces.stop - pieces.start
     total = np.bincount(pieces.attitude, size, count)
-    per_batch = max(1, min(int(np.median(total)) // 10, int(size.min()) // 2))
+    per_batch = max(1, min(int(np.median(total)) // _BATCHES, int(size.min()) // 2))
     batches = size // per_batch
     owner = np.repeat(pieces.attitude, batches)
     offset = np.arange(len(owner)) - np.repeat(np.cumsum(batches) - batches, batches)
@@ -295,15 +300,17 @@ def _statistics(
     level = np.trace(scatter, axis1=1, axis2=2) / np.maximum(number - 1, 1)
     usual = level <= 3 * np.median(level)
     pooled = scatter[usual].sum(axis=0) / max(float((number - 1)[usual].sum()), 1.0)
-    floor = [0.0 if pooled[k, k] > 0 else _resolution(recording.column(name)) for k, name in enumerate(names)]
-    pooled = pooled + np.diag(np.square(floor) / 12)
     shrunk = (scatter + _POOL_DEGREES * pooled) / (freedom + _POOL_DEGREES)
     covariance: Array = shrunk * (per_batch / total)[:, None, None]
+    # Noise below half a step of the output does not average its rounding away.
+    noise = np.sqrt(np.median(blocks.scatter[start], axis=0))
+    coarse = noise < resolution / 2
+    covariance[:, range(3), range(3)] += np.where(coarse, resolution**2 / 12, 0.0)
     return mean, covariance, (total * blocks.length).astype(np.int64)
 
 
 def _resolution(samples: Array) -> float:
-    """Smallest step between the values of a channel that shows no noise at all."""
+    """Smallest step between the values of a channel."""
     values = np.unique(samples[:: max(1, len(samples) // 100_000)])
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
 

@@ -41,6 +41,7 @@ _UNITS = {
         Unit("s", "time"),
         Unit("ms", "time", 1e-3),
         Unit("us", "time", 1e-6),
+        Unit("min", "time", 60.0),
         Unit("m/s^2", "acceleration"),
         Unit("g", "acceleration", STANDARD_GRAVITY),
         Unit("mg", "acceleration", 1e-3 * STANDARD_GRAVITY),
@@ -61,6 +62,7 @@ _UNITS = {
         Unit("V/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("m", "length"),
         Unit("Hz", "frequency"),
+        Unit("kHz", "frequency", 1e3),
         Unit("1", "number"),
         Unit("ppm", "number", 1e-6),
     )

@@ -27,6 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of the output has gone; nothing more can be said there.
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
         return _INTERRUPTED_PIPE
+    except OSError as error:
+        where = error.filename or "standard output"
+        return _refuse(f"{where}: cannot be written: {error.strerror}")
     except KeyboardInterrupt:
         return 130
     except Exception as error:

@@ -10,7 +10,6 @@ from imulab._version import VERSION
 from imulab.cli import records, tumble
 
 _SETTINGS: dict[str, Any] = {
-    "no_args_is_help": True,
     "add_completion": False,
     "rich_markup_mode": None,
     "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100},

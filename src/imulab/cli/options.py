@@ -69,6 +69,8 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
     for name in outputs:
         if name is None:
             continue
+        if name in ("", "-"):
+            raise OptionError(f"output {name!r}: expected the name of a file to write")
         if Path(name).resolve() in taken:
             raise OptionError(f"{name}: would overwrite {taken[Path(name).resolve()]}; expected another name")
         if not Path(name).resolve().parent.is_dir():

@@ -55,10 +55,16 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
         return
     bias = np.mean([rate[a:b].mean(axis=0) for a, b, _ in pieces], axis=0)
     turn = frame_rotations(rate - bias, time, start[short], stop[short])
+    mirrored = frame_rotations(bias - rate, time, start[short], stop[short])
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     before, after = up[:-1][short], up[1:][short]
     miss = {name: _median_miss(turn, before @ m.T, after @ m.T) for name, m in _signed_permutations().items()}
-    best = min(miss, key=lambda name: miss[name])
+    miss |= {
+        f"{name} and the gyroscopes all reversed": _median_miss(mirrored, before @ m.T, after @ m.T)
+        for name, m in _signed_permutations().items()
+    }
+    # Reversing all three axes of gravity changes nothing: of two equals, the one with fewer reversals is meant.
+    best = min(miss, key=lambda name: (round(miss[name], 9), name.count("-")))
     if miss["x y z"] > _WRONG and miss[best] < _RIGHT:
         raise DataError(
             f"{recording.name}: columns accel_x accel_y accel_z: axes swapped or reversed: between attitudes the "

@@ -12,6 +12,8 @@ from imulab.units import from_si, parse_unit, to_si
 _ENOUGH_TO_TELL = 5
 _DEAD_SPAN = 0.02
 _GYRO_SPAN = 0.05
+_PROPORTIONAL = 0.9999
+_FARTHEST = 5.0
 _WORST_RMS = 0.1
 
 
@@ -37,6 +39,14 @@ def _check_turned(attitudes: Attitudes) -> None:
                 raise DataError(
                     f"{name}: columns {columns[other]} and {column} hold the same samples; "
                     f"expected three different axes"
+                )
+    if len(attitudes) >= _ENOUGH_TO_TELL and (span > 0).all():
+        correlation = np.atleast_2d(np.corrcoef(attitudes.mean.T))
+        for axis, other in ((1, 0), (2, 0), (2, 1)):
+            if abs(correlation[axis, other]) > _PROPORTIONAL:
+                raise DataError(
+                    f"{name}: columns {columns[other]} and {columns[axis]} are proportional (correlation "
+                    f"{correlation[axis, other]:+.5f} over the attitudes); expected three different axes"
                 )
     if attitudes.swing is not None and len(attitudes) >= _ENOUGH_TO_TELL:
         swing = float(attitudes.swing.max())
@@ -65,6 +75,15 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
             f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
             f"{from_si(found, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
             f"{unit.symbol}: is the unit wrong?"
+        )
+    magnitude = to_si(np.linalg.norm(attitudes.mean, axis=1), unit.symbol) / gravity
+    far = (magnitude < 1 / _FARTHEST) | (magnitude > _FARTHEST)
+    if far.any():
+        index = int(np.argmax(far))
+        raise DataError(
+            f"{attitudes.recording.name}: {attitudes.label(index)}, columns accel_x accel_y accel_z: "
+            f"the specific force is {from_si(magnitude[index] * gravity, unit.symbol):.4g} {unit.symbol}, expected "
+            f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}"
         )
 
 

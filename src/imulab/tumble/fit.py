@@ -168,7 +168,7 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 def _solve(problem: Problem, attitudes: Attitudes, method: str) -> tuple[Solution, Observability]:
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "linearised" and n >= size:
-        solution = solve_linearised(problem, attitudes.recording.name)
+        solution = solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
     else:
         solution = solve_norm(problem, limit=chi_square_limit(n - size))
     seen = observability(solution.jacobian[0], absolute_weights(problem, solution))

@@ -89,7 +89,10 @@ def _solve_polynomial(reading: Array, nonlinearity: Array) -> tuple[Array, Array
             s = np.where(moving | np.isnan(step), s - step, s)
             if not moving.any():
                 break
-        return s, _polynomial(s, nonlinearity)[1]
+        slope = _polynomial(s, nonlinearity)[1]
+        # Where the polynomial turns back there is no specific force that gives this output.
+        solved = (slope > 0) & ~moving
+        return np.where(solved, s, np.nan), np.where(solved, slope, np.nan)
 
 
 def _polynomial(s: Array, nonlinearity: Array) -> tuple[Array, Array]:
@@ -127,7 +130,7 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
     a = (reading - theta[:, None, 0:3]) / scale
     inversion = invert(a, misalignment, nonlinearity)
     f, s = inversion.force, inversion.sensed
-    norm = np.sqrt(np.einsum("bni,bni->bn", f, f))
+    norm = np.maximum(np.sqrt(np.einsum("bni,bni->bn", f, f)), np.finfo(float).tiny)
     u = f / norm[:, :, None]
     # v solves T' v = u, so that d|f| = v . (ds - dT f)
     v = np.empty_like(u)

@@ -17,6 +17,8 @@ from imulab.tumble.model import HIGHEST_ORDER, parameter_count
 from imulab.tumble.solve import Problem, Solution, leave_one_out, solve_norm
 
 _SIGNIFICANT = 0.05
+_SIGNIFICANT_BEYOND = 0.01
+"""For orders above 2: four tests at 5 % each would find something too often."""
 _ROUNDING = 1e-30
 """Smallest variance of |f| that is told from rounding, g^2."""
 _NOTHING_KNOWN = 1e12
@@ -25,7 +27,7 @@ _NOTHING_KNOWN = 1e12
 
 @dataclass(frozen=True)
 class OrderRow:
-    """One row of the table of orders; rms and leave-one-out error in the unit of gravity that it was made with."""
+    """One row of the table of orders; rms and leave-one-out error in m/s^2, as Huber's loss feels the residuals."""
 
     order: int
     parameters: int
@@ -52,7 +54,7 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
 
     All orders are compared with the same weights: each attitude's own noise, with the excess that order 1 and 2 leave
     unexplained at most. A higher order is taken only if it predicts better than the one chosen so far and the F-test
-    finds its gain significant at 5 %.
+    finds its gain significant at 5 % (1 % above order 2).
 
     Parameters
     ----------
@@ -79,7 +81,8 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
         row = _row(trial, fit, costs, gravity)
         rows.append(row)
         better = row.leave_one_out is not None and row.leave_one_out < best
-        significant = order == 1 or f_test(costs[chosen], parameter_count(chosen), costs[order], size, n) < _SIGNIFICANT
+        level = _SIGNIFICANT if order <= 2 else _SIGNIFICANT_BEYOND
+        significant = order == 1 or f_test(costs[chosen], parameter_count(chosen), costs[order], size, n) < level
         if row.observable and better and significant:
             chosen, best = order, row.leave_one_out or np.inf
     return OrderChoice(chosen, tuple(rows))
@@ -101,7 +104,7 @@ def _row(problem: Problem, fit: Solution, costs: dict[int, float], gravity: floa
         order=order,
         parameters=size,
         degrees_of_freedom=n - size,
-        rms=gravity * float(np.sqrt(np.mean(fit.deviations[0] ** 2))),
+        rms=gravity * float(np.sqrt(np.mean((fit.down_weights[0] * fit.deviations[0]) ** 2))),
         leave_one_out=predicted,
         f_probability=f_test(costs[below], parameter_count(below), costs[order], size, n) if below else None,
         bic=bayesian_information(costs[order], size, n),

@@ -93,6 +93,8 @@ def simulate_tumble(
         A value is out of range.
     """
     _check(order, sample_rate, hold, move, noise)
+    if seed < 0:
+        raise OptionError(f"seed {seed}: expected a whole number from 0")
     rng = np.random.default_rng(seed)
     directions = _spread(attitudes, rng) if isinstance(attitudes, int) else np.asarray(attitudes, dtype=np.float64)
     if knock is not None and not 1 <= knock <= len(directions):

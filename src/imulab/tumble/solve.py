@@ -32,6 +32,7 @@ _LINEARISED_PASSES = 50
 _REWEIGHTING_PASSES = {False: 4, True: 30}
 _WEIGHTS_AT_REST = 1e-4
 _WORST_DEFLECTION = 0.98
+_REFIT_AT_MOST = 150
 
 
 @dataclass(frozen=True)
@@ -241,18 +242,21 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     """Return the error |f| - 1 of each attitude under the fit to all others, shape (n,), for a batch of one.
 
     Each of the n refits is one problem of a batch, with the weights of the whole fit and one of them set to zero.
+    Beyond some hundred attitudes no single one moves the fit, and the linear formula r / (1 - h) is exact enough.
     """
     n = problem.reading.shape[1]
+    if n > _REFIT_AT_MOST:
+        errors: Array = (solution.residuals / (1 - leverage(solution.jacobian, solution.weights)))[0]
+        return errors
     repeated = replace(problem, reading=np.broadcast_to(problem.reading[0], (n, n, 3)))
     weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
     lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
     fit = _least_squares(repeated, np.repeat(solution.theta, n, axis=0), weights, lengthening)
-    errors: Array = np.diagonal(fit.residuals)
-    return errors
+    return np.diagonal(fit.residuals)
 
 
-def solve_linearised(problem: Problem, name: str) -> Solution:
-    """Run the published first-order iteration for a batch of one; weights and covariances as for `solve_norm`.
+def solve_linearised(problem: Problem, name: str, limit: float = np.inf) -> Solution:
+    """Run the published first-order iteration for a batch of one; weights and excess variance as for `solve_norm`.
 
     ``sum_i sum_j d_ji a_i^(j+1) + m_1 a_x a_y + m_2 a_y a_z + m_3 a_z a_x = (|B|^2 - 1) / 2``, solved by linear least
     squares until every change is below 5 ppm, 2 ug and 3 arcsec.
@@ -262,9 +266,23 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
     DataError
         The iteration does not converge.
     """
+    _, own = _noise(problem, start_parameters(problem.order))
+    theta, passes = _linearised_iteration(problem, own[0], name)
+    solution = _evaluated(problem, theta, passes)
+    chi_square = float((solution.residuals**2 / solution.own_variance).sum())
+    if problem.covariance is None or chi_square <= limit:
+        return solution
+    n, size = problem.reading.shape[1], theta.shape[1]
+    excess = excess_variance(solution.residuals, solution.own_variance, max(n - size, 1))
+    theta, passes = _linearised_iteration(problem, solution.own_variance[0] + excess, name)
+    solution = _evaluated(problem, theta, passes)
+    return replace(solution, variance=solution.own_variance + excess[:, None], excess=np.sqrt(excess))
+
+
+def _linearised_iteration(problem: Problem, variance: Array, name: str) -> tuple[Array, int]:
+    """Repeat the linear step until it rests; return theta, shape (1, p), and the number of passes."""
     order = problem.order
-    _, own = _noise(problem, start_parameters(order))
-    root = 1 / np.sqrt(own[0])
+    root = 1 / np.sqrt(variance)
     reading = problem.reading[0]
     bias, scale, misalignment = np.zeros(3), np.ones(3), np.zeros(3)
     for number in range(1, _LINEARISED_PASSES + 1):
@@ -288,7 +306,7 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
             and np.abs(solution[3 * (order + 1) :]).max() < _MISALIGNMENT_CHANGE
         ):
             theta = np.concatenate([scale * bias, scale, misalignment, change[2:].ravel()])[None]
-            return _evaluated(problem, theta, number)
+            return theta, number
     raise DataError(
         f"{name}: method linearised does not converge on these attitudes (after {number} passes); use --method norm"
     )
