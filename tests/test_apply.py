@@ -18,7 +18,9 @@ AXES = ["accel_x", "accel_y", "accel_z"]
 
 
 def record(truth, order: int, unit: str, **model) -> Calibration:
-    parameters = {name: Parameter(value, None, "1") for name, value in truth.items()}
+    units = {"b": "m/s^2", "s": f"{unit}/(m/s^2)", "m": "rad", "2": "1/(m/s^2)"}
+    units |= {str(power): f"1/(m/s^2)^{power - 1}" for power in (3, 4, 5)}
+    parameters = {n: Parameter(value, None, units[n[1] if n[0] == "k" else n[0]]) for n, value in truth.items()}
     return Calibration("tumble", parameters, Covariance((), ()), {"order": order, "output_unit": unit, **model}, {})
 
 

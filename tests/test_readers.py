@@ -181,7 +181,7 @@ def test_numbers_equal_those_of_another_reader(file):
 FIFTY = b"".join(b"%d,1,20\n" % k for k in range(49))
 REFUSED = {
     "letters": (HEAD + FIFTY + b"0.5,x1,20\n", "row 50 (line 51), column accel_x: expected a number, found 'x1'"),
-    "quoted": (HEAD + FIFTY + b'0.5,1,"2"\n', "row 50 (line 51), column temperature: expected a number, found '\"2\"'"),
+    "quoted": (HEAD + FIFTY + b'0.5,1,"2\n', "row 50 (line 51), column temperature: expected a number, found '\"2'"),
     "comments": (b"# a\n# b: c\n\n" + HEAD + FIFTY + b"?,1,2\n", "row 50 (line 54), column time: expected a number"),
     "long": (HEAD + b"1,%s,2\n" % (b"z" * 500), "row 1 (line 2), column accel_x: expected a number, found 'zzz"),
     "ragged short": (HEAD + FIFTY + b"0.5,1\n0.6,1,20\n", "row 50 (line 51): expected 3 fields, found 2"),
@@ -424,3 +424,36 @@ def test_a_file_that_does_not_fit_its_layout_is_refused(file, origins, content, 
         read(path, layout)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
+
+
+def test_quoted_numbers_are_read(file):
+    recording = read(file(b'"time [s]","accel_x [g]"\n"0.5","-1.25"\n1.5,"2"\n'))
+    assert recording.column("time").tolist() == [0.5, 1.5]
+    assert recording.column("accel_x").tolist() == [-1.25, 2.0]
+
+
+def test_columns_outside_the_vocabulary_keep_a_unit_that_is_not_known(file):
+    recording = read(file(b"time [s],mag_x [uT]\n0,1\n1,2\n"))
+    assert recording.units == {"time": "s", "mag_x": "uT"}
+
+
+@pytest.mark.parametrize(
+    ("titles", "message"),
+    [
+        (b"Time [s],accel_x [g]", "column 'Time': expected the name 'time'"),
+        (b"timestamp [s],accel_x [g]", "column 'timestamp': expected the name 'time'"),
+        (b"time [s],Accel X [g]", "column 'Accel X': expected the name 'accel_x'"),
+        (b"time [s];accel_x [g]", "separated by ';', expected ','; describe the file with --layout"),
+        (b"time [s]\taccel_x [g]", "separated by a tab"),
+    ],
+)
+def test_titles_that_nearly_are_ours_are_refused_with_what_is_meant(file, titles, message):
+    with pytest.raises(UnitError) as caught:
+        read(file(titles + b"\n0,1\n1,2\n"))
+    assert message in str(caught.value)
+
+
+def test_a_decimal_comma_is_recognised(file):
+    layout = Layout({"time": LayoutColumn(0, "s"), "accel_x": LayoutColumn(1, "g")}, delimiter=";", name="foreign")
+    with pytest.raises(ReadError, match="found '0,5' \\(a decimal comma\\? expected a point\\)"):
+        read(file(b"0,5;1,25\n"), layout)

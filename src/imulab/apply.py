@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from imulab.calibration import Calibration
 from imulab.errors import RecordError
 from imulab.recording import Recording
-from imulab.tumble.apply import apply_tumble
+from imulab.tumble.apply import apply_tumble, beyond_test
 
 _FAR_IN_TEMPERATURE = 20.0
 
@@ -45,11 +45,21 @@ def apply_blocks(records: Iterable[Calibration], blocks: Iterable[Recording]) ->
 
 def warnings_of(record: Calibration, recording: Recording) -> list[str]:
     """Return what a user should know about applying this record to this recording."""
+    found = []
+    mine, its = record.sensor.get("serial"), recording.metadata.get("serial")
+    if mine and its and mine != its:
+        found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
     made = record.model.get("temperature")
     here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
-        return []
+        return found
     return [
+        *found,
         f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
-        f"{made['value']:.1f} degC at which the record was made"
+        f"{made['value']:.1f} degC at which the record was made",
     ]
+
+
+def beyond_test_of(record: Calibration, recording: Recording) -> tuple[int, float]:
+    """Return how many samples lie far beyond what the record was made at, and the largest, m/s^2."""
+    return beyond_test(record, recording) if record.procedure == "tumble" else (0, 0.0)

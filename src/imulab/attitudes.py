@@ -58,6 +58,8 @@ class Attitudes:
         Static stretches as rows (first sample, last sample + 1, attitude), for a continuous recording.
     swing
         Range of each axis over the whole recording, motion included, shape (3,).
+    notes
+        What a user should know of how they were found.
     """
 
     mean: Array
@@ -71,6 +73,7 @@ class Attitudes:
     trace: Trace | None = None
     pieces: NDArray[np.int64] | None = None
     swing: Array | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.mean)

@@ -21,13 +21,17 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     OptionError
         The file cannot be written there.
     """
-    target = Path(path)
+    target = Path(path).resolve()  # through a link to the file that it names
     if target.is_dir():
-        raise OptionError(f"{target}: expected the name of a file to write, found a folder")
+        raise OptionError(f"{path}: expected the name of a file to write, found a folder")
+    if target.exists() and not target.is_file():  # a device or a pipe is written to, not replaced
+        with target.open("wb") as stream:
+            yield stream
+        return
     try:
         descriptor, name = tempfile.mkstemp(prefix=".imulab.", suffix=".part", dir=target.parent)
     except OSError as error:
-        raise OptionError(f"{target}: cannot be written: {error.strerror}") from None
+        raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
     part = Path(name)
     try:
         with os.fdopen(descriptor, "wb") as stream:
@@ -38,7 +42,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         part.replace(target)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise OptionError(f"{target}: cannot be written: {error.strerror}") from None
+        raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
     except BaseException:
         part.unlink(missing_ok=True)
         raise

@@ -200,17 +200,33 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
     """
     name, bracket, rest = title.strip().strip('"').strip().partition("[")
     name = name.strip()
+    _check_name(name, title, file)
     if not bracket:
         if _expected(name) is None:
             return name, "1"
         raise UnitError(f"{file}: column {name} has no unit; expected a title such as '{name} [{_example(name)}]'")
     if not rest.rstrip().endswith("]"):
         raise UnitError(f"{file}: column title {title.strip()!r}: expected 'name [unit]'")
+    symbol = rest.rstrip()[:-1].strip()
     try:
-        unit = parse_unit(rest.rstrip()[:-1]).symbol
+        return name, parse_unit(symbol).symbol
     except UnitError as error:
+        if _expected(name) is None and symbol:
+            return name, symbol  # not ours to convert: it passes through
         raise UnitError(f"{file}: column {name}: {error}") from None
-    return name, unit
+
+
+def _check_name(name: str, title: str, file: str) -> None:
+    """Refuse what is meant as a name of the vocabulary but is not one."""
+    if ";" in title or "\t" in title:
+        mark = "';'" if ";" in title else "a tab"
+        raise UnitError(
+            f"{file}: titles {title.strip()[:40]!r}: separated by {mark}, expected ','; describe the file with --layout"
+        )
+    lower = name.lower()
+    meant = "time" if lower in ("t", "timestamp", "time_s", "seconds") else lower.replace(" ", "_")
+    if meant != name and _expected(meant) is not None:
+        raise UnitError(f"{file}: column {name!r}: expected the name {meant!r}")
 
 
 def _expected(name: str) -> tuple[str, ...] | None:
@@ -236,8 +252,10 @@ def check_unit(name: str, unit: str, file: str) -> None:
         It has none, or one of another quantity.
     """
     expected = _expected(name)
+    if expected is None:
+        return
     quantity = parse_unit(unit).quantity if unit else "nothing"
-    if expected is not None and quantity not in expected:
+    if quantity not in expected:
         raise UnitError(
             f"{file}: column {name}: expected a unit of {' or '.join(expected)}, found {unit!r} ({quantity})"
         )

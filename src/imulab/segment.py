@@ -26,6 +26,10 @@ _BLOCK_SECONDS = 0.1
 _SMALLEST_BLOCK = 4
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
+_SLOW = 5.0
+_MUCH_LOST = 0.05
+_LONG_TABLE = 1000
+_NO_TIME = "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with motion?"
 _BATCHES = 4
 """Batches per attitude: few, so that they are long against the correlation of the noise, which is pooled."""
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
@@ -114,6 +118,7 @@ def find_attitudes(
             unit=unit,
             recording=recording,
             temperature=temperature,
+            notes=(_NO_TIME.format(len(recording)),) if len(recording) > _LONG_TABLE else (),
         )
     time = check_time(recording)
     blocks = _form_blocks(recording, names, time, window)
@@ -152,7 +157,20 @@ def find_attitudes(
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
+        notes=_notes(blocks, variance),
     )
+
+
+def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
+    """What is odd about the clock of the recording."""
+    rate = blocks.length / blocks.duration
+    lost = 1 - float(np.isfinite(variance).mean())
+    notes = []
+    if rate < _SLOW:
+        notes.append(f"about {rate:.3g} samples per second: is the unit of time right?")
+    if lost > _MUCH_LOST:
+        notes.append(f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used")
+    return tuple(notes)
 
 
 def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:

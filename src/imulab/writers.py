@@ -24,7 +24,9 @@ def write_csv(blocks: Recording | Iterable[Recording], path: str | Path) -> None
         The name does not end in .csv, or the file cannot be written there.
     """
     if Path(path).suffix.lower() != ".csv":
-        raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv")
+        raise OptionError(
+            f"{path}: cannot write this kind of file; expected a name that ends in .csv (Parquet is not supported yet)"
+        )
     with replacing(path) as stream:
         write_csv_to(blocks, stream)
 

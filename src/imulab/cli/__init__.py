@@ -16,6 +16,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from imulab.cli.app import command
     from imulab.errors import ImulabError
 
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a terminal without µ gets a question mark, not a fault
+            stream.reconfigure(errors="replace")
     try:
         status = command().main(args=arguments, prog_name="imulab", standalone_mode=False)
         sys.stdout.flush()

@@ -51,14 +51,26 @@ def apply(
 
 
 def _warned(records: list[Calibration], blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Pass blocks on; say once, at the first, what a user should know."""
-    from imulab.apply import warnings_of
+    """Pass blocks on; say at the first what a user should know, and at the end what lay beyond the test."""
+    from imulab.apply import beyond_test_of, warnings_of
+    from imulab.units import from_si
 
+    count, largest, name = 0, 0.0, ""
     for number, block in enumerate(blocks):
         if number == 0:
-            for message in dict.fromkeys(message for record in records for message in warnings_of(record, block)):
+            messages = [message for record in records for message in warnings_of(record, block)]
+            if len({record.to_dict()["content_sha256"] for record in records}) < len(records):
+                messages.append("the same record is applied twice")
+            for message in dict.fromkeys(messages):
                 warn(message)
+        here, most = beyond_test_of(records[0], block)
+        count, largest, name = count + here, max(largest, most), block.name
         yield block
+    if count:
+        warn(
+            f"{name}: {count} samples beyond 2 g (up to {from_si(largest, 'g'):.1f} g): "
+            "the record's nonlinearity was measured within 1 g"
+        )
 
 
 def show(

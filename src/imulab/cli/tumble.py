@@ -122,7 +122,7 @@ def fit(
 
 
 def _order(text: str) -> int | str:
-    return int(text) if text.isdecimal() and len(text) < 3 else text
+    return int(text) if text.isascii() and text.isdecimal() and len(text) < 3 else text
 
 
 def _gravity(gravity: str | None, latitude: str | None, height: str | None) -> Gravity | float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -64,7 +65,8 @@ def read_blocks(file: str | Path, layout: str | Path | Layout | None = None) -> 
 
 
 def _name(file: str | Path) -> str:
-    return "standard input" if str(file) == "-" else str(file)
+    """What messages and records call a file; bytes that are no UTF-8 are written as escapes."""
+    return "standard input" if str(file) == "-" else os.fsencode(file).decode("utf-8", "backslashreplace")
 
 
 def _layout(layout: str | Path | Layout | None) -> Layout | None:

@@ -54,6 +54,10 @@ static int slow_number(const char *p, const char *end, double *value) {
 static int number(const char *p, const char *end, double *value) {
     while (p < end && (*p == ' ' || *p == '\t')) p++;
     while (end > p && (end[-1] == ' ' || end[-1] == '\t' || end[-1] == '\r')) end--;
+    if (end - p >= 2 && *p == '"' && end[-1] == '"') { /* spreadsheets quote numbers */
+        p++;
+        end--;
+    }
     if (p == end) {
         *value = (double)NAN; /* an empty field is a missing reading */
         return OK;
@@ -153,7 +157,7 @@ static PyObject *parse(PyObject *module, PyObject *args) {
     Py_ssize_t rows = 0, found = 0;
     int problem = OK, fits = capacity >= 0 && delimiter > 0 && delimiter < 128;
     for (Py_ssize_t i = 0; fits && i < fields; i++) {
-        fits = slot[i] < 0 || (slot[i] + 1) * capacity * (Py_ssize_t)sizeof(double) <= out.len;
+        fits = slot[i] < 0 || slot[i] < out.len / (Py_ssize_t)sizeof(double) / (capacity > 0 ? capacity : 1);
     }
     const char *p = block.buf, *end = p + block.len;
     while (fits && p < end) {

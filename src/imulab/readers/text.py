@@ -108,6 +108,8 @@ class TextFile:
         try:
             return line.decode("utf-8").rstrip("\r")
         except UnicodeDecodeError:
+            if line.startswith(b"#"):
+                return line.decode("latin-1").rstrip("\r")
             raise ReadError(f"{self._name}: line {self._lines_before}: expected UTF-8 text") from None
 
     # --- head --------------------------------------------------------------------------------------------------
@@ -161,6 +163,10 @@ class TextFile:
         slots = np.full(len(present), -1, dtype=np.int32)
         for slot, (name, column) in enumerate(layout.columns.items()):
             origin = column.origin
+            if isinstance(origin, str) and present.count(origin) > 1:
+                raise ReadError(
+                    f"{self._name}: {layout.name} takes {name} from a column named {origin!r}, found it twice"
+                )
             index = origin if isinstance(origin, int) else present.index(origin) if origin in present else -1
             if not 0 <= index < len(present):
                 what = f"column {origin}" if isinstance(origin, int) else f"a column named {origin!r}"
@@ -206,7 +212,8 @@ class TextFile:
         found = _fields(line, self._delimiter)[field].strip(" \t\r")
         slot = int(self._slots[field])
         shown = found if len(found) <= 40 else found[:37] + "..."
-        raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}")
+        comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", found) else ""
+        raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}{comma}")
 
 
 def _fields(line: str, delimiter: str) -> list[str]:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.errors import UnitError
+from imulab.errors import RecordError, UnitError
 from imulab.recording import Array, Recording
-from imulab.tumble.model import AXES, MISALIGNMENTS, invert
-from imulab.units import conversion_factor
+from imulab.tumble.model import AXES, MISALIGNMENTS, invert, parameter_names, parameter_units
+from imulab.units import STANDARD_GRAVITY, conversion_factor
+
+_FAR = 2.0
 
 
 def apply_tumble(record: Calibration, recording: Recording) -> Recording:
@@ -21,6 +25,7 @@ def apply_tumble(record: Calibration, recording: Recording) -> Recording:
     DataError
         The recording has no accelerometer triad.
     """
+    _parameters(record)
     unit, needed = recording.triad_unit("accel"), str(record.model["output_unit"])
     try:
         factor = conversion_factor(unit, needed)
@@ -40,11 +45,71 @@ def apply_tumble(record: Calibration, recording: Recording) -> Recording:
 def specific_force(record: Calibration, output: Array) -> Array:
     """Return the specific force, m/s^2, for outputs in the record's unit; both of shape (n, 3).
 
-    ``A = M / S - b``, the polynomial inverted by Newton's method, then ``f = T^-1 s``; NaN stays in what it touches.
+    ``A = M / S - b``, the polynomial inverted by Newton's method, then ``f = T^-1 s``. NaN stays in what it touches; an
+    output that lies beyond a turning point of the polynomial becomes NaN.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter, or has one that cannot be.
     """
-    order = int(record.model["order"])
-    scale = np.array([record.value(f"scale_factor_{axis}") for axis in AXES])
-    bias = np.array([record.value(f"bias_{axis}") for axis in AXES])
-    misalignment = np.array([record.value(f"misalignment_{pair}") for pair in MISALIGNMENTS])
-    nonlinearity = np.array([[record.value(f"k{p}_{axis}") for axis in AXES] for p in range(2, order + 1)])
-    return invert(output / scale - bias, misalignment, nonlinearity.reshape(order - 1, 3)).force
+    p = _parameters(record)
+    reading = output / p.scale - p.bias
+    for axis in range(3):
+        low, high = _monotone_range(p.nonlinearity[:, axis])
+        column = reading[:, axis]
+        reading[:, axis] = np.where((column < low) | (column > high), np.nan, column)
+    return invert(reading, p.misalignment, p.nonlinearity).force
+
+
+def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
+    """Return how many samples lie far beyond the 1 g that the record was made at, and the largest, m/s^2.
+
+    Counted only where the record has nonlinearity, which gravity has shown within 1 g and nowhere else.
+    """
+    p = _parameters(record)
+    if not p.nonlinearity.size:
+        return 0, 0.0
+    factor = conversion_factor(recording.triad_unit("accel"), str(record.model["output_unit"]))
+    reading = np.abs(recording.triad("accel") * factor / p.scale - p.bias)
+    largest = np.where(np.isfinite(reading), reading, 0.0).max(axis=1, initial=0.0)
+    return int(np.count_nonzero(largest > _FAR * STANDARD_GRAVITY)), float(largest.max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    scale: Array
+    bias: Array
+    misalignment: Array
+    nonlinearity: Array  # (order - 1, 3)
+
+
+def _parameters(record: Calibration) -> _Parameters:
+    try:
+        order = record.model["order"]
+        units = parameter_units(order, str(record.model["output_unit"]))
+        for name, unit in zip(parameter_names(order), units, strict=True):
+            if record.parameters[name].unit != unit:
+                raise RecordError(f"the record has {name} in {record.parameters[name].unit!r}, expected {unit!r}")
+        scale = np.array([record.value(f"scale_factor_{axis}") for axis in AXES])
+        bias = np.array([record.value(f"bias_{axis}") for axis in AXES])
+        misalignment = np.array([record.value(f"misalignment_{pair}") for pair in MISALIGNMENTS])
+        nonlinearity = np.array([[record.value(f"k{p}_{axis}") for axis in AXES] for p in range(2, order + 1)])
+    except KeyError as error:
+        raise RecordError(f"the record lacks {error.args[0]}") from None
+    except TypeError:
+        raise RecordError(f"the record has order {record.model['order']!r}, expected a whole number") from None
+    if not (scale != 0).all():
+        raise RecordError("the record has a scale factor of 0")
+    return _Parameters(scale, bias, misalignment, nonlinearity.reshape(order - 1, 3))
+
+
+def _monotone_range(nonlinearity: Array) -> tuple[float, float]:
+    """Readings between the turning points of ``s + k2 s^2 + ...`` next to zero."""
+    powers = np.concatenate([[0.0, 1.0], nonlinearity])
+    slope = np.polynomial.polynomial.polyder(powers)
+    turns = np.polynomial.polynomial.polyroots(slope)
+    real = turns[np.abs(turns.imag) < 1e-12 * np.maximum(np.abs(turns), 1.0)].real
+    low, high = real[real < 0].max(initial=-np.inf), real[real > 0].min(initial=np.inf)
+    ends = [float(np.polynomial.polynomial.polyval(s, powers)) if np.isfinite(s) else s for s in (low, high)]
+    return ends[0], ends[1]

@@ -39,6 +39,12 @@ def parameter_names(order: int) -> list[str]:
     ]
 
 
+def parameter_units(order: int, output: str) -> list[str]:
+    """Return the units of the parameters in a record, in the same order."""
+    nonlinearity = ["1/(m/s^2)" if j == 1 else f"1/(m/s^2)^{j}" for j in range(1, order)]
+    return ["m/s^2"] * 3 + [f"{output}/(m/s^2)"] * 3 + ["rad"] * 3 + [unit for unit in nonlinearity for _ in AXES]
+
+
 @dataclass(frozen=True)
 class Inversion:
     """Specific force of a batch of outputs, and what its derivatives need.

@@ -10,13 +10,19 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.estimate import Observability, leverage
+from imulab.estimate import Observability, leverage, robust_scale
 from imulab.recording import Array
-from imulab.tumble.model import AXES, GAUGE, parameter_names
+from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
 from imulab.tumble.orders import OrderRow
 from imulab.tumble.solve import Problem, Solution, forces
+from imulab.units import parse_unit
 
-_STANDS_OUT = 4.0
+_STANDS_OUT = 5.0
+_MOST_NAMED = 8
+_ENOUGH_DEGREES = 9
+_ON_EARTH = (9.76, 9.84)
+_WORST_SCALE = 0.1
+_WORST_MISALIGNMENT = 0.1
 _DOWN_WEIGHTED = 0.5
 _HIGH_CONDITION = 300.0
 _FEW_DEGREES = 5
@@ -79,7 +85,7 @@ def make_record(
         procedure="tumble",
         parameters={
             name: Parameter(float(values[i]), None if matrix is None else float(np.sqrt(matrix[i, i])), unit)
-            for i, (name, unit) in enumerate(zip(names, _units(order, attitudes.unit), strict=True))
+            for i, (name, unit) in enumerate(zip(names, parameter_units(order, attitudes.unit), strict=True))
         },
         covariance=Covariance((), ())
         if matrix is None
@@ -90,7 +96,7 @@ def make_record(
             "loss": options["loss"],
             "attitudes": n,
             "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
-            "leave_one_out": _leave_one_out(orders, order, g),
+            "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
             "degrees_of_freedom": n - size,
             "reduced_chi_square": chi_square / (n - size) if n > size else None,
             "noise": "known" if known else "estimated from the residuals",
@@ -138,16 +144,18 @@ def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array,
     return values, derivative
 
 
-def _units(order: int, output: str) -> list[str]:
-    nonlinearity = ["1/(m/s^2)" if j == 1 else f"1/(m/s^2)^{j}" for j in range(1, order)]
-    return ["m/s^2"] * 3 + [f"{output}/(m/s^2)"] * 3 + ["rad"] * 3 + [unit for unit in nonlinearity for _ in AXES]
-
-
-def _leave_one_out(orders: tuple[OrderRow, ...], order: int, g: float) -> dict[str, Any] | None:
+def _leave_one_out(
+    orders: tuple[OrderRow, ...], problem: Problem, solution: Solution, method: str, g: float
+) -> dict[str, Any] | None:
+    """Error of each attitude predicted from the others, rms: from the table of orders, or by the linear formula."""
     for row in orders:
-        if row.order == order and row.leave_one_out is not None:
+        if row.order == problem.order and row.leave_one_out is not None and method == "norm":
             return {"value": row.leave_one_out, "unit": "m/s^2"}
-    return None
+    if problem.reading.shape[1] <= solution.theta.shape[1]:
+        return None
+    free = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-12)
+    felt = solution.down_weights[0] * solution.residuals[0] / free
+    return {"value": g * float(np.sqrt(np.mean(felt**2))), "unit": "m/s^2"}
 
 
 def _data(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: Solution, g: float) -> dict[str, Any]:
@@ -188,30 +196,59 @@ def _warnings(
     observability: Observability,
     reduced_chi_square: float,
 ) -> list[str]:
-    n, size = len(attitudes), solution.theta.shape[1]
-    found = list(attitudes.recording.notes)
+    return [
+        *attitudes.recording.notes,
+        *attitudes.notes,
+        *_gravity_warnings(gravity),
+        *_attitude_warnings(attitudes, problem, solution, reduced_chi_square),
+        *_freedom_warnings(problem, solution, observability),
+        *_size_warnings(attitudes, solution),
+    ]
+
+
+def _gravity_warnings(gravity: Gravity) -> list[str]:
     if gravity.origin.startswith("standard"):
-        found.append(
+        return [
             f"no local gravity was given: standard gravity {gravity.value} m/s^2 was used, and every scale factor "
             "inherits its difference from the local value (0.5 % from pole to equator)"
-        )
+        ]
+    low, high = _ON_EARTH
+    if not low <= gravity.value <= high:
+        return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
+    return []
+
+
+def _attitude_warnings(
+    attitudes: Attitudes, problem: Problem, solution: Solution, reduced_chi_square: float
+) -> list[str]:
+    found = []
     if solution.excess[0] > 0:
         found.append(
-            f"the attitudes scatter more than their own noise explains (reduced chi-square {reduced_chi_square:.1f}): "
-            f"{_TO_MICRO * solution.excess[0]:.0f} µg were added to each attitude's uncertainty"
+            f"the attitudes scatter more than their own noise explains (reduced chi-square {reduced_chi_square:.3g}): "
+            f"{_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"
         )
-    standard = _standardised(problem, solution)
-    found += [
-        f"down-weighted to {solution.down_weights[0][index]:.2f}: {attitudes.label(index)}, "
-        f"residual {1e3 * solution.deviations[0][index]:+.3f} mg"
-        for index in np.flatnonzero(solution.down_weights[0] < _DOWN_WEIGHTED).tolist()
-    ]
-    found += [
-        f"{attitudes.label(index)} stands out by {abs(standard[index]):.1f} standard deviations (residual "
-        f"{1e3 * solution.deviations[0][index]:+.3f} mg); --loss huber keeps it from spoiling the rest"
-        for index in np.flatnonzero(np.abs(standard) > _STANDS_OUT).tolist()
-        if not problem.robust
-    ]
+    deviation = 1e3 * solution.deviations[0]
+    if problem.robust:
+        down = solution.down_weights[0]
+        which = np.flatnonzero(down < _DOWN_WEIGHTED).tolist()
+        single = [
+            f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {deviation[i]:+.3f} mg" for i in which
+        ]
+    else:
+        standard = np.abs(_standardised(problem, solution))
+        which = np.flatnonzero(standard > _STANDS_OUT).tolist()
+        single = [
+            f"{attitudes.label(i)} stands out by {standard[i]:.0f} standard deviations "
+            f"(residual {deviation[i]:+.3f} mg); --loss huber keeps it from spoiling the rest"
+            for i in which
+        ]
+    more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []
+    return found + single[:_MOST_NAMED] + more
+
+
+def _freedom_warnings(problem: Problem, solution: Solution, observability: Observability) -> list[str]:
+    n, size = problem.reading.shape[1], solution.theta.shape[1]
+    found = []
     if observability.condition > _HIGH_CONDITION:
         confused = observability.confused(parameter_names(problem.order))
         found.append(
@@ -221,16 +258,40 @@ def _warnings(
         found.append(
             f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
         )
-    elif n - size < _FEW_DEGREES and problem.covariance is None:
-        found.append(f"only {n - size} degrees of freedom: the uncertainties are themselves uncertain")
+    if n - size < _FEW_DEGREES:
+        left = f"{n - size} degree{'' if n - size == 1 else 's'} of freedom"
+        found.append(
+            f"only {left}: {n} attitudes hardly check whether order {problem.order} is enough, and the uncertainties "
+            f"hold only if it is; {size + _ENOUGH_DEGREES} or more would tell"
+        )
+    return found
+
+
+def _size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
+    """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
+    theta, found = solution.theta[0], []
+    if parse_unit(attitudes.unit).quantity == "acceleration":
+        found += [
+            f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
+            for axis, value in zip(AXES, theta[3:6], strict=True)
+            if abs(value - 1) > _WORST_SCALE
+        ]
+    found += [
+        f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
+        for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=True)
+        if abs(value) > _WORST_MISALIGNMENT
+    ]
     return found
 
 
 def _standardised(problem: Problem, solution: Solution) -> Array:
-    """Residuals over their standard deviations, shape (n,), their level from the residuals where noise is unknown."""
+    """Residuals over their standard deviations, shape (n,): own noise, or the bulk of them where that is more."""
     n, size = problem.reading.shape[1], solution.theta.shape[1]
+    if n - size < _FEW_DEGREES:
+        return np.zeros(n)
     share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
-    standard: Array = solution.residuals[0] / np.sqrt(solution.variance[0] * share)
-    if problem.covariance is None and n > size:
-        standard = standard / np.sqrt(float((solution.weights[0] * solution.residuals[0] ** 2).sum()) / (n - size))
-    return standard if n > size else np.zeros(n)
+    standard = solution.residuals / np.sqrt(solution.own_variance * share)
+    bulk = float(robust_scale(standard, size)[0])
+    known = problem.covariance is not None
+    standardised: Array = standard[0] / (max(bulk, 1.0) if known else max(bulk, 1e-12))
+    return standardised
