@@ -231,3 +231,28 @@ def test_an_unknown_temperature_is_not_warned_of():
     assert warnings_of(record(truth, 1, "g"), at([90.0])) == []
     assert warnings_of(record(truth, 1, "g", **MADE), recording(np.zeros((2, 3)), "g")) == []
     assert warnings_of(record(truth, 1, "g", **MADE), at([np.nan])) == []
+
+
+def test_outputs_beyond_a_turning_point_have_no_specific_force():
+    """k3 = -2 mg/g^3: the output turns back at s = 1 / sqrt(3 * 0.002) = 12.9 g, A = 8.6 g."""
+    truth, _, _ = simulated(3, "g")
+    nominal = {n: (1 / G if n[0] == "s" else -2e-3 / G**2 if n[:2] == "k3" else 0.0) for n in truth}
+    readings = np.array([[r, 0.0, 0.0] for r in (1.0, 8.0, 8.6, 8.61, 10.0, 16.0, -8.6, -8.61)])
+    corrected = apply(record(nominal, 3, "g"), recording(readings, "g")).triad("accel")[:, 0] / G
+    assert np.isnan(corrected).tolist() == [False, False, False, True, True, True, False, True]
+    np.testing.assert_allclose(corrected[:3] - 2e-3 * corrected[:3] ** 3, [1.0, 8.0, 8.6], rtol=1e-12)
+
+
+def test_a_record_in_other_units_is_refused():
+    truth, _, outputs = simulated(1, "g")
+    whole = record(truth, 1, "g")
+    altered = replace(whole, parameters={**whole.parameters, "bias_x": Parameter(10.0, None, "mg")})
+    with pytest.raises(RecordError, match=r"has bias_x in 'mg', expected 'm/s\^2'"):
+        apply(altered, recording(outputs, "g"))
+
+
+def test_a_record_of_another_unit_is_warned_of():
+    truth, _, outputs = simulated(1, "g")
+    other = replace(record(truth, 1, "g"), sensor={"serial": "SN41"})
+    (message,) = warnings_of(other, recording(outputs, "g"))
+    assert message == "flight.csv: serial SN42, but the record was made for SN41"

@@ -150,3 +150,53 @@ def test_no_path_of_a_machine_is_in_the_sources():
     home = os.path.expanduser("~") + "/"  # noqa: PTH111
     for path in [*(REPOSITORY / "src").rglob("*.py"), *(REPOSITORY / "docs").rglob("*.md")]:
         assert home not in path.read_text(), path
+
+
+def test_apply_warns_once_beyond_what_the_test_has_seen(imulab, tmp_path):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "20", "--hold", "3", "--order", "2")
+    imulab("tumble", "fit", "t.csv", "--gravity", G, "-o", "t.json", "--order", "2")
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    titles = next(i for i, line in enumerate(lines) if line.startswith("time"))
+    fields = lines[titles + 3].split(",")
+    lines[titles + 3] = ",".join([fields[0], "50.0", *fields[2:]])
+    (tmp_path / "wild.csv").write_text("\n".join(lines) + "\n")
+    done = imulab("apply", "t.json", "wild.csv", "-o", "c.csv")
+    assert done.returncode == 0
+    assert done.stderr.startswith("imulab: warning: wild.csv: 1 samples beyond 2 g (up to 5.")
+    assert done.stderr.count("\n") == 1
+    assert imulab("apply", "t.json", "t.csv", "-o", "c.csv").stderr == ""
+    assert "applied twice" in imulab("apply", "t.json", "t.json", "t.csv", "-o", "c.csv").stderr
+
+
+def test_output_that_cannot_be_written_is_a_refusal(tmp_path):
+    run = [sys.executable, "-m", "imulab"]
+    subprocess.run([*run, "tumble", "simulate", "-o", "t.csv"], cwd=tmp_path, check=True, capture_output=True)
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        done = subprocess.run(
+            [*run, "show", "t.csv"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 2
+    assert done.stderr == "imulab: standard output: cannot be written: No space left on device\n"
+
+
+def test_a_terminal_without_greek_letters_is_no_fault(tmp_path):
+    run = [sys.executable, "-m", "imulab"]
+    subprocess.run([*run, "tumble", "simulate", "-o", "t.csv"], cwd=tmp_path, check=True, capture_output=True)
+    done = subprocess.run(
+        [*run, "tumble", "fit", "t.csv", "--gravity", G],
+        cwd=tmp_path, env={"PYTHONIOENCODING": "ascii", "PATH": ""}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_link_keeps_its_name_and_a_device_stays_a_device(imulab, tmp_path):
+    (tmp_path / "target.json").write_text("old")
+    (tmp_path / "link.json").symlink_to(tmp_path / "target.json")
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    done = imulab("tumble", "fit", "t.csv", "--gravity", G, "--order", "1", "-o", "link.json")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "link.json").is_symlink()
+    assert il.load(tmp_path / "target.json").model["order"] == 1
+    done = imulab("tumble", "fit", "t.csv", "--gravity", G, "--order", "1", "-o", "/dev/null", "--json")
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "/dev/null").is_file()

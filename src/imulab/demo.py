@@ -8,6 +8,7 @@ import numpy as np
 
 import imulab as il
 from imulab.errors import OptionError
+from imulab.present import exhibits_of
 from imulab.recording import Recording
 from imulab.tumble.engineering import engineering_rows
 from imulab.units import from_si
@@ -47,10 +48,11 @@ def _tumble(home: Path) -> str:
     il.write_csv(corrected, corrected_file)
 
     lines = [
-        f"tumble: {len(attitudes)} attitudes in {len(recording)} samples, "
-        f"order {fit.calibration.model['order']} chosen",
-        f"  error of the specific force at rest (median attitude): {_error(recording, attitudes.pieces) / 1e3:.1f} mg "
-        f"before, {_error(corrected, attitudes.pieces) / 1e3:.3f} mg after",
+        f"tumble: {len(recording)} samples, {len(attitudes)} attitudes (the knocked one, before and after, "
+        f"counts twice), order {fit.calibration.model['order']} chosen",
+        f"  {exhibits_of(fit.calibration).headline}",
+        f"  Against the simulated truth the median attitude was {_error(recording, attitudes.pieces) / 1e3:.1f} mg "
+        f"off, and is {_error(corrected, attitudes.pieces) / 1e3:.3f} mg off after correction.",
     ]
     for row in engineering_rows(fit.calibration):
         value, uncertainty = row.text()
@@ -58,6 +60,10 @@ def _tumble(home: Path) -> str:
     lines += [f"  note: {message}" for message in fit.calibration.warnings]
     lines += [
         f"  recording {recording_file}, record {record_file}, corrected data {corrected_file}",
+        "  the same by hand:",
+        f"    imulab tumble fit {recording_file} --gravity {_GRAVITY} --loss huber "
+        f"-o {record_file} --report {report_file}",
+        f"    imulab apply {record_file} {recording_file} -o {corrected_file}",
         f"open {report_file}",
     ]
     return "\n".join(lines)

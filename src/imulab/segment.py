@@ -26,6 +26,7 @@ _BLOCK_SECONDS = 0.1
 _SMALLEST_BLOCK = 4
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
+_CLEAR_DRIFT = 6.0
 _SLOW = 5.0
 _MUCH_LOST = 0.05
 _LONG_TABLE = 1000
@@ -157,7 +158,7 @@ def find_attitudes(
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
-        notes=_notes(blocks, variance),
+        notes=_notes(blocks, variance) + _drift_notes(pieces, blocks, names, unit),
     )
 
 
@@ -170,6 +171,30 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
         notes.append(f"about {rate:.3g} samples per second: is the unit of time right?")
     if lost > _MUCH_LOST:
         notes.append(f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used")
+    return tuple(notes)
+
+
+def _drift_notes(pieces: _Pieces, blocks: _Blocks, names: list[str], unit: str) -> tuple[str, ...]:
+    """Drift of the zero, seen as a common slope within the attitudes at rest; no fit of attitudes alone shows it."""
+    owner = np.repeat(np.arange(len(pieces.start)), pieces.stop - pieces.start)
+    offset = np.arange(len(owner)) - np.repeat(np.cumsum(pieces.stop - pieces.start), pieces.stop - pieces.start)
+    block = offset + np.repeat(pieces.stop, pieces.stop - pieces.start)
+    size = np.bincount(owner)
+    time = block - np.bincount(owner, block)[owner] / size[owner]
+    spread = float((time**2).sum())
+    notes = []
+    total = (int(pieces.stop[-1]) - int(pieces.start[0])) * blocks.duration
+    for axis, name in enumerate(names):
+        values = blocks.mean[block, axis]
+        values = values - np.bincount(owner, values)[owner] / size[owner]
+        slope = float((time * values).sum()) / spread
+        error = float(np.sqrt(np.mean((values - slope * time) ** 2) / spread))
+        rate = slope / blocks.duration
+        if abs(slope) > _CLEAR_DRIFT * error and abs(rate) * total > _CLEAR_DRIFT * error * np.sqrt(spread / len(size)):
+            notes.append(
+                f"{name} drifts at rest by {rate:+.3g} {unit}/s, {rate * total:+.3g} {unit} over the test: "
+                "its zero is not constant, and the uncertainties do not cover that"
+            )
     return tuple(notes)
 
 

@@ -8,7 +8,6 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Table
 from imulab.present import exhibits_of
 from imulab.recording import Recording
-from imulab.tumble.engineering import engineering_rows
 
 _GAP = 1.5
 
@@ -18,20 +17,16 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
     exhibits = exhibits_of(record)
     serial = record.sensor.get("serial", "unit without serial number")
     lines = [f"{record.procedure} calibration of {serial}", exhibits.headline, ""]
-    if record.procedure == "tumble":
-        lines += _aligned(
-            ["parameter", "value", "u", "unit"],
-            [[row.name, *row.text(), row.unit] for row in engineering_rows(record)],
-        )
     for item in exhibits.items:
-        if isinstance(item, Table) and item.title != "Parameters":
+        if isinstance(item, Table):
             mark = [["*" if i == item.highlight else "", *row] for i, row in enumerate(item.rows)]
-            lines += ["", f"{item.title} (* chosen)", *_aligned(["", *item.columns], mark)]
+            chosen = " (* chosen)" if item.highlight is not None else ""
+            lines += [f"{item.title}{chosen}", *_aligned(["", *item.columns], mark), ""]
     if provenance:
-        lines += ["", f"created {record.created} by {record.software}"]
+        lines += [f"created {record.created} by {record.software}"]
         lines += [f"source {source.file} SHA-256 {source.sha256}" for source in record.sources]
         lines += [f"warning: {message}" for message in record.warnings]
-    return "\n".join(lines)
+    return "\n".join(lines).rstrip()
 
 
 def describe_recording(recording: Recording) -> str:

@@ -107,7 +107,7 @@ def _residuals(record: Calibration) -> Figure:
     span = _span([value for value, colour in zip(after, colours, strict=True) if colour == GOOD] or after, bars)
     return Figure(
         title="Residual |f| − g of each attitude",
-        caption="Above: with the nominal sensor. Below: with this calibration"
+        caption="Above: with the nominal sensor (for counts and volts: the span of each axis). Below: calibrated"
         + ("; bars are one standard uncertainty of |f|" if bars else "")
         + (f"; {bad} down-weighted attitude{'s' if bad > 1 else ''} in red" if bad else "")
         + ". A pattern in the lower plot is an error that the model does not know.",
@@ -202,8 +202,9 @@ def _orders(record: Calibration) -> Table:
         )
     return Table(
         title="Choice of the order",
-        caption="A higher order always fits closer (rms). It is taken only if it also predicts attitudes it has not "
-        "seen (leave-one-out), if the F-test finds the gain significant, and if the attitudes can observe it.",
+        caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
+        "attitudes it has not seen (leave-one-out), if the F-test finds the gain significant, and if the attitudes can "
+        "observe it.",
         columns=[
             "order",
             "parameters",

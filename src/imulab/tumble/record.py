@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.estimate import Observability, leverage, robust_scale
+from imulab.estimate import Observability, coverage_factor, leverage
 from imulab.recording import Array
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
 from imulab.tumble.orders import OrderRow
@@ -235,12 +235,10 @@ def _attitude_warnings(
             f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {deviation[i]:+.3f} mg" for i in which
         ]
     else:
-        standard = np.abs(_standardised(problem, solution))
-        which = np.flatnonzero(standard > _STANDS_OUT).tolist()
         single = [
-            f"{attitudes.label(i)} stands out by {standard[i]:.0f} standard deviations "
+            f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
             f"(residual {deviation[i]:+.3f} mg); --loss huber keeps it from spoiling the rest"
-            for i in which
+            for i, standard in _outliers(problem, solution).items()
         ]
     more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []
     return found + single[:_MOST_NAMED] + more
@@ -284,14 +282,20 @@ def _size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
     return found
 
 
-def _standardised(problem: Problem, solution: Solution) -> Array:
-    """Residuals over their standard deviations, shape (n,): own noise, or the bulk of them where that is more."""
+def _outliers(problem: Problem, solution: Solution) -> dict[int, float]:
+    """Return the attitudes that stand out, and by how many standard deviations.
+
+    Each residual is held against the scatter of the others, with itself left out (externally studentised; Belsley, Kuh
+    and Welsch 1980), or against its own noise where that is more; the limit is one false alarm in a thousand tests.
+    """
     n, size = problem.reading.shape[1], solution.theta.shape[1]
-    if n - size < _FEW_DEGREES:
-        return np.zeros(n)
+    freedom = n - size
+    if freedom < _FEW_DEGREES:
+        return {}
     share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
-    standard = solution.residuals / np.sqrt(solution.own_variance * share)
-    bulk = float(robust_scale(standard, size)[0])
-    known = problem.covariance is not None
-    standardised: Array = standard[0] / (max(bulk, 1.0) if known else max(bulk, 1e-12))
-    return standardised
+    standard = np.abs(solution.residuals[0]) / np.sqrt(solution.own_variance[0] * share)
+    others = np.sqrt(np.maximum(((standard**2 * share).sum() - standard**2) / (freedom - 1), 0.0))
+    least = 1.0 if problem.covariance is not None else 1e-12
+    standard = standard / np.maximum(others, least)
+    limit = max(_STANDS_OUT, coverage_factor(freedom - 1, 1 - 1e-3 / n))
+    return {i: float(standard[i]) for i in np.flatnonzero(standard > limit).tolist()}
