@@ -8,6 +8,8 @@ from typing import Any
 
 GOOD, BAD, QUIET, INK = "#1f6f8b", "#c8553d", "#9aa5ad", "#22303a"
 """Colours: what holds, what stands out, what is background, text."""
+ALARM = 0.5
+"""An observation with less than this share of its weight is drawn as standing out."""
 
 
 @dataclass(frozen=True)
