@@ -398,3 +398,11 @@ def test_clipped_rows_of_a_table_are_called_so():
 @pytest.mark.parametrize("rows", [np.repeat(CUBE, 4, axis=0), np.round(500 * FIXTURE), np.repeat(FIXTURE, 3, axis=0)])
 def test_the_equal_values_of_a_fixture_are_not_called_clipped(rows):
     assert len(find_attitudes(recording(rows, unit="count"))) == len(rows)
+
+
+def test_deviations_may_be_named_by_their_axis_alone():
+    long = with_std(recording(DIRECTIONS), ["g"] * 3, [1e-3, 2e-3, 3e-3])
+    columns = {name.replace("std_accel_", "std_"): values for name, values in long.columns.items()}
+    units = {name.replace("std_accel_", "std_"): unit for name, unit in long.units.items()}
+    short = Recording(columns, units, name="short.csv")
+    np.testing.assert_array_equal(find_attitudes(short).covariance, find_attitudes(long).covariance)

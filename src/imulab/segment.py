@@ -200,10 +200,10 @@ def _drift_notes(pieces: _Pieces, blocks: _Blocks, names: list[str], unit: str) 
 
 def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:
     """Covariances from the ``std_*`` columns of a table, in the unit of the means, or None."""
-    present = [f"std_{name}" for name in names if f"std_{name}" in recording]
-    if not present:
+    long, short = [f"std_{name}" for name in names], [f"std_{name[-1]}" for name in names]
+    stated = short if any(name in recording for name in short) else long
+    if not any(name in recording for name in stated):
         return None
-    stated = [f"std_{name}" for name in names]
     check_finite(recording, stated)
     try:
         factors = [conversion_factor(recording.units[name], unit) for name in stated]
