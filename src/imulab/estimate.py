@@ -296,3 +296,10 @@ def coverage_factor(freedom: float | None, probability: float = 0.95) -> float:
 
     tail = 0.5 + probability / 2
     return float(ndtri(tail) if freedom is None else stdtrit(freedom, tail))
+
+
+def chi_square_probability(value: float, freedom: int) -> float:
+    """Return the probability that chi-square with `freedom` degrees exceeds `value`."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(freedom, value))

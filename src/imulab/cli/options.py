@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from imulab.errors import OptionError, UnitError
+from imulab.errors import OptionError, ReadError, UnitError
 from imulab.units import parse_unit, to_si
 
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
@@ -76,6 +76,19 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
         if not Path(name).resolve().parent.is_dir():
             raise OptionError(f"{name}: cannot be written: no such folder")
         taken[Path(name).resolve()] = name
+
+
+def is_json(file: str) -> bool:
+    """Return whether a file is a record rather than a recording, by its first character."""
+    if file == "-":
+        return False
+    try:
+        with Path(file).open("rb") as stream:
+            return stream.read(64).lstrip().startswith(b"{")
+    except FileNotFoundError:
+        raise ReadError(f"{file}: no such file") from None
+    except OSError as error:
+        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
 
 
 def warn(message: str) -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, check_outputs, warn
-from imulab.errors import OptionError, ReadError
+from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, check_outputs, is_json, warn
+from imulab.errors import OptionError
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
@@ -74,16 +73,22 @@ def _warned(records: list[Calibration], blocks: Iterable[Recording]) -> Iterator
 
 
 def show(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="Record or recording.")],
+    files: Annotated[list[str], typer.Argument(metavar="FILE [FILE]", help="Record or recording, or two records.")],
     layout: LayoutFile = None,
     json: AsJson = False,
 ) -> None:
-    """Say what is in a record or a recording."""
+    """Say what is in a record or a recording, or what changed between two records of one unit."""
+    if len(files) > 2:
+        raise OptionError(f"show: expected one file or two records, found {len(files)} files")
+    if len(files) == 2:
+        _show_changes(*files, json=json)
+        return
+    (file,) = files
     from imulab.calibration import load
     from imulab.cli.show import describe_record, describe_recording
     from imulab.readers import read
 
-    if layout is None and _is_json(file):
+    if layout is None and is_json(file):
         record = load(file)
         print(record.to_json().rstrip("\n") if json else describe_record(record))
         return
@@ -92,16 +97,23 @@ def show(
     print(describe_recording(read(file, layout)))
 
 
-def _is_json(file: str) -> bool:
-    if file == "-":
-        return False
-    try:
-        with Path(file).open("rb") as stream:
-            return stream.read(64).lstrip().startswith(b"{")
-    except FileNotFoundError:
-        raise ReadError(f"{file}: no such file") from None
-    except OSError as error:
-        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
+def _show_changes(first: str, second: str, *, json: bool) -> None:
+    from imulab.calibration import load
+    from imulab.cli.show import describe_changes
+    from imulab.tumble.compare import compare_records
+
+    records = [load(first), load(second)]
+    comparison = compare_records(*records)
+    if json:
+        from dataclasses import asdict
+        from json import dumps
+
+        print(dumps(asdict(comparison), indent=1))
+        return
+    serials = [record.sensor.get("serial") for record in records]
+    if all(serials) and serials[0] != serials[1]:
+        warn(f"records of different units: {serials[0]} and {serials[1]}")
+    print(describe_changes(first, second, comparison, str(records[0].model["output_unit"])))
 
 
 def report(

@@ -8,6 +8,8 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Table
 from imulab.present import exhibits_of
 from imulab.recording import Recording
+from imulab.tumble.compare import Comparison
+from imulab.tumble.engineering import change_rows
 
 _GAP = 1.5
 
@@ -21,12 +23,26 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
         if isinstance(item, Table):
             mark = [["*" if i == item.highlight else "", *row] for i, row in enumerate(item.rows)]
             chosen = " (* chosen)" if item.highlight is not None else ""
-            lines += [f"{item.title}{chosen}", *_aligned(["", *item.columns], mark), ""]
+            lines += [f"{item.title}{chosen}", *aligned(["", *item.columns], mark), ""]
     if provenance:
         lines += [f"created {record.created} by {record.software}"]
         lines += [f"source {source.file} SHA-256 {source.sha256}" for source in record.sources]
         lines += [f"warning: {message}" for message in record.warnings]
     return "\n".join(lines).rstrip()
+
+
+def describe_changes(first: str, second: str, comparison: Comparison, output: str) -> str:
+    """Return what changed from one record to the other."""
+    rows = change_rows(comparison, output)
+    changed = [row[0] for row in rows if row[-1]]
+    verdict = (
+        f"{len(changed)} of {len(rows)} parameters changed: {' '.join(changed)}" if changed else "no significant change"
+    )
+    titles = ["parameter", "change", "u", "change / u", "unit", ""]
+    lines = [f"{second} less {first}: {verdict}", "", *aligned(titles, rows)]
+    if comparison.probability is not None:
+        lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
+    return "\n".join(lines)
 
 
 def describe_recording(recording: Recording) -> str:
@@ -47,13 +63,13 @@ def describe_recording(recording: Recording) -> str:
         finite = values[np.isfinite(values)]
         shown = [f"{x:.6g}" for x in (finite.min(), finite.mean(), finite.max())] if finite.size else ["–"] * 3
         rows.append([name, recording.units[name], *shown, str(len(values) - finite.size)])
-    lines += ["", *_aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
+    lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
     lines += [f"note: {note}" for note in recording.notes]
     return "\n".join(lines)
 
 
-def _aligned(titles: list[str], rows: list[list[str]]) -> list[str]:
-    """Return a table as lines; texts to the left, numbers to the right."""
+def aligned(titles: list[str], rows: list[list[str]]) -> list[str]:
+    """Return a table as lines of text; texts to the left, numbers to the right."""
     table = [titles, *rows]
     widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
     numeric = [all(_numeric(row[i]) for row in rows) for i in range(len(titles))]

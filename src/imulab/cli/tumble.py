@@ -28,9 +28,45 @@ if TYPE_CHECKING:
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
+    group.command("plan")(plan)
     group.command("simulate")(simulate)
     group.command("fit")(fit)
+    group.command("check")(check)
     return group
+
+
+def plan(
+    order: Annotated[str, typer.Option(help="Order of the model, 1 to 5.")],
+    attitudes: Annotated[str, typer.Option(help="Number of attitudes to choose.")],
+    output: Annotated[str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Plan to write.")] = None,
+    noise: Annotated[str, typer.Option(help="Noise of |f| in one attitude.")] = "1 ug",
+    criterion: Annotated[str, typer.Option(help="A: least sum of variances; D: smallest confidence region.")] = "A",
+    source: Annotated[
+        str,
+        typer.Option(
+            "--from",
+            metavar="sphere|FILE",
+            help="Where attitudes may lie: sphere, fixture:15 or head:15 (steps in deg), or a file that lists them.",
+        ),
+    ] = "sphere",
+    add: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Attitudes already there: a plan, a record or a recording.")
+    ] = None,
+    report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
+) -> None:
+    """Choose the attitudes to measure, and predict the uncertainty of every parameter."""
+    from imulab.cli.plan import run
+
+    run(
+        order=order,
+        attitudes=attitudes,
+        output=output,
+        noise=noise,
+        criterion=criterion,
+        source=source,
+        add=add,
+        report=report,
+    )
 
 
 def simulate(
@@ -119,6 +155,39 @@ def fit(
             print(f"{what}: {name}")
     for message in record.warnings:
         warn(message)
+
+
+def check(
+    record: Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")],
+    file: RecordingFile,
+    layout: LayoutFile = None,
+    limit: Annotated[str, typer.Option(help="Largest | |f| - g | that passes.")] = "1 mg",
+    gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2; that of the record if not given.")] = None,
+) -> int:
+    """Hold fresh attitudes against a record, without refitting; exit status 0 if all pass, 1 if not."""
+    from imulab.calibration import load
+    from imulab.readers import read
+    from imulab.segment import find_attitudes
+    from imulab.tumble.compare import check_tumble
+    from imulab.tumble.figures import small_g
+
+    attitudes = find_attitudes(read(file, layout))
+    result = check_tumble(
+        load(record),
+        attitudes,
+        limit=quantity(limit, "--limit", "acceleration", "mg"),
+        gravity=None if gravity is None else quantity(gravity, "--gravity", "acceleration", "m/s^2"),
+    )
+    for index, value in enumerate(result.residuals.tolist()):
+        print(
+            f"{attitudes.label(index)}: {small_g(value)}" + ("" if abs(value) <= result.limit else "  beyond the limit")
+        )
+    verdict = "pass" if result.passed else "fail"
+    print(
+        f"{verdict}: {len(attitudes)} attitudes, largest |f| - g {small_g(result.residuals[result.worst])} "
+        f"({attitudes.label(result.worst)}), limit {small_g(result.limit)}"
+    )
+    return 0 if result.passed else 1
 
 
 def _order(text: str) -> int | str:

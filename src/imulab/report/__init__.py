@@ -20,7 +20,7 @@ def render(record: Calibration, exhibits: Exhibits) -> str:
     """Return the report of a record as HTML text."""
     plots = [item for item in exhibits.items if isinstance(item, Figure)]
     return str(
-        _template().render(
+        _template("page.html.j2").render(
             record=record,
             title=_TITLES.get(record.procedure, record.procedure.capitalize()),
             exhibits=exhibits,
@@ -30,6 +30,14 @@ def render(record: Calibration, exhibits: Exhibits) -> str:
             provenance=_provenance(record),
         )
     )
+
+
+def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicted: list[tuple[str, str, str]]) -> str:
+    """Return the printable sheet of a plan as HTML text; each attitude's `picture` is SVG made by imulab itself."""
+    from markupsafe import Markup
+
+    shown = [{**item, "picture": Markup(item["picture"])} for item in attitudes]
+    return str(_template("plan.html.j2").render(title=title, lead=lead, attitudes=shown, predicted=predicted))
 
 
 def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:
@@ -44,11 +52,11 @@ def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:
 
 
 @cache
-def _template() -> Any:
+def _template(name: str) -> Any:
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string((files("imulab.report") / "page.html.j2").read_text(encoding="utf-8"))
+    return environment.from_string((files("imulab.report") / name).read_text(encoding="utf-8"))
 
 
 @cache

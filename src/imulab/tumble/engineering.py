@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from imulab.calibration import Calibration
-from imulab.exhibit import format_uncertain
+from imulab.exhibit import format_uncertain, plain_number
+from imulab.tumble.compare import Comparison
 from imulab.tumble.record import zero_outputs
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
@@ -22,6 +23,32 @@ class EngineeringRow:
     def text(self) -> tuple[str, str]:
         """Return value and uncertainty as text."""
         return format_uncertain(self.value, self.standard_uncertainty)
+
+
+def change_rows(comparison: Comparison, output: str) -> list[list[str]]:
+    """Return the changes between two records as name, difference, uncertainty, deviations, unit and verdict."""
+    physical = parse_unit(output).quantity == "acceleration"
+    rows = []
+    for change in comparison.changes:
+        factor, _, unit = _engineering(change.name.rpartition("_")[0], output, physical)
+        difference, uncertainty = format_uncertain(
+            change.difference * factor, change.standard_uncertainty * abs(factor)
+        )
+        verdict = "changed" if change.significant else ""
+        rows.append([change.name, difference, uncertainty, f"{change.deviations:+.1f}", unit, verdict])
+    return rows
+
+
+def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]]:
+    """Return predicted uncertainties (units of g) as name, text and engineering unit."""
+    rows = []
+    for name, value in uncertainties.items():
+        stem = name.rpartition("_")[0]
+        factor, unit = {"bias": (1e6, "µg"), "scale_factor": (1e6, "ppm"), "misalignment": (1e6, "µrad")}.get(
+            stem, (1e6, f"µg/g{'⁰¹²³⁴⁵'[int(stem[1:])] if stem[1:].isdigit() else ''}")
+        )
+        rows.append((name, plain_number(value * factor, 3), unit))
+    return rows
 
 
 def engineering_rows(record: Calibration) -> list[EngineeringRow]:

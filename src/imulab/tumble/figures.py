@@ -25,8 +25,8 @@ def exhibits(record: Calibration) -> Exhibits:
     facts = [
         ("attitudes", str(fit["attitudes"])),
         ("order", str(model["order"])),
-        (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", _small_g(_rms(used))),
-        ("leave-one-out", _small_g(left_out["value"]) if left_out else "not computed"),
+        (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", small_g(_rms(used))),
+        ("leave-one-out", small_g(left_out["value"]) if left_out else "not computed"),
         ("worst u(scale factor)", f"{worst:.2g} ppm" if worst is not None else "not stated"),
         ("condition number", plain_number(fit["condition_number"], 3)),
     ]
@@ -41,13 +41,13 @@ def exhibits(record: Calibration) -> Exhibits:
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} down-weighted" if bad else ""
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
-        f"{_small_g(_rms(used))} rms (before: {_small_g(_rms(data['residual_before']))}){aside}.",
+        f"{small_g(_rms(used))} rms (before: {small_g(_rms(data['residual_before']))}){aside}.",
         facts=facts,
         items=items,
     )
 
 
-def _small_g(value: float) -> str:
+def small_g(value: float) -> str:
     """Return an acceleration in µg or mg, three significant digits."""
     micro = _micro_g(value)
     return (

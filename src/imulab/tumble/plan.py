@@ -1,0 +1,281 @@
+"""Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
+
+The information of an attitude is the gradient of |f| for a nominal sensor, a function of its upward direction alone.
+Attitudes are exchanged one by one for the best of a list of candidates (Fedorov 1972; Atkinson, Donev and Tobias,
+Optimum Experimental Designs, 2007, ch. 12) from several starts, and on the free sphere then moved to where they are
+best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import ObservabilityError, OptionError
+from imulab.estimate import observability
+from imulab.recording import Array
+from imulab.tumble.advice import sphere_points
+from imulab.tumble.model import HIGHEST_ORDER, norm_and_jacobian, parameter_count, parameter_names
+from imulab.tumble.solve import start_parameters
+
+CRITERIA = ("A", "D")
+_CANDIDATES = 900
+_STARTS = 12
+_SWEEPS = 40
+_CLOSEST = np.radians(3.0)
+"""Two attitudes closer than this are the same attitude: the same axis vertical."""
+_POLISH_RADII = np.radians([8.0, 3.0, 1.0])
+_CAP = 48
+_RIDGE = 1e-9
+"""Information that keeps the matrix regular while attitudes are still missing."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Attitudes to measure, in the order that turns least.
+
+    Attributes
+    ----------
+    directions
+        Upward direction in the body frame, shape (n, 3).
+    order
+        Order of the model that they are for.
+    covariance
+        Predicted covariance of the parameters for a nominal sensor, in units of g, per variance of |f| / g in one
+        attitude; attitudes already there included. Shape (p, p).
+    condition_number
+        Of the scaled Jacobian.
+    already
+        Number of attitudes that were there before.
+    """
+
+    directions: Array
+    order: int
+    covariance: Array
+    condition_number: float
+    already: int
+
+    def uncertainties(self, noise: float) -> dict[str, float]:
+        """Return the standard uncertainty of every parameter in units of g, for a noise of |f| in g."""
+        sigma = noise * np.sqrt(np.diag(self.covariance))
+        return dict(zip(parameter_names(self.order), sigma.tolist(), strict=True))
+
+
+def information_rows(directions: Array, order: int) -> Array:
+    """Return the gradient of |f| with respect to the scaled parameters of a nominal sensor, shape (n, p)."""
+    rows: Array = norm_and_jacobian(start_parameters(order), directions[None], order)[1][0]
+    return rows
+
+
+def plan_tumble(
+    *,
+    order: int,
+    attitudes: int,
+    criterion: str = "A",
+    candidates: Array | None = None,
+    already: Array | None = None,
+    seed: int = 1,
+) -> Plan:
+    """Choose attitudes for a tumble test.
+
+    Criterion A minimises the sum of the parameters' variances (in units of g), D the volume of their confidence region.
+
+    Parameters
+    ----------
+    order
+        Order of the model, 1 to 5.
+    attitudes
+        Number of attitudes to choose.
+    criterion
+        ``"A"`` or ``"D"``.
+    candidates
+        Upward directions that the fixture allows, shape (m, 3); the whole sphere if not given.
+    already
+        Upward directions already measured, shape (k, 3).
+    seed
+        Of the random starts.
+
+    Raises
+    ------
+    OptionError
+        Too few attitudes or candidates, or an unknown criterion.
+    ObservabilityError
+        No choice among the candidates determines the model.
+    """
+    size = parameter_count(order) if 1 <= order <= HIGHEST_ORDER else 0
+    if not size:
+        raise OptionError(f"order {order}: expected 1 to {HIGHEST_ORDER}")
+    if criterion not in CRITERIA:
+        raise OptionError(f"criterion {criterion!r}: expected one of {' '.join(CRITERIA)}")
+    before = np.empty((0, 3)) if already is None else already
+    if attitudes < 1 or attitudes + len(before) < size:
+        known = f" with the {len(before)} already there" if len(before) else ""
+        raise OptionError(
+            f"{attitudes} attitudes{known}: order {order} has {size} parameters; expected at least as many"
+        )
+    free = candidates is None
+    points = _sphere_candidates() if candidates is None else _distinct(candidates)
+    if len(points) < attitudes:
+        raise OptionError(f"{len(points)} different candidate attitudes; expected at least {attitudes}")
+    rng = np.random.default_rng(seed)
+    fixed = information_rows(before, order)
+    rows = information_rows(points, order)
+    best: Array | None = None
+    best_cost = np.inf
+    for _ in range(_STARTS):
+        chosen, cost = _exchange(rows, points, fixed, before, attitudes, criterion, rng)
+        if cost < best_cost:
+            best, best_cost = points[chosen], cost
+    if best is None:
+        raise ObservabilityError(f"no {attitudes} of the {len(points)} candidate attitudes determine order {order}")
+    if free:
+        best = _polish(best, fixed, before, order, criterion, rng)
+    everything = np.vstack([before, best])
+    jacobian = information_rows(everything, order)
+    seen = observability(jacobian, np.full(len(everything), 1e16))
+    if seen.rank < size:
+        confused = " ".join(seen.confused(parameter_names(order)))
+        raise ObservabilityError(f"the candidate attitudes cannot separate {confused} of order {order}")
+    return Plan(_shortest_path(best), order, _inverse(jacobian.T @ jacobian), seen.condition, len(before))
+
+
+def fixture_candidates(step: float) -> Array:
+    """Return the directions of a two-axis fixture that turns in steps of `step`, rad: roll and pitch."""
+    count = _steps(step)
+    angle = np.arange(count) * (2 * np.pi / count)
+    roll, pitch = (grid.ravel() for grid in np.meshgrid(angle, angle))
+    return _distinct(np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]))
+
+
+def head_candidates(step: float) -> Array:
+    """Return the directions of a dividing head, its axis level, with the unit mounted along x, y and z in turn."""
+    count = _steps(step)
+    angle = np.arange(count) * (2 * np.pi / count)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
+    return _distinct(np.vstack([np.roll(circle, shift, axis=1) for shift in range(3)]))
+
+
+def roll_pitch(directions: Array) -> Array:
+    """Return roll and pitch, rad, shape (n, 2), of a body with z up when level: up = R_x(roll)' R_y(pitch)' e_z."""
+    x, y, z = directions.T
+    return np.column_stack([np.arctan2(y, z), np.arctan2(-x, np.hypot(y, z))])
+
+
+def turning(directions: Array) -> float:
+    """Return the sum of the angles from each direction to the next, rad."""
+    return float(np.arccos(np.clip(np.einsum("ni,ni->n", directions[:-1], directions[1:]), -1, 1)).sum())
+
+
+def _steps(step: float) -> int:
+    count = round(2 * np.pi / step) if step > 0 else 0
+    if not 4 <= count <= 720 or abs(count * step - 2 * np.pi) > 1e-6:
+        raise OptionError(f"step {np.degrees(step):g} deg: expected a whole part of 360 deg, 0.5 to 90 deg")
+    return count
+
+
+def _sphere_candidates() -> Array:
+    """An even lattice, with the faces, edges and corners of a cube, which fixtures give exactly."""
+    cube = np.array([v for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)])
+    return np.vstack([cube / np.linalg.norm(cube, axis=1, keepdims=True), sphere_points(_CANDIDATES)])
+
+
+def _distinct(directions: Array) -> Array:
+    """Unit directions without repetitions."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    _, first = np.unique(np.round(unit, 6) + 0.0, axis=0, return_index=True)
+    distinct: Array = unit[np.sort(first)]
+    return distinct
+
+
+def _exchange(
+    rows: Array,
+    points: Array,
+    fixed: Array,
+    before: Array,
+    count: int,
+    criterion: str,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.int64], float]:
+    """Exchange attitudes from a random start until no exchange helps; return the choice and its cost."""
+    chosen = rng.choice(len(rows), count, replace=False)
+    base = fixed.T @ fixed + _RIDGE * np.eye(rows.shape[1])
+    for _ in range(_SWEEPS):
+        moved = False
+        for place in range(count):
+            others = np.delete(chosen, place)
+            inverse = _inverse(base + rows[others].T @ rows[others])
+            gain = _gain(inverse, rows, criterion)
+            # The same attitude twice measures nothing new that a longer hold would not.
+            near = np.vstack([points[others], before])
+            gain[(points @ near.T).max(axis=1, initial=-1.0) > np.cos(_CLOSEST)] = -np.inf
+            best = int(np.argmax(gain))
+            if gain[best] > gain[chosen[place]] * (1 + 1e-9) or gain[chosen[place]] == -np.inf:
+                chosen[place], moved = best, True
+        if not moved:
+            break
+    return chosen, _cost(base + rows[chosen].T @ rows[chosen], criterion)
+
+
+def _gain(inverse: Array, rows: Array, criterion: str) -> Array:
+    """What adding each row improves: the drop of the trace of the inverse (A) or the growth of the determinant (D)."""
+    carried = rows @ inverse
+    variance: Array = 1 + np.einsum("ij,ij->i", carried, rows)
+    if criterion == "D":
+        return variance
+    gain: Array = np.einsum("ij,ij->i", carried, carried) / variance
+    return gain
+
+
+def _inverse(information: Array) -> Array:
+    return np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+def _cost(information: Array, criterion: str) -> float:
+    if criterion == "D":
+        return -float(np.linalg.slogdet(information)[1])
+    return float(np.trace(np.linalg.inv(information)))
+
+
+def _polish(
+    directions: Array, fixed: Array, before: Array, order: int, criterion: str, rng: np.random.Generator
+) -> Array:
+    """Move each attitude within shrinking caps to where it gives most."""
+    best = directions.copy()
+    base = fixed.T @ fixed + _RIDGE * np.eye(fixed.shape[1])
+    for radius in _POLISH_RADII:
+        for _ in range(4):
+            for place in range(len(best)):
+                others = np.delete(best, place, axis=0)
+                kept = information_rows(others, order)
+                cap = best[place] + radius * rng.uniform(-1, 1, (_CAP, 3))
+                cap = np.vstack([best[place], cap / np.linalg.norm(cap, axis=1, keepdims=True)])
+                gain = _gain(_inverse(base + kept.T @ kept), information_rows(cap, order), criterion)
+                near = np.vstack([others, before])
+                gain[1:][(cap[1:] @ near.T).max(axis=1, initial=-1.0) > np.cos(_CLOSEST)] = -np.inf
+                best[place] = cap[int(np.argmax(gain))]
+    return best
+
+
+def _shortest_path(directions: Array) -> Array:
+    """Order the attitudes so that little is turned between them: nearest neighbour, then 2-opt, level first."""
+    count = len(directions)
+    angle = np.arccos(np.clip(directions @ directions.T, -1, 1))
+    start = int(np.argmax(directions[:, 2]))
+    path, left = [start], set(range(count)) - {start}
+    while left:
+        path.append(min(left, key=lambda k: angle[path[-1], k]))
+        left.remove(path[-1])
+    improved = True
+    while improved:
+        improved = False
+        for i in range(count - 2):
+            for j in range(i + 2, count):
+                a, b, c = path[i], path[i + 1], path[j]
+                after = angle[b, path[j + 1]] - angle[c, path[j + 1]] if j + 1 < count else 0.0
+                if angle[a, c] - angle[a, b] + after < -1e-9:
+                    path[i + 1 : j + 1] = path[i + 1 : j + 1][::-1]
+                    improved = True
+    return directions[path]

@@ -1,0 +1,181 @@
+"""Plans: as good as the published table, allowed by the fixture, and predicting what the bound says."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import imulab as il
+from imulab.errors import ObservabilityError, OptionError
+from imulab.tumble.plan import fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
+from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
+from reference import tumble as reference
+
+G = 9.80665
+
+
+def worst(plan, stem):
+    return max(value for name, value in plan.uncertainties(1.0).items() if name.startswith(stem))
+
+
+@pytest.mark.parametrize(
+    ("count", "order", "table"),
+    [
+        (24, 2, {"k2": 1.2}),
+        (24, 3, {"k2": 1.6, "k3": 2.1}),
+        (24, 4, {"k2": 5.4, "k3": 3.0, "k4": 4.5}),
+        (48, 2, {"k2": 0.8}),
+        (48, 3, {"k2": 1.0, "k3": 1.4}),
+        (48, 4, {"k2": 3.8, "k3": 2.0, "k4": 3.2}),
+    ],
+)
+def test_plans_are_no_worse_than_the_table_of_the_method(count, order, table):
+    """Worst axis per unit noise, chosen by A-optimality; the table has two digits."""
+    plan = plan_tumble(order=order, attitudes=count)
+    for stem, value in table.items():
+        assert worst(plan, stem) < value + 0.055, stem
+
+
+@pytest.mark.parametrize("criterion", ["A", "D"])
+def test_a_plan_is_better_in_its_criterion_than_random_attitudes_and_than_the_other(criterion):
+    plans = {c: plan_tumble(order=4, attitudes=18, criterion=c) for c in "AD"}
+    cost = {
+        "A": lambda plan: np.trace(plan.covariance),
+        "D": lambda plan: np.linalg.slogdet(plan.covariance)[1],
+    }[criterion]
+    other = "D" if criterion == "A" else "A"
+    assert cost(plans[criterion]) < cost(plans[other])
+    # 18 attitudes, order 4, 1 µg: a random set gives 70 ppm of scale factor error, an optimal one 2.8 (the method)
+    assert worst(plans["D"], "scale") < 3.0
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_the_prediction_is_the_cramer_rao_bound_of_a_nominal_sensor(order):
+    plan = plan_tumble(order=order, attitudes=3 * (order + 2) + 4)
+    truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(order)}
+    noise = 1e-5
+    bound = reference.bound(plan.directions, truth, order, G, np.full((len(plan.directions), 3), noise * G))
+    in_g = {"b": 1 / G, "s": 1.0, "m": 1.0, "2": G, "3": G**2, "4": G**3}
+    for (name, value), variance in zip(plan.uncertainties(noise).items(), np.diag(bound), strict=True):
+        assert value == pytest.approx(np.sqrt(variance) * in_g[name[1] if name[0] == "k" else name[0]], rel=1e-6), name
+
+
+def test_no_two_attitudes_have_the_same_axis_vertical():
+    plan = plan_tumble(order=1, attitudes=60)
+    cosine = plan.directions @ plan.directions.T - 2 * np.eye(60)
+    assert np.degrees(np.arccos(cosine.max())) >= 2.999
+
+
+@pytest.mark.parametrize("make", [fixture_candidates, head_candidates])
+def test_a_fixture_gets_only_attitudes_that_it_has(make):
+    candidates = make(np.radians(15))
+    plan = plan_tumble(order=2, attitudes=18, candidates=candidates)
+    nearest = (plan.directions @ candidates.T).max(axis=1)
+    np.testing.assert_allclose(nearest, 1.0, atol=1e-12)
+    assert len(np.unique(np.round(plan.directions, 6), axis=0)) == 18
+
+
+def test_a_head_with_steps_of_90_degrees_is_blind():
+    with pytest.raises(OptionError, match="6 different candidate attitudes; expected at least 9"):
+        plan_tumble(order=1, attitudes=9, candidates=head_candidates(np.radians(90)))
+    with pytest.raises(ObservabilityError, match="misalignment_zx misalignment_zy"):
+        plan_tumble(
+            order=1, attitudes=9, candidates=np.vstack([np.eye(3), -np.eye(3), [[0.6, 0.8, 0]] * 2, np.eye(3) + 1e-3])
+        )
+
+
+def test_attitudes_already_there_are_taken_into_account():
+    faces = np.vstack([np.eye(3), -np.eye(3)])
+    more = plan_tumble(order=1, attitudes=6, already=faces)
+    assert more.already == 6
+    rng = np.random.default_rng(1)
+    truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
+    scale = np.array([1 / G] * 3 + [1.0] * 6)
+    for _ in range(20):
+        sets = np.vstack([faces, reference.random_attitudes(rng, 6)])
+        random = reference.bound(sets, truth, 1, G, np.full((12, 3), G)) * np.outer(scale, scale)
+        assert np.trace(more.covariance) < np.trace(random)
+    # what a cube cannot see lies between its axes: each addition is far from every face
+    assert np.degrees(np.arccos((more.directions @ faces.T).max())) > 30
+
+
+def test_roll_and_pitch_are_those_of_another_library():
+    plan = plan_tumble(order=2, attitudes=20)
+    for up, (roll, pitch) in zip(plan.directions, roll_pitch(plan.directions), strict=True):
+        body_to_level = Rotation.from_euler("ZYX", [0.3, pitch, roll])
+        np.testing.assert_allclose(body_to_level.inv().apply([0, 0, 1]), up, atol=1e-12)
+
+
+def test_the_order_turns_less_than_the_list_as_chosen():
+    plan = plan_tumble(order=4, attitudes=48)
+    shuffled = np.random.default_rng(1).permutation(plan.directions)
+    assert turning(plan.directions) < 0.5 * turning(shuffled)
+
+
+def test_a_plan_reads_back_and_feeds_the_simulator_and_the_fit(tmp_path):
+    plan = plan_tumble(order=2, attitudes=18)
+    il.write_csv(plan_recording(plan), tmp_path / "plan.csv")
+    read = directions_of(il.read(tmp_path / "plan.csv"))
+    np.testing.assert_allclose(read, plan.directions, atol=1e-6)
+    recording = il.simulate_tumble(attitudes=read, order=2, noise=1e-3 * G, seed=3, gyro=False)
+    record = il.fit_tumble(il.find_attitudes(recording), order=2, gravity=G).calibration
+    # the prediction for the noise that the attitudes turned out to have
+    noise = np.median(record.data["attitudes"]["standard_uncertainty"]) / G
+    for name, predicted in plan.uncertainties(noise).items():
+        if name.startswith("k2"):
+            assert record.parameters[name].standard_uncertainty * G == pytest.approx(predicted, rel=0.2), name
+
+
+def test_pictures_show_the_face_that_is_up():
+    for up, text in (([0, 0, 1.0], "+z"), ([0, 0, -1.0], "−z"), ([1.0, 0, 0], "+x"), ([0, -1.0, 0], "−y")):
+        picture = attitude_picture(np.array(up))
+        assert f">{text}<" in picture
+        opposite = ("−" if text[0] == "+" else "+") + text[1]
+        assert f">{opposite}<" not in picture
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"order": 6, "attitudes": 30}, "order 6: expected 1 to 5"),
+        ({"order": 2, "attitudes": 11}, "order 2 has 12 parameters"),
+        ({"order": 1, "attitudes": 12, "criterion": "G"}, "expected one of A D"),
+    ],
+)
+def test_impossible_plans_are_refused(options, message):
+    with pytest.raises(OptionError, match=message):
+        plan_tumble(**options)
+
+
+def test_the_command_writes_a_plan_and_a_sheet(imulab, tmp_path):
+    done = imulab(
+        "tumble", "plan", "--order", "2", "--attitudes", "14", "--noise", "5ug", "-o", "p.csv", "--report", "p.html"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "14 attitudes for order 2, criterion A" in done.stdout
+    assert "for a noise of 5 µg" in done.stdout
+    sheet = (tmp_path / "p.html").read_text()
+    assert sheet.count("<svg ") == 14
+    more = imulab("tumble", "plan", "--order", "2", "--attitudes", "4", "--add", "p.csv", "--from", "fixture:15")
+    assert "4 attitudes with the 14 already there" in more.stdout
+    for arguments, fragment in (
+        (["--from", "fixture:7"], "expected a whole part of 360 deg"),
+        (["--from", "nowhere.csv"], "nowhere.csv: no such file"),
+        (["--noise", "0"], "expected more than 0"),
+        (["-o", "p.txt"], "ends in .csv"),
+        (["--criterion", "G"], "expected one of A D"),
+    ):
+        refused = imulab("tumble", "plan", "--order", "2", "--attitudes", "14", *arguments)
+        assert refused.returncode == 2
+        assert fragment in refused.stderr
+        assert refused.stderr.count("\n") == 1
+
+
+def test_add_takes_a_recording_and_a_record(imulab):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    imulab("tumble", "fit", "t.csv", "--gravity", str(G), "--order", "1", "-o", "t.json")
+    found = [
+        imulab("tumble", "plan", "--order", "2", "--attitudes", "3", "--add", file) for file in ("t.csv", "t.json")
+    ]
+    for done in found:
+        assert done.returncode == 0, done.stderr
+        assert "3 attitudes with the 16 already there" in done.stdout
