@@ -15,6 +15,7 @@ from imulab.cli.options import (
     RecordingFile,
     ReportFile,
     check_outputs,
+    progress_bar,
     quantity,
     warn,
     whole_number,
@@ -111,6 +112,9 @@ def fit(
     gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2.")] = None,
     latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
     height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
+    monte_carlo: Annotated[
+        str | None, typer.Option("--monte-carlo", metavar="N", help="Trials of a propagation of distributions.")
+    ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -128,13 +132,18 @@ def fit(
 
     check_outputs([output, report], [file] + ([layout] if layout else []))
     local = _gravity(gravity, latitude, height)
-    result = fit_tumble(
-        find_attitudes(read(file, layout)),
-        order=_order(order),
-        gravity=local,
-        method=method,
-        loss=loss,
-    )
+    trials = None if monte_carlo is None else whole_number(monte_carlo, "--monte-carlo")
+    attitudes = find_attitudes(read(file, layout))
+    with progress_bar("Monte Carlo", trials) as progress:
+        result = fit_tumble(
+            attitudes,
+            order=_order(order),
+            gravity=local,
+            method=method,
+            loss=loss,
+            monte_carlo=trials,
+            progress=progress,
+        )
     record = result.calibration
     with ExitStack() as stack:
         # Both files are opened before either is finished, so that neither is left alone behind an error.

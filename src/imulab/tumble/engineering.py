@@ -39,6 +39,26 @@ def change_rows(comparison: Comparison, output: str) -> list[list[str]]:
     return rows
 
 
+def propagated_rows(record: Calibration) -> list[list[str]]:
+    """Return the Monte Carlo intervals beside the linear ones: name, both, ratio of their widths, unit."""
+    output = str(record.model["output_unit"])
+    physical = parse_unit(output).quantity == "acceleration"
+    coverage = record.fit["coverage_factor_95"]
+    rows = []
+    for name, found in record.fit["monte_carlo"]["parameters"].items():
+        parameter = record.parameters[name]
+        factor, offset, unit = _engineering(name.rpartition("_")[0], output, physical)
+        u = parameter.standard_uncertainty or 0.0
+        linear = [parameter.value - coverage * u, parameter.value + coverage * u]
+        texts = [
+            " to ".join(format_uncertain(end * factor + offset, u * abs(factor))[0] for end in ends)
+            for ends in (linear, found["interval_95"])
+        ]
+        ratio = (found["interval_95"][1] - found["interval_95"][0]) / (linear[1] - linear[0])
+        rows.append([name, *texts, f"{ratio:.3f}", unit])
+    return rows
+
+
 def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]]:
     """Return predicted uncertainties (units of g) as name, text and engineering unit."""
     rows = []

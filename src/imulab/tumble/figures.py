@@ -8,7 +8,7 @@ import numpy as np
 
 from imulab.calibration import Calibration
 from imulab.exhibit import ALARM, BAD, GOOD, QUIET, Exhibits, Figure, Table, format_uncertain, plain_number
-from imulab.tumble.engineering import engineering_rows
+from imulab.tumble.engineering import engineering_rows, propagated_rows
 from imulab.tumble.model import AXES
 from imulab.tumble.sphere import sphere_figure
 from imulab.units import from_si
@@ -31,6 +31,8 @@ def exhibits(record: Calibration) -> Exhibits:
         ("condition number", plain_number(fit["condition_number"], 3)),
     ]
     items: list[Figure | Table] = [_residuals(record), _parameters(record)]
+    if "monte_carlo" in fit:
+        items.append(_propagated(record))
     if fit["orders"]:
         items.append(_orders(record))
     items.append(sphere_figure(record))
@@ -177,6 +179,18 @@ def _parameters(record: Calibration) -> Table:
         caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.",
         columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit"],
         rows=rows,
+    )
+
+
+def _propagated(record: Calibration) -> Table:
+    trials = record.fit["monte_carlo"]
+    failed = f", {trials['failed']} more did not converge" if trials["failed"] else ""
+    return Table(
+        title="Monte Carlo",
+        caption=f"95 % intervals of {trials['trials']} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
+        "from 1 means that the model is not linear over its own uncertainty: trust the trials then.",
+        columns=["parameter", "linear", "Monte Carlo", "ratio of widths", "unit"],
+        rows=propagated_rows(record),
     )
 
 

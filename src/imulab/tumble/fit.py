@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from imulab.tumble.advice import helpful_attitudes
 from imulab.tumble.axes import check_axes
 from imulab.tumble.checks import check_attitudes, check_residuals
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
+from imulab.tumble.montecarlo import propagate
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
 from imulab.tumble.record import Gravity, Scaling, make_record
 from imulab.tumble.solve import Problem, Solution, forces, solve_linearised, solve_norm
@@ -66,6 +68,8 @@ def fit_tumble(
     gravity: float | Gravity | None = None,
     method: str = "norm",
     loss: str = "square",
+    monte_carlo: int | None = None,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> TumbleFit:
     """Calibrate an accelerometer triad from static attitudes.
 
@@ -84,6 +88,10 @@ def fit_tumble(
         ``"norm"`` or ``"linearised"``.
     loss
         ``"square"``, or ``"huber"`` against single disturbed attitudes (method norm only).
+    monte_carlo
+        Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
+    progress
+        Called with the number of trials done so far.
 
     Raises
     ------
@@ -114,6 +122,11 @@ def fit_tumble(
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])
     matrix, freedom = _covariance(problem, solution)
+    trials = None
+    if monte_carlo is not None:
+        if matrix is None or method != "norm":
+            raise OptionError("monte-carlo needs method norm and more attitudes than parameters, or stated deviations")
+        trials = propagate(problem, solution, trials=monte_carlo, freedom=freedom, progress=progress)
     record = make_record(
         attitudes=attitudes,
         gravity=local,
@@ -124,7 +137,9 @@ def fit_tumble(
         coverage=coverage_factor(freedom) if matrix is not None else None,
         observability=seen,
         orders=choice.rows if choice else (),
-        options={"order": order, "method": method, "loss": loss, "gravity": local.value},
+        options={"order": order, "method": method, "loss": loss, "gravity": local.value}
+        | ({} if monte_carlo is None else {"monte_carlo": monte_carlo}),
+        monte_carlo=trials,
     )
     return TumbleFit(
         calibration=record,

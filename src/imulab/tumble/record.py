@@ -13,6 +13,7 @@ from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.estimate import Observability, coverage_factor, leverage
 from imulab.recording import Array
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
+from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
 from imulab.tumble.solve import Problem, Solution, forces
 from imulab.units import parse_unit
@@ -57,6 +58,7 @@ def make_record(
     observability: Observability,
     orders: tuple[OrderRow, ...],
     options: Mapping[str, Any],
+    monte_carlo: MonteCarlo | None = None,
 ) -> Calibration:
     """Turn a solution in units of g into the record.
 
@@ -106,6 +108,7 @@ def make_record(
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
             "orders": [asdict(row) for row in orders],
+            **_propagated(monte_carlo, scaling, g, order),
         },
         options=dict(options),
         data=_data(attitudes, scaling, problem, solution, g),
@@ -130,13 +133,38 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
     return found
 
 
+def _propagated(trials: MonteCarlo | None, scaling: Scaling, g: float, order: int) -> dict[str, Any]:
+    """Mean, standard deviation and 95 % interval of every parameter over the trials, in SI."""
+    if trials is None:
+        return {}
+    values = _si_values(trials.theta, scaling, g, order)
+    low, high = np.quantile(values, [0.025, 0.975], axis=0)
+    columns = zip(parameter_names(order), values.mean(axis=0), values.std(axis=0, ddof=1), low, high, strict=True)
+    return {
+        "monte_carlo": {
+            "trials": len(values),
+            "failed": trials.failed,
+            "parameters": {
+                name: {"mean": float(m), "standard_deviation": float(s), "interval_95": [float(a), float(b)]}
+                for name, m, s, a, b in columns
+            },
+        }
+    }
+
+
+def _si_values(theta: Array, scaling: Scaling, g: float, order: int) -> Array:
+    """Parameter vectors in SI, shape (b, p)."""
+    scale_factor = scaling.scale * theta[:, 3:6] / g
+    bias = (scaling.zero + scaling.scale * theta[:, 0:3]) / scale_factor
+    powers = np.repeat(np.arange(1, order), 3)
+    return np.hstack([bias, scale_factor, theta[:, 6:9], theta[:, 9:] / g**powers])
+
+
 def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
     """Return the parameter vector in SI and its derivative with respect to theta, shape (p, p)."""
-    zero, sigma = theta[:3], theta[3:6]
-    scale_factor = scaling.scale * sigma / g
-    bias = (scaling.zero + scaling.scale * zero) / scale_factor
+    values = _si_values(theta[None], scaling, g, order)[0]
+    bias, scale_factor, sigma = values[:3], values[3:6], theta[3:6]
     powers = np.repeat(np.arange(1, order), 3)
-    values = np.concatenate([bias, scale_factor, theta[6:9], theta[9:] / g**powers])
     derivative = np.diag(
         np.concatenate([scaling.scale / scale_factor, scaling.scale / g, np.ones(3), g ** -powers.astype(float)])
     )
