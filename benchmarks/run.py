@@ -20,6 +20,8 @@ import numpy as np
 
 import imulab as il
 from imulab.estimate import chi_square_limit
+from imulab.tumble.gyro import fit_gyro
+from imulab.tumble.plan import plan_tumble
 from imulab.tumble.solve import Problem, solve_norm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -116,6 +118,13 @@ def fitting() -> None:
     covariance = np.broadcast_to(4e-10 * np.eye(3), (1, 24, 3, 3))
     (batch,) = seconds(lambda: solve_norm(Problem(noisy, covariance, 4), limit=chi_square_limit(6)), repeats=3)
     row("10,000 fits of 24 attitudes, order 4, one batch, nominal start", f"{batch:.1f} s", "<= 4 s")
+    (planned,) = seconds(lambda: plan_tumble(order=4, attitudes=24), repeats=3)
+    row("plan of 24 attitudes, order 4", f"{planned:.2f} s", "<= 3 s")
+    recording = il.simulate_tumble(order=1, attitudes=38, seed=1)
+    attitudes = il.find_attitudes(recording)
+    record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
+    (gyro,) = seconds(lambda: fit_gyro(record, attitudes, recording), repeats=5)
+    row("gyroscope triad from 37 turns, 26,400 samples", f"{gyro:.2f} s", "<= 1 s")
 
 
 def plain_scipy_fit(outputs: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imulab.apply import apply, apply_blocks, warnings_of
+from imulab.applying import apply, apply_blocks, warnings_of
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.recording import Recording

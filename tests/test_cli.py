@@ -42,6 +42,18 @@ def test_help_imports_no_numerics():
     assert done.stdout.endswith("set()\n")
 
 
+def test_no_submodule_hides_a_public_function():
+    """Importing a submodule puts it where its package looks names up: imulab.apply must stay the function."""
+    import importlib
+    import pkgutil
+
+    for module in pkgutil.walk_packages(il.__path__, "imulab."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    assert callable(il.apply)
+    assert {m.name.split(".")[1] for m in pkgutil.walk_packages(il.__path__, "imulab.")}.isdisjoint(il.__all__)
+
+
 def test_public_names_all_resolve():
     for name in il.__all__:
         assert getattr(il, name) is not None

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 from imulab._version import VERSION as __version__  # noqa: N811
 
 if TYPE_CHECKING:
-    from imulab.apply import apply as apply
+    from imulab.applying import apply as apply
     from imulab.attitudes import Attitudes as Attitudes
     from imulab.calibration import Calibration as Calibration
     from imulab.calibration import load as load
@@ -50,7 +50,7 @@ _HOME = {
     "ImulabError": "errors",
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
-    "apply": "apply",
+    "apply": "applying",
     "find_attitudes": "segment",
     "fit_tumble": "tumble.fit",
     "load": "calibration",

@@ -6,6 +6,8 @@ Source: Savage, Strapdown inertial navigation integration algorithm design, part
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -67,3 +69,46 @@ def _matrices(q: Array) -> Array:
     ]
     matrices: Array = np.array(rows).transpose(2, 0, 1)
     return matrices
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Turns over segments, and their sensitivity to errors of the rate.
+
+    Attributes
+    ----------
+    matrix
+        Carries fixed directions, in body components, from the start of each segment to its end, shape (m, 3, 3).
+    weighted
+        ``sum C_i' x_i dt`` for each weight x (k of them): an error ``dw = a x`` of the rate changes a carried
+        direction v by ``C (v x sum C_i' x_i dt a)``. Shape (m, k, 3, 3).
+    """
+
+    matrix: Array
+    weighted: Array
+
+
+def weighted_turns(rate: Array, step: Array, weights: Array) -> Turns:
+    """Compose turns with their sensitivities by pairs; both are monoids, so that no loop over samples is needed.
+
+    Parameters
+    ----------
+    rate
+        Mean rate of each step, rad/s, shape (m, n, 3).
+    step
+        Duration of each step, s, zero after a segment's end, shape (m, n).
+    weights
+        Shape (m, n, k).
+    """
+    missing = (1 << max(rate.shape[1] - 1, 0).bit_length()) - rate.shape[1]
+    angle = np.pad(-rate * step[:, :, None], ((0, 0), (0, missing), (0, 0)))
+    q = _quaternions(angle)
+    half = _matrices(_quaternions(0.5 * angle).reshape(-1, 4)).reshape(*angle.shape, 3)
+    scaled = np.pad(weights * step[:, :, None], ((0, 0), (0, missing), (0, 0)))
+    sums = scaled[..., None, None] * np.swapaxes(half, -1, -2)[:, :, None]
+    while q.shape[1] > 1:
+        first = q[:, 0::2]
+        back = np.swapaxes(_matrices(first.reshape(-1, 4)).reshape(*first.shape[:2], 3, 3), -1, -2)
+        sums = sums[:, 0::2] + back[:, :, None] @ sums[:, 1::2]
+        q = _compose(q[:, 1::2], first)
+    return Turns(_matrices(q[:, 0]), sums[:, 0])

@@ -29,7 +29,7 @@ def apply(
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; native CSV to OUT or standard output."""
-    from imulab.apply import apply_blocks
+    from imulab.applying import apply_blocks
     from imulab.calibration import load
     from imulab.readers import read_blocks
     from imulab.writers import write_csv, write_csv_to
@@ -51,7 +51,7 @@ def apply(
 
 def _warned(records: list[Calibration], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say at the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.apply import beyond_test_of, warnings_of
+    from imulab.applying import beyond_test_of, warnings_of
     from imulab.units import from_si
 
     count, largest, name = 0, 0.0, ""

@@ -23,6 +23,7 @@ from imulab.cli.options import (
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
+    from imulab.calibration import Calibration
     from imulab.tumble.record import Gravity
 
 
@@ -32,6 +33,7 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
     group.command("plan")(plan)
     group.command("simulate")(simulate)
     group.command("fit")(fit)
+    group.command("gyro")(gyro)
     group.command("check")(check)
     return group
 
@@ -123,10 +125,7 @@ def fit(
 
     Prints what was found; -o writes the calibration record, --report its figures.
     """
-    from imulab.files import replacing
-    from imulab.present import exhibits_of
     from imulab.readers import read
-    from imulab.report import render
     from imulab.segment import find_attitudes
     from imulab.tumble.fit import fit_tumble
 
@@ -144,7 +143,15 @@ def fit(
             monte_carlo=trials,
             progress=progress,
         )
-    record = result.calibration
+    finish(result.calibration, output, report, json=json)
+
+
+def finish(record: Calibration, output: str | None, report: str | None, *, json: bool) -> None:
+    """Write a record and its report, both or none, and say what was found."""
+    from imulab.files import replacing
+    from imulab.present import exhibits_of
+    from imulab.report import render
+
     with ExitStack() as stack:
         # Both files are opened before either is finished, so that neither is left alone behind an error.
         to_record = stack.enter_context(replacing(output)) if output else None
@@ -164,6 +171,39 @@ def fit(
             print(f"{what}: {name}")
     for message in record.warnings:
         warn(message)
+
+
+def gyro(
+    file: RecordingFile,
+    accel: Annotated[str, typer.Option("--accel", metavar="RECORD", help="Tumble record of the accelerometers.")],
+    accel_file: Annotated[
+        str | None,
+        typer.Option("--accel-file", metavar="FILE", help="Accelerometers' recording, if not the same file."),
+    ] = None,
+    layout: LayoutFile = None,
+    accel_layout: Annotated[
+        str | None, typer.Option("--accel-layout", metavar="L.toml", help="Columns of the accelerometers' file.")
+    ] = None,
+    fit_bias: Annotated[bool, typer.Option("--fit-bias", help="Fit the biases to the turns too.")] = False,
+    g_sensitivity: Annotated[str, typer.Option(help="auto, yes or no.")] = "auto",
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
+    from imulab.calibration import load
+    from imulab.readers import read
+    from imulab.segment import find_attitudes
+    from imulab.tumble.gyro import fit_gyro
+    from imulab.tumble.gyrorecord import with_gyro
+
+    inputs = [name for name in (file, accel, accel_file, layout, accel_layout) if name]
+    check_outputs([output, report], inputs)
+    record = load(accel)
+    recording = read(file, layout)
+    own = recording if accel_file is None else read(accel_file, accel_layout or layout)
+    result = fit_gyro(record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity)
+    finish(with_gyro(record, result, recording, own), output, report, json=json)
 
 
 def check(

@@ -10,13 +10,15 @@ from imulab.calibration import Calibration
 from imulab.errors import RecordError, UnitError
 from imulab.recording import Array, Recording
 from imulab.tumble.model import AXES, MISALIGNMENTS, invert, parameter_names, parameter_units
-from imulab.units import STANDARD_GRAVITY, conversion_factor
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit
 
 _FAR = 2.0
 
 
 def apply_tumble(record: Calibration, recording: Recording) -> Recording:
     """Return the recording with accel_* as specific force, m/s^2, in the body frame of the record's gauge.
+
+    Where record and recording both have a gyroscope triad, gyro_* become the body rate in that frame.
 
     Raises
     ------
@@ -36,10 +38,59 @@ def apply_tumble(record: Calibration, recording: Recording) -> Recording:
         ) from None
     force = specific_force(record, recording.triad("accel") * factor)
     names = [f"accel_{axis}" for axis in AXES]
-    return recording.with_columns(
-        {name: np.ascontiguousarray(force[:, i]) for i, name in enumerate(names)},
-        dict.fromkeys(names, "m/s^2"),
+    corrected = recording.with_columns(
+        {name: np.ascontiguousarray(force[:, i]) for i, name in enumerate(names)}, dict.fromkeys(names, "m/s^2")
     )
+    if "gyro_output_unit" in record.model and all(f"gyro_{axis}" in recording for axis in AXES):
+        return _apply_gyro(record, corrected, force)
+    return corrected
+
+
+def _apply_gyro(record: Calibration, recording: Recording, force: Array) -> Recording:
+    """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s."""
+    unit, needed = recording.triad_unit("gyro"), str(record.model["gyro_output_unit"])
+    try:
+        factor = conversion_factor(unit, needed)
+    except UnitError:
+        raise UnitError(
+            f"{recording.name}: columns gyro_x gyro_y gyro_z are in {unit}, "
+            f"but the record calibrates outputs in {needed}"
+        ) from None
+    rate = body_rate(record, recording.triad("gyro") * factor, force)
+    kept = unit if parse_unit(unit).quantity == "rate" else "rad/s"
+    names = [f"gyro_{axis}" for axis in AXES]
+    return recording.with_columns(
+        {name: from_si(np.ascontiguousarray(rate[:, i]), kept) for i, name in enumerate(names)},
+        dict.fromkeys(names, kept),
+    )
+
+
+def body_rate(record: Calibration, output: Array, force: Array) -> Array:
+    """Return the body rate, rad/s, for gyroscope outputs in the record's unit and specific force, m/s^2; shapes (n, 3).
+
+    ``w = T^-1 (M / S - b - G f)``.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter.
+    """
+    try:
+        scale = np.array([record.value(f"gyro_scale_factor_{axis}") for axis in AXES])
+        bias = np.array([record.value(f"gyro_bias_{axis}") for axis in AXES])
+        misalignment = np.eye(3)
+        for i, row in enumerate(AXES):
+            for j, column in enumerate(AXES):
+                if i != j:
+                    misalignment[i, j] = record.value(f"gyro_misalignment_{row}{column}")
+        sensed = output / scale - bias
+        if "gyro_g_sensitivity_xx" in record.parameters:
+            sensitivity = [[record.value(f"gyro_g_sensitivity_{i}{j}") for j in AXES] for i in AXES]
+            sensed = sensed - force @ np.array(sensitivity).T
+    except KeyError as error:
+        raise RecordError(f"the record lacks {error.args[0]}") from None
+    rate: Array = sensed @ np.linalg.inv(misalignment).T
+    return rate
 
 
 def specific_force(record: Calibration, output: Array) -> Array:

@@ -30,7 +30,7 @@ def change_rows(comparison: Comparison, output: str) -> list[list[str]]:
     physical = parse_unit(output).quantity == "acceleration"
     rows = []
     for change in comparison.changes:
-        factor, _, unit = _engineering(change.name.rpartition("_")[0], output, physical)
+        factor, _, unit = _converted(change.name, change.unit, output, physical)
         difference, uncertainty = format_uncertain(
             change.difference * factor, change.standard_uncertainty * abs(factor)
         )
@@ -47,7 +47,7 @@ def propagated_rows(record: Calibration) -> list[list[str]]:
     rows = []
     for name, found in record.fit["monte_carlo"]["parameters"].items():
         parameter = record.parameters[name]
-        factor, offset, unit = _engineering(name.rpartition("_")[0], output, physical)
+        factor, offset, unit = _converted(name, parameter.unit, output, physical)
         u = parameter.standard_uncertainty or 0.0
         linear = [parameter.value - coverage * u, parameter.value + coverage * u]
         texts = [
@@ -79,10 +79,10 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
     zeros = {} if physical else zero_outputs(record)
     for name, parameter in record.parameters.items():
         stem, _, axis = name.rpartition("_")
-        factor, offset, unit = _engineering(stem, output, physical)
+        factor, offset, unit = _converted(name, parameter.unit, output, physical)
         rows.append(
             EngineeringRow(
-                name if not (physical and stem == "scale_factor") else f"scale_factor_error_{axis}",
+                name.replace("scale_factor", "scale_factor_error") if unit == "ppm" else name,
                 parameter.value * factor + offset,
                 None if parameter.standard_uncertainty is None else parameter.standard_uncertainty * abs(factor),
                 unit,
@@ -93,6 +93,23 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
                 EngineeringRow(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zeros.items()
             ]
     return rows
+
+
+def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float, float, str]:
+    """Factor, offset and unit that turn a parameter of either triad into engineering units."""
+    stem = name.rpartition("_")[0]
+    if not stem.startswith("gyro_"):
+        return _engineering(stem, output, physical)
+    if stem == "gyro_bias":
+        return from_si(1.0, "deg/s"), 0.0, "deg/s"
+    if stem == "gyro_scale_factor":
+        sensed = unit.removesuffix("/(rad/s)")
+        if parse_unit(sensed).quantity == "rate":
+            return 1e6 / from_si(1.0, sensed), -1e6, "ppm"
+        return 1.0, 0.0, unit
+    if stem == "gyro_misalignment":
+        return 1e3, 0.0, "mrad"
+    return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
 
 
 def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, str]:

@@ -38,6 +38,8 @@ def exhibits(record: Calibration) -> Exhibits:
     items.append(sphere_figure(record))
     if "trace" in record.data:
         items.append(_trace(record))
+    if "gyro" in record.data:
+        items.append(_turns(record))
     if record.covariance.names:
         items.append(_correlation(record))
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} down-weighted" if bad else ""
@@ -279,6 +281,36 @@ def _trace(record: Calibration) -> Figure:
                 for a, b, weight in zip(data["start"], data["stop"], data["down_weight"], strict=True)
             ],
         },
+    )
+
+
+def _turns(record: Calibration) -> Figure:
+    data = record.data["gyro"]
+    angle = [float(from_si(value, "deg")) for value in data["residual"]]
+    number = list(range(1, len(angle) + 1))
+    text = [f"{a:.1f} to {b:.1f} s" for a, b in zip(data["start"], data["stop"], strict=True)]
+    rms = float(from_si(_rms(data["residual"]), "deg"))
+    return Figure(
+        title="What the gyroscopes miss in each turn",
+        caption="Angle between the direction of gravity as the gyroscopes carry it and the one found after the turn, "
+        f"rms {rms:.3g} deg. A few high bars: very fast turns, or a unit that moved while it was taken to be at rest.",
+        traces=[
+            {
+                "type": "bar",
+                "x": number,
+                "y": angle,
+                "marker": {"color": GOOD},
+                "text": text,
+                "textposition": "none",
+                "hovertemplate": "turn %{x}, %{text}<br>%{y:.3f} deg<extra></extra>",
+            }
+        ],
+        layout={
+            "xaxis": _axis("turn", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
+            "yaxis": _axis("residual angle, deg"),
+            "showlegend": False,
+        },
+        height=320,
     )
 
 

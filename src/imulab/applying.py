@@ -1,4 +1,7 @@
-"""Records to corrected recordings: one dispatch over the procedures."""
+"""Records to corrected recordings: one dispatch over the procedures.
+
+Not named after its function: a submodule ``imulab.apply`` would take the place of ``imulab.apply()`` once imported.
+"""
 
 from __future__ import annotations
 
