@@ -457,3 +457,8 @@ def test_a_decimal_comma_is_recognised(file):
     layout = Layout({"time": LayoutColumn(0, "s"), "accel_x": LayoutColumn(1, "g")}, delimiter=";", name="foreign")
     with pytest.raises(ReadError, match="found '0,5' \\(a decimal comma\\? expected a point\\)"):
         read(file(b"0,5;1,25\n"), layout)
+
+
+def test_a_record_in_the_place_of_a_recording_is_recognised(file):
+    with pytest.raises(ReadError, match=r"expected a recording, found JSON \(a calibration record\?\)"):
+        read(file(b'{\n "format": "imulab.calibration"\n}\n'))
