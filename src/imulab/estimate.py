@@ -236,7 +236,7 @@ def huber_inflation(standardised: Array, size: int) -> Array:
     return factor
 
 
-def excess_variance(residuals: Array, variance: Array, freedom: int) -> Array:
+def excess_variance(residuals: Array, variance: Array, freedom: float) -> Array:
     """Return the variance that must be added to each observation's own for chi-square to equal its expectation.
 
     Mandel-Paule: the root tau^2 >= 0 of ``sum r^2 / (variance + tau^2) = freedom``, by Newton from below (the sum is

@@ -114,6 +114,9 @@ def fit(
     gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2.")] = None,
     latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
     height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
+    prior: Annotated[
+        str | None, typer.Option("--prior", metavar="RECORD", help="Earlier record of this unit, as prior knowledge.")
+    ] = None,
     monte_carlo: Annotated[
         str | None, typer.Option("--monte-carlo", metavar="N", help="Trials of a propagation of distributions.")
     ] = None,
@@ -125,11 +128,12 @@ def fit(
 
     Prints what was found; -o writes the calibration record, --report its figures.
     """
+    from imulab.calibration import load
     from imulab.readers import read
     from imulab.segment import find_attitudes
     from imulab.tumble.fit import fit_tumble
 
-    check_outputs([output, report], [file] + ([layout] if layout else []))
+    check_outputs([output, report], [name for name in (file, layout, prior) if name])
     local = _gravity(gravity, latitude, height)
     trials = None if monte_carlo is None else whole_number(monte_carlo, "--monte-carlo")
     attitudes = find_attitudes(read(file, layout))
@@ -140,6 +144,7 @@ def fit(
             gravity=local,
             method=method,
             loss=loss,
+            prior=None if prior is None else load(prior),
             monte_carlo=trials,
             progress=progress,
         )

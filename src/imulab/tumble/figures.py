@@ -33,6 +33,8 @@ def exhibits(record: Calibration) -> Exhibits:
     items: list[Figure | Table] = [_residuals(record), _parameters(record)]
     if "monte_carlo" in fit:
         items.append(_propagated(record))
+    if "prior" in fit:
+        items.append(_shares(record))
     if fit["orders"]:
         items.append(_orders(record))
     items.append(sphere_figure(record))
@@ -193,6 +195,18 @@ def _propagated(record: Calibration) -> Table:
         "from 1 means that the model is not linear over its own uncertainty: trust the trials then.",
         columns=["parameter", "linear", "Monte Carlo", "ratio of widths", "unit"],
         rows=propagated_rows(record),
+    )
+
+
+def _shares(record: Calibration) -> Table:
+    prior = record.fit["prior"]
+    rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior["shares"].items()]
+    return Table(
+        title="Prior and data",
+        caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior['created']}) or "
+        "these attitudes. A prior that no longer holds shows as scatter beyond the noise.",
+        columns=["parameter", "from the prior", "from the data"],
+        rows=rows,
     )
 
 

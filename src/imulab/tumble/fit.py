@@ -25,8 +25,8 @@ from imulab.tumble.checks import check_attitudes, check_residuals
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
 from imulab.tumble.montecarlo import propagate
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
-from imulab.tumble.record import Gravity, Scaling, make_record
-from imulab.tumble.solve import Problem, Solution, forces, solve_linearised, solve_norm
+from imulab.tumble.record import Gravity, Scaling, make_record, prior_of
+from imulab.tumble.solve import Problem, Solution, data_freedom, forces, informed_rows, solve_linearised, solve_norm
 from imulab.units import STANDARD_GRAVITY, parse_unit, to_si
 
 METHODS = ("norm", "linearised")
@@ -68,6 +68,7 @@ def fit_tumble(
     gravity: float | Gravity | None = None,
     method: str = "norm",
     loss: str = "square",
+    prior: Calibration | None = None,
     monte_carlo: int | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> TumbleFit:
@@ -88,6 +89,9 @@ def fit_tumble(
         ``"norm"`` or ``"linearised"``.
     loss
         ``"square"``, or ``"huber"`` against single disturbed attitudes (method norm only).
+    prior
+        Earlier tumble record of the same unit, taken as a normal distribution of the parameters; gives the order under
+        ``"auto"``. Needs method norm, loss square and stated or measured noise.
     monte_carlo
         Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
     progress
@@ -111,21 +115,27 @@ def fit_tumble(
     noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
     problem = Problem(reading, noise, 1, robust=loss == "huber")
     choice: OrderChoice | None = None
+    known = None
+    if prior is not None:
+        order = _prior_order(prior, order, method, loss, attitudes)
+        known = prior_of(prior, scaling, local.value, attitudes.unit)
     if order == "auto":
         if len(attitudes) >= parameter_count(1):
             choice = choose_order(problem, local.value)
         chosen = choice.order if choice else 1
     else:
         chosen = int(order)
-    problem = Problem(reading, noise, chosen, robust=loss == "huber")
+    problem = Problem(reading, noise, chosen, robust=loss == "huber", prior=known)
     solution, seen = _solve(problem, attitudes, method)
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])
     matrix, freedom = _covariance(problem, solution)
     trials = None
     if monte_carlo is not None:
-        if matrix is None or method != "norm":
-            raise OptionError("monte-carlo needs method norm and more attitudes than parameters, or stated deviations")
+        if matrix is None or method != "norm" or known is not None:
+            raise OptionError(
+                "monte-carlo needs method norm, no prior, and more attitudes than parameters or stated deviations"
+            )
         trials = propagate(problem, solution, trials=monte_carlo, freedom=freedom, progress=progress)
     record = make_record(
         attitudes=attitudes,
@@ -140,6 +150,7 @@ def fit_tumble(
         options={"order": order, "method": method, "loss": loss, "gravity": local.value}
         | ({} if monte_carlo is None else {"monte_carlo": monte_carlo}),
         monte_carlo=trials,
+        prior=prior,
     )
     return TumbleFit(
         calibration=record,
@@ -160,6 +171,22 @@ def _check_options(order: int | str, method: str, loss: str) -> None:
         raise OptionError(f"loss {loss!r}: expected one of {' '.join(LOSSES)}")
     if loss == "huber" and method == "linearised":
         raise OptionError("loss huber needs method norm, found method linearised")
+
+
+def _prior_order(prior: Calibration, order: int | str, method: str, loss: str, attitudes: Attitudes) -> int:
+    """Return the order of the prior, which is that of the fit."""
+    if prior.procedure != "tumble" or not prior.covariance.names:
+        raise OptionError("prior: expected a tumble record that states uncertainties")
+    if method != "norm" or loss != "square":
+        raise OptionError("a prior needs method norm and loss square")
+    if attitudes.covariance is None:
+        raise OptionError(
+            "a prior needs the noise of the attitudes, to be weighed against: a recording, or std_* columns"
+        )
+    own = int(prior.model["order"])
+    if order not in ("auto", own):
+        raise OptionError(f"order {order} with a prior of order {own}: expected order {own} or auto")
+    return own
 
 
 def _gravity(gravity: float | Gravity | None) -> Gravity:
@@ -185,8 +212,10 @@ def _solve(problem: Problem, attitudes: Attitudes, method: str) -> tuple[Solutio
     if method == "linearised" and n >= size:
         solution = solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
     else:
-        solution = solve_norm(problem, limit=chi_square_limit(n - size))
-    seen = observability(solution.jacobian[0], absolute_weights(problem, solution))
+        limit = chi_square_limit(n - size if problem.prior is None else n)
+        start = None if problem.prior is None else problem.prior.mean[None]
+        solution = solve_norm(problem, start, limit=limit)
+    seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
     if seen.rank < size:
         names = parameter_names(problem.order)
         confused = seen.confused(names)
@@ -211,6 +240,11 @@ def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, flo
     """Covariance of theta, shape (p, p), and the degrees of freedom of its scale (None: noise known)."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     freedom = n - size
+    if problem.prior is not None:
+        rows, weights = informed_rows(problem, solution.jacobian[0], 1 / solution.variance[0])
+        left = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
+        estimated = bool(solution.excess[0] > 0) and left > 1
+        return covariance(rows[None], weights[None])[0], left if estimated else None
     base = covariance(solution.jacobian, 1 / solution.variance)[0]
     known = problem.covariance is not None
     if problem.robust and freedom > 0:

@@ -10,12 +10,13 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
+from imulab.errors import RecordError
 from imulab.estimate import Observability, coverage_factor, leverage
 from imulab.recording import Array
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
-from imulab.tumble.solve import Problem, Solution, forces
+from imulab.tumble.solve import Prior, Problem, Solution, data_freedom, forces
 from imulab.units import parse_unit
 
 _STANDS_OUT = 5.0
@@ -59,6 +60,7 @@ def make_record(
     orders: tuple[OrderRow, ...],
     options: Mapping[str, Any],
     monte_carlo: MonteCarlo | None = None,
+    prior: Calibration | None = None,
 ) -> Calibration:
     """Turn a solution in units of g into the record.
 
@@ -72,6 +74,7 @@ def make_record(
     recording = attitudes.recording
     n, size = len(attitudes), len(names)
     chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
+    freedom = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
     known = problem.covariance is not None
     if not known:
         chi_square *= g**2
@@ -99,8 +102,8 @@ def make_record(
             "attitudes": n,
             "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
             "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
-            "degrees_of_freedom": n - size,
-            "reduced_chi_square": chi_square / (n - size) if n > size else None,
+            "degrees_of_freedom": n - size if prior is None else freedom,
+            "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
             "noise": "known" if known else "estimated from the residuals",
             "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
             "coverage_factor_95": coverage,
@@ -109,12 +112,13 @@ def make_record(
             "iterations": int(solution.iterations[0]),
             "orders": [asdict(row) for row in orders],
             **_propagated(monte_carlo, scaling, g, order),
+            **_prior_shares(prior, problem, covariance),
         },
         options=dict(options),
         data=_data(attitudes, scaling, problem, solution, g),
         sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
-        warnings=tuple(_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(n - size, 1))),
+        warnings=tuple(_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0))),
     )
 
 
@@ -158,6 +162,51 @@ def _si_values(theta: Array, scaling: Scaling, g: float, order: int) -> Array:
     bias = (scaling.zero + scaling.scale * theta[:, 0:3]) / scale_factor
     powers = np.repeat(np.arange(1, order), 3)
     return np.hstack([bias, scale_factor, theta[:, 6:9], theta[:, 9:] / g**powers])
+
+
+def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prior:
+    """Return a record's parameters as a prior of the scaled parameters: the inverse of `_si_values`.
+
+    Raises
+    ------
+    RecordError
+        The record's outputs have another unit.
+    """
+    if record.model["output_unit"] != unit:
+        raise RecordError(f"the prior has outputs in {record.model['output_unit']}, the recording in {unit}")
+    order = int(record.model["order"])
+    names = parameter_names(order)
+    values = np.array([record.value(name) for name in names])
+    bias, scale_factor = values[:3], values[3:6]
+    powers = np.repeat(np.arange(1, order), 3)
+    theta = np.concatenate(
+        [
+            (scale_factor * bias - scaling.zero) / scaling.scale,
+            scale_factor * g / scaling.scale,
+            values[6:9],
+            values[9:] * g**powers,
+        ]
+    )
+    derivative = np.linalg.inv(_to_si(theta, scaling, g, order)[1])
+    index = [record.covariance.names.index(name) for name in names]
+    covariance = derivative @ record.covariance.array()[np.ix_(index, index)] @ derivative.T
+    spread = np.sqrt(np.diag(covariance))
+    root = np.linalg.cholesky(covariance / np.outer(spread, spread))
+    return Prior(theta, np.linalg.inv(root) / spread)
+
+
+def _prior_shares(prior: Calibration | None, problem: Problem, covariance: Array | None) -> dict[str, Any]:
+    """Say what came from the prior: the diagonal of ``H^-1 P``, 1 where the data added nothing."""
+    if prior is None or problem.prior is None or covariance is None:
+        return {}
+    shares = np.diag(covariance @ problem.prior.rows.T @ problem.prior.rows)
+    return {
+        "prior": {
+            "content_sha256": prior.to_dict()["content_sha256"],
+            "created": prior.created,
+            "shares": {n: float(s) for n, s in zip(parameter_names(problem.order), shares, strict=True)},
+        }
+    }
 
 
 def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
@@ -284,7 +333,7 @@ def _freedom_warnings(problem: Problem, solution: Solution, observability: Obser
         found.append(
             f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
         )
-    if n - size < _FEW_DEGREES:
+    if n - size < _FEW_DEGREES and problem.prior is None:
         left = f"{n - size} degree{'' if n - size == 1 else 's'} of freedom"
         found.append(
             f"only {left}: {n} attitudes hardly check whether order {problem.order} is enough, and the uncertainties "

@@ -36,6 +36,17 @@ _REFIT_AT_MOST = 150
 
 
 @dataclass(frozen=True)
+class Prior:
+    """Earlier knowledge of the scaled parameters: normal, as observations ``rows (theta - mean) = 0 ± 1``.
+
+    `mean` has shape (p,), `rows` shape (q, p), with ``rows' rows`` the inverse of the covariance.
+    """
+
+    mean: Array
+    rows: Array
+
+
+@dataclass(frozen=True)
 class Problem:
     """Attitudes of a batch of units, scaled: outputs less a nominal zero, over a nominal scale, in units of g.
 
@@ -51,6 +62,8 @@ class Problem:
         Huber's loss instead of squares.
     excess
         Whether attitudes that scatter more than their covariances allow get a common further variance.
+    prior
+        Earlier knowledge of the parameters.
     """
 
     reading: Array
@@ -58,6 +71,7 @@ class Problem:
     order: int
     robust: bool = False
     excess: bool = True
+    prior: Prior | None = None
 
 
 @dataclass(frozen=True)
@@ -151,7 +165,8 @@ def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.i
         residuals = fit.residuals
         if problem.covariance is not None and problem.excess and not problem.robust:
             too_large = (residuals**2 / own).sum(axis=1) > limit
-            found = excess_variance(residuals, own, max(n - size, 1)) if too_large.any() else np.zeros(count)
+            freedom = n - size if problem.prior is None else data_freedom(problem, fit.jacobian[0], 1 / own[0])
+            found = excess_variance(residuals, own, max(freedom, 1)) if too_large.any() else np.zeros(count)
             excess = np.where(too_large, found, 0.0)
         variance = own + excess[:, None]
         if problem.robust:
@@ -193,7 +208,37 @@ def _least_squares(
         norm, jacobian, _, _ = norm_and_jacobian(parameters, reading, problem.order)
         return norm - 1 - lengthening[index], jacobian
 
-    return levenberg_marquardt(model, theta, weights, tolerance=tolerance, max_iterations=max_iterations)
+    prior = problem.prior
+    if prior is None:
+        return levenberg_marquardt(model, theta, weights, tolerance=tolerance, max_iterations=max_iterations)
+
+    def informed(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
+        residuals, jacobian = model(parameters, index)
+        rows = np.broadcast_to(prior.rows, (len(index), *prior.rows.shape))
+        known = (parameters - prior.mean) @ prior.rows.T
+        return np.hstack([residuals, known]), np.concatenate([jacobian, rows], axis=1)
+
+    n = weights.shape[1]
+    all_weights = np.hstack([weights, np.ones((len(weights), len(prior.rows)))])
+    fit = levenberg_marquardt(informed, theta, all_weights, tolerance=tolerance, max_iterations=max_iterations)
+    return replace(fit, residuals=fit.residuals[:, :n], jacobian=fit.jacobian[:, :n], weights=weights)
+
+
+def informed_rows(problem: Problem, jacobian: Array, weights: Array) -> tuple[Array, Array]:
+    """Return Jacobian (n + q, p) and weights (n + q,) of one problem with the rows of its prior."""
+    if problem.prior is None:
+        return jacobian, weights
+    return np.vstack([jacobian, problem.prior.rows]), np.concatenate([weights, np.ones(len(problem.prior.rows))])
+
+
+def data_freedom(problem: Problem, jacobian: Array, weights: Array) -> float:
+    """Return attitudes less the parameters that they, rather than the prior, determine: ``n - tr(H^-1 J' W J)``."""
+    n, size = jacobian.shape
+    if problem.prior is None:
+        return float(n - size)
+    information = jacobian.T @ (jacobian * weights[:, None])
+    whole = information + problem.prior.rows.T @ problem.prior.rows
+    return float(n - np.trace(np.linalg.solve(whole, information)))
 
 
 def _mean_square(fit: Fit, down: Array, size: int) -> Array:

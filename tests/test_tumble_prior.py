@@ -1,0 +1,144 @@
+"""Priors: a record and a field check together are worth both sets of attitudes in one fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imulab as il
+from conftest import table
+from imulab.calibration import Covariance
+from imulab.errors import OptionError, RecordError
+from reference import tumble as reference
+
+G = 9.80665
+SIGMA = 2e-4
+
+
+def attitudes_of(truth, order, count, seed, sigma=SIGMA, unit="m/s^2", stated=True):
+    rng = np.random.default_rng(seed)
+    data = np.array([reference.forward(G * u, truth, order) for u in reference.random_attitudes(rng, count)])
+    return table(data + sigma * rng.standard_normal(data.shape), unit, sigma if stated else None)
+
+
+def fit(recording, order=1, **options):
+    return il.fit_tumble(il.find_attitudes(recording), order=order, gravity=G, **options).calibration
+
+
+def joined(first, second):
+    columns = {n: np.concatenate([first.columns[n], second.columns[n]]) for n in first.columns}
+    return replace(first, columns=columns)
+
+
+@pytest.mark.parametrize(("order", "few"), [(1, 30), (1, 5), (2, 30), (2, 7)])
+def test_prior_and_data_equal_one_fit_of_everything(order, few):
+    truth = reference.random_truth(np.random.default_rng(order), order)
+    factory, field = (attitudes_of(truth, order, n, seed) for n, seed in ((40, 1), (few, 2)))
+    updated = fit(field, order, prior=fit(factory, order))
+    together = fit(joined(factory, field), order)
+    for name, parameter in together.parameters.items():
+        found = updated.parameters[name]
+        assert found.value == pytest.approx(parameter.value, abs=0.02 * parameter.standard_uncertainty), name
+        assert found.standard_uncertainty == pytest.approx(parameter.standard_uncertainty, rel=0.01), name
+    size = np.sqrt(np.outer(*[np.diag(together.covariance.array())] * 2))
+    np.testing.assert_allclose(updated.covariance.array() / size, together.covariance.array() / size, atol=0.02)
+
+
+def test_a_vague_prior_changes_nothing_and_a_sharp_one_everything():
+    truth = reference.random_truth(np.random.default_rng(3), 1)
+    record, field = fit(attitudes_of(truth, 1, 30, 1)), attitudes_of(truth, 1, 30, 2)
+    alone = fit(field)
+    matrix = record.covariance.array()
+    for factor, expected, share in ((1e6, alone, 0.0), (1e-6, record, 1.0)):
+        scaled = replace(
+            record, covariance=Covariance(record.covariance.names, tuple(map(tuple, (matrix * factor).tolist())))
+        )
+        updated = fit(field, prior=scaled)
+        for name, parameter in expected.parameters.items():
+            assert updated.value(name) == pytest.approx(parameter.value, abs=0.02 * parameter.standard_uncertainty), (
+                name
+            )
+            assert updated.fit["prior"]["shares"][name] == pytest.approx(share, abs=1e-3), name
+
+
+def test_shares_say_what_few_attitudes_cannot_tell():
+    """Six faces of a cube say nothing of misalignment, and much of bias and scale factor."""
+    truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
+    record = fit(attitudes_of(truth, 1, 12, 1))
+    rng = np.random.default_rng(2)
+    faces = table(G * np.vstack([np.eye(3), -np.eye(3)]) + SIGMA * rng.standard_normal((6, 3)), sigma=SIGMA)
+    shares = fit(faces, prior=record).fit["prior"]["shares"]
+    assert min(shares[f"misalignment_{p}"] for p in ("yx", "zx", "zy")) > 0.95
+    # all of them against (P + J' J / sigma^2)^-1 P with derivatives of the transcribed residual
+    values = {name: p.value for name, p in record.parameters.items()}
+    jacobian = np.column_stack(
+        [
+            (
+                reference.residual(faces.triad("accel"), values | {n: values[n] + 1e-6}, 1, G)
+                - reference.residual(faces.triad("accel"), values | {n: values[n] - 1e-6}, 1, G)
+            )
+            / 2e-6
+            for n in values
+        ]
+    )
+    precision = np.linalg.inv(record.covariance.array())
+    expected = np.diag(np.linalg.solve(precision + jacobian.T @ jacobian / SIGMA**2, precision))
+    np.testing.assert_allclose(list(shares.values()), expected, atol=0.01)
+
+
+def test_a_prior_of_a_unit_that_changed_shows():
+    truth = reference.random_truth(np.random.default_rng(4), 1)
+    record = fit(attitudes_of(truth, 1, 30, 1))
+    moved = truth | {"bias_x": truth["bias_x"] + 0.05}
+    updated = fit(attitudes_of(moved, 1, 8, 2), prior=record)
+    assert any("scatter more than their own noise" in w for w in updated.warnings)
+
+
+def test_the_order_is_that_of_the_prior():
+    truth = reference.random_truth(np.random.default_rng(5), 2)
+    record = fit(attitudes_of(truth, 2, 40, 1), 2)
+    assert fit(attitudes_of(truth, 2, 8, 2), "auto", prior=record).model["order"] == 2
+    with pytest.raises(OptionError, match="order 1 with a prior of order 2"):
+        fit(attitudes_of(truth, 2, 20, 2), 1, prior=record)
+
+
+@pytest.mark.parametrize(
+    ("options", "field", "error", "message"),
+    [
+        ({"method": "linearised"}, {}, OptionError, "a prior needs method norm and loss square"),
+        ({"loss": "huber"}, {}, OptionError, "a prior needs method norm and loss square"),
+        ({"monte_carlo": 1000}, {}, OptionError, "no prior"),
+        ({}, {"stated": False}, OptionError, "a prior needs the noise of the attitudes"),
+        ({}, {"unit": "V"}, RecordError, r"the prior has outputs in m/s\^2, the recording in V"),
+    ],
+)
+def test_what_does_not_go_with_a_prior_is_refused(options, field, error, message):
+    truth = reference.random_truth(np.random.default_rng(6), 1)
+    record = fit(attitudes_of(truth, 1, 30, 1))
+    with pytest.raises(error, match=message):
+        fit(attitudes_of(truth, 1, 20, 2, **field), prior=record, **options)
+
+
+def test_a_prior_without_uncertainties_is_refused():
+    truth = reference.random_truth(np.random.default_rng(7), 1)
+    bare = fit(attitudes_of(truth, 1, 9, 1, stated=False))
+    with pytest.raises(OptionError, match="expected a tumble record that states uncertainties"):
+        fit(attitudes_of(truth, 1, 20, 2), prior=bare)
+
+
+def test_the_command_updates_a_record_from_few_attitudes(imulab, tmp_path):
+    imulab("tumble", "simulate", "-o", "a.csv", "--order", "1", "--seed", "3", "--attitudes", "24")
+    imulab("tumble", "fit", "a.csv", "--gravity", str(G), "--order", "1", "-o", "a.json")
+    whole = il.read(tmp_path / "a.csv")
+    il.write_csv(replace(whole, columns={n: v[:3000] for n, v in whole.columns.items()}), tmp_path / "b.csv")
+    assert imulab("tumble", "fit", "b.csv", "--gravity", str(G), "--order", "1").returncode == 2  # too few alone
+    done = imulab(
+        "tumble", "fit", "b.csv", "--gravity", str(G), "--prior", "a.json", "-o", "b.json", "--report", "b.html"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Prior and data" in done.stdout
+    assert "from the prior" in (tmp_path / "b.html").read_text()
+    before, after = il.load(tmp_path / "a.json"), il.load(tmp_path / "b.json")
+    for name in before.parameters:
+        assert after.parameters[name].standard_uncertainty < before.parameters[name].standard_uncertainty * 1.0001
+    assert imulab("tumble", "fit", "b.csv", "--gravity", str(G), "--prior", "b.csv").returncode == 2
