@@ -127,6 +127,36 @@ def fitting() -> None:
     row("gyroscope triad from 37 turns, 26,400 samples", f"{gyro:.2f} s", "<= 1 s")
 
 
+def efficiency() -> None:
+    """Rms error over the Cramér-Rao bound and coverage of 95 % intervals, through the public fit."""
+    sigma, trials = 2e-4, 2000
+    for order, count in ((1, 24), (2, 24), (4, 24), (4, 48)):
+        rng = np.random.default_rng(1000 * order + count)
+        truth = reference.random_truth(rng, order)
+        directions = reference.random_attitudes(rng, count)
+        clean = np.array([reference.forward(G * u, truth, order) for u in directions])
+        bound = np.sqrt(np.diag(reference.bound(directions, truth, order, G, np.full((count, 3), sigma))))
+        for known in (True, False):
+            errors, covered = [], []
+            for _ in range(trials):
+                noisy = clean + sigma * rng.standard_normal(clean.shape)
+                columns = {f"accel_{a}": noisy[:, i].copy() for i, a in enumerate("xyz")}
+                columns |= {f"std_accel_{a}": np.full(count, sigma) for a in "xyz"} if known else {}
+                table = il.Recording(columns, dict.fromkeys(columns, "m/s^2"))
+                record = il.fit_tumble(il.find_attitudes(table), order=order, gravity=G).calibration
+                error = np.array([p.value for p in record.parameters.values()]) - list(truth.values())
+                half = [record.fit["coverage_factor_95"] * p.standard_uncertainty for p in record.parameters.values()]
+                errors.append(error)
+                covered.append(np.abs(error) <= half)
+            ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / bound
+            row(
+                f"order {order}, {count} attitudes, noise {'known' if known else 'estimated'}: rms / Cramér-Rao bound",
+                f"{ratio.min():.3f} to {ratio.max():.3f}, pooled {np.sqrt(np.mean(ratio**2)):.3f}; "
+                f"95 % intervals cover {100 * np.mean(covered):.1f} %",
+                "<= 1.05 (5,000 trials); 93 to 97 %",
+            )
+
+
 def plain_scipy_fit(outputs: np.ndarray) -> np.ndarray:
     """What one would write without imulab: nine parameters, finite differences."""
     from scipy.optimize import least_squares
@@ -142,7 +172,7 @@ def plain_scipy_fit(outputs: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    for part in (starting, reading, segmenting, fitting):
+    for part in (starting, reading, segmenting, fitting, efficiency):
         part()
     names = ("imulab", "numpy", "scipy", "polars")
     lines = [
@@ -156,8 +186,7 @@ def main() -> None:
         "|---|---|---|",
         *(f"| {what} | {found} | {asked} |" for what, found, asked in ROWS),
         "",
-        "Accuracy is measured by the tests: `make test-all` checks, over 5,000 trials a case, the rms error of each",
-        "parameter against the Cramér-Rao bound and the coverage of the 95 % intervals.",
+        "Ratios to the bound are of 2,000 trials, known to 1.6 % each; `make test-all` pins them at 5,000 trials.",
     ]
     (HERE / "RESULTS.md").write_text("\n".join(lines) + "\n")
 
