@@ -28,14 +28,7 @@ def apply_tumble(record: Calibration, recording: Recording) -> Recording:
         The recording has no accelerometer triad.
     """
     _parameters(record)
-    unit, needed = recording.triad_unit("accel"), str(record.model["output_unit"])
-    try:
-        factor = conversion_factor(unit, needed)
-    except UnitError:
-        raise UnitError(
-            f"{recording.name}: columns accel_x accel_y accel_z are in {unit}, "
-            f"but the record calibrates outputs in {needed}"
-        ) from None
+    factor = output_factor(recording.name, "accel", recording.triad_unit("accel"), str(record.model["output_unit"]))
     force = specific_force(record, recording.triad("accel") * factor)
     names = [f"accel_{axis}" for axis in AXES]
     corrected = recording.with_columns(
@@ -48,14 +41,8 @@ def apply_tumble(record: Calibration, recording: Recording) -> Recording:
 
 def _apply_gyro(record: Calibration, recording: Recording, force: Array) -> Recording:
     """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s."""
-    unit, needed = recording.triad_unit("gyro"), str(record.model["gyro_output_unit"])
-    try:
-        factor = conversion_factor(unit, needed)
-    except UnitError:
-        raise UnitError(
-            f"{recording.name}: columns gyro_x gyro_y gyro_z are in {unit}, "
-            f"but the record calibrates outputs in {needed}"
-        ) from None
+    unit = recording.triad_unit("gyro")
+    factor = output_factor(recording.name, "gyro", unit, str(record.model["gyro_output_unit"]))
     rate = body_rate(record, recording.triad("gyro") * factor, force)
     kept = unit if parse_unit(unit).quantity == "rate" else "rad/s"
     names = [f"gyro_{axis}" for axis in AXES]
@@ -63,6 +50,23 @@ def _apply_gyro(record: Calibration, recording: Recording, force: Array) -> Reco
         {name: from_si(np.ascontiguousarray(rate[:, i]), kept) for i, name in enumerate(names)},
         dict.fromkeys(names, kept),
     )
+
+
+def output_factor(name: str, sensor: str, unit: str, needed: str) -> float:
+    """Return the factor from a triad's unit to the unit of the outputs that a record calibrates.
+
+    Raises
+    ------
+    UnitError
+        There is none; the message names the recording and both units.
+    """
+    try:
+        return conversion_factor(unit, needed)
+    except UnitError:
+        raise UnitError(
+            f"{name}: columns {' '.join(f'{sensor}_{axis}' for axis in AXES)} are in {unit}, "
+            f"but the record calibrates outputs in {needed}"
+        ) from None
 
 
 def body_rate(record: Calibration, output: Array, force: Array) -> Array:

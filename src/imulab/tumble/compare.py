@@ -8,11 +8,10 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
-from imulab.errors import RecordError, UnitError
+from imulab.errors import RecordError
 from imulab.estimate import chi_square_probability, coverage_factor
 from imulab.recording import Array
-from imulab.tumble.apply import specific_force
-from imulab.units import conversion_factor
+from imulab.tumble.apply import output_factor, specific_force
 
 _FALSE_ALARM = 0.05
 
@@ -66,13 +65,7 @@ def check_tumble(record: Calibration, attitudes: Attitudes, *, limit: float, gra
     """
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")
-    try:
-        factor = conversion_factor(attitudes.unit, str(record.model["output_unit"]))
-    except UnitError:
-        raise UnitError(
-            f"{attitudes.recording.name}: columns accel_x accel_y accel_z are in {attitudes.unit}, "
-            f"but the record calibrates outputs in {record.model['output_unit']}"
-        ) from None
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
     force = specific_force(record, attitudes.mean * factor)
     local = float(record.model["gravity"]["value"]) if gravity is None else gravity
     return Check(np.linalg.norm(force, axis=1) - local, limit)

@@ -24,8 +24,8 @@ from imulab.errors import DataError, ObservabilityError, OptionError, RecordErro
 from imulab.estimate import Observability, covariance, f_test, levenberg_marquardt, observability
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rotation import Turns, weighted_turns
-from imulab.tumble.apply import specific_force
-from imulab.units import conversion_factor, parse_unit, to_si
+from imulab.tumble.apply import output_factor, specific_force
+from imulab.units import parse_unit, to_si
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
 SENSITIVITIES = ("auto", "yes", "no")
@@ -154,7 +154,7 @@ def fit_gyro(
     unit = recording.triad_unit("gyro")
     check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
     time, output = check_time(recording), recording.triad("gyro")
-    factor = conversion_factor(attitudes.unit, str(record.model["output_unit"]))
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
     force = specific_force(record, attitudes.mean * factor)
     rest = _at_rest(attitudes, time, output, force, sensitivity, recording.name)
     moving = _force_at(record, attitudes.recording, time, factor) if rest.slope is not None else None
