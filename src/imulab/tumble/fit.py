@@ -104,7 +104,9 @@ def fit_tumble(
     DataError
         The attitudes cannot be those of an accelerometer triad in the given unit.
     OptionError
-        An option has an unknown value.
+        An option has an unknown value, or does not go with another.
+    RecordError
+        The prior lacks a parameter, or has outputs in another unit.
     """
     _check_options(order, method, loss)
     local = _gravity(gravity)

@@ -31,7 +31,8 @@ _MISALIGNMENT_CHANGE = 3 / 3600 * np.pi / 180
 _LINEARISED_PASSES = 50
 _REWEIGHTING_PASSES = {False: 4, True: 30}
 _WEIGHTS_AT_REST = 1e-4
-_WORST_DEFLECTION = 0.98
+_DIVERGED = 0.98
+"""A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
 _REFIT_AT_MOST = 150
 
 
@@ -135,8 +136,8 @@ def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.i
     """Fit |f| = 1 by weighted least squares, or with Huber's loss.
 
     Weights are ``1 / (q' C q)``, q = d|f|/dM: each attitude's own noise along its own vertical. They and the
-    lengthening of |f| by noise across it are recomputed at the solution and the fit repeated, twice, or until Huber's
-    weights rest.
+    lengthening of |f| by noise across it are recomputed at the solution and the fit is repeated until they rest (at
+    most 4 passes, 30 with Huber's loss).
 
     Parameters
     ----------
@@ -343,7 +344,7 @@ def _linearised_iteration(problem: Problem, variance: Array, name: str) -> tuple
         bias = bias + change[0]
         scale = scale * (1 + change[1])
         misalignment = misalignment + solution[3 * (order + 1) :]
-        if not (np.abs(change[:2]).max() < _WORST_DEFLECTION and np.isfinite(solution).all()):
+        if not (np.abs(change[:2]).max() < _DIVERGED and np.isfinite(solution).all()):
             break
         if (
             np.abs(change[1]).max() < _SCALE_CHANGE
