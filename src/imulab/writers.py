@@ -20,8 +20,8 @@ _ROW_GROUP = 1 << 18
 def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
     """Write a recording, or its consecutive blocks, as native CSV or Parquet by the ending of the name.
 
-    Numbers read back exactly; columns keep their names, order and units; metadata becomes head comments ``# key: value``
-    or Parquet metadata. The file is written whole or not at all.
+    Numbers read back exactly; columns keep their names, order and units; metadata becomes head comments
+    ``# key: value`` or Parquet metadata. The file is written whole or not at all.
 
     Raises
     ------
@@ -30,9 +30,7 @@ def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
     """
     kind = Path(path).suffix.lower()
     if kind not in (".csv", ".parquet"):
-        raise OptionError(
-            f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet"
-        )
+        raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet")
     with replacing(path) as stream:
         (write_csv_to if kind == ".csv" else write_parquet_to)(blocks, stream)
 
@@ -47,9 +45,7 @@ def check_writable(path: str) -> None:
     """
     kind = Path(path).suffix.lower()
     if kind not in (".csv", ".parquet"):
-        raise OptionError(
-            f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet"
-        )
+        raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet")
     if kind == ".parquet":
         _pyarrow()
 

@@ -28,7 +28,7 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
     for column, entry in layout.columns.items():
         if not isinstance(entry.origin, str):
             raise ReadError(
-                f"{name}: {layout.name} takes {column} from column {entry.origin}; in a {kind} file columns have names: "
+                f"{name}: {layout.name} takes {column} from column {entry.origin}; in a {kind} file they have names: "
                 f'from = "variable" or "group/dataset", with [0] behind it for a column of a matrix'
             )
         match = _INDEXED.fullmatch(entry.origin)
@@ -70,7 +70,9 @@ def sliced(
     if len(shape) != 2:
         raise ReadError(f"{where}: expected a vector or a matrix, found an array of {' x '.join(map(str, shape))}")
     if number is None:
-        raise ReadError(f"{where}: a matrix of {' x '.join(map(str, shape))}; say which column, with [0] behind its name")
+        raise ReadError(
+            f"{where}: a matrix of {' x '.join(map(str, shape))}; say which column, with [0] behind its name"
+        )
     rows, columns = (shape[1], shape[0]) if by_rows else shape
     if number >= columns:
         raise ReadError(f"{where}: column {number} of a matrix with {columns} columns (counted from 0)")

@@ -51,7 +51,9 @@ _FIELDS = {
     "ACC": ("AccX", "AccY", "AccZ"),
     "GYR": ("GyrX", "GyrY", "GyrZ"),
 }
-_NAME = re.compile(r"(IMU|ACC|GYR)([1-9]?)")  # before ArduPilot 4.1 each instance had its own message: IMU, IMU2, ACC1 ...
+_NAME = re.compile(
+    r"(IMU|ACC|GYR)([1-9]?)"
+)  # before ArduPilot 4.1 each instance had its own message: IMU, IMU2, ACC1 ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,7 +49,9 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             while isinstance(array, np.ndarray) and array.dtype == object and array.size == 1:
                 array = array.ravel()[0]
         if not isinstance(array, np.ndarray) or array.dtype.names:
-            raise ReadError(f"{where}: expected numbers, found {'a struct' if hasattr(array, 'dtype') else type(array).__name__}")
+            raise ReadError(
+                f"{where}: expected numbers, found {'a struct' if hasattr(array, 'dtype') else type(array).__name__}"
+            )
         lengths[column], rows = sliced(array.shape, number, False, where)
         take[column] = partial(_floats, rows, array, where)
     yield from recordings(take, lengths, layout, name)

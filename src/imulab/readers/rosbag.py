@@ -1,9 +1,9 @@
 """sensor_msgs/Imu (and Temperature) out of ROS 1 bags, MCAP and ROS 2 sqlite files.
 
 The payloads of a topic have a fixed size, so that a NumPy view reads thousands at once. Sources: the definitions of
-sensor_msgs/Imu and std_msgs/Header; OMG DDS-XTypes 1.3, 7.4 (plain CDR: little or big endian, doubles aligned to 8 bytes
-behind a head of 4); ROS wiki "Messages" (ROS 1: little endian, not aligned). A covariance of -1 at its first place, or a
-reading of NaN, says that a quantity is not reported.
+sensor_msgs/Imu and std_msgs/Header; OMG DDS-XTypes 1.3, 7.4 (plain CDR: little or big endian, doubles aligned to 8
+bytes behind a head of 4); ROS wiki "Messages" (ROS 1: little endian, not aligned). A covariance of -1 at its first
+place, or a reading of NaN, says that a quantity is not reported.
 """
 
 from __future__ import annotations
@@ -58,9 +58,16 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
             raise ReadError(f"{name}: {chosen[0]} reports neither specific force nor rate (covariance -1 or nan)")
         taken = [slice(0 if there[0] else 3, 6 if there[1] else 3)]
         streams = [
-            Stream("accelerometer" if there[0] else "gyroscope", {**(_ACCEL if there[0] else {}), **(_GYRO if there[1] else {})})
+            Stream(
+                "accelerometer" if there[0] else "gyroscope",
+                {**(_ACCEL if there[0] else {}), **(_GYRO if there[1] else {})},
+            )
         ]
-        notes += [f"{chosen[0]} does not report the {what}" for what, is_there in zip(("accelerometer", "gyroscope"), there, strict=True) if not is_there]
+        notes += [
+            f"{chosen[0]} does not report the {what}"
+            for what, is_there in zip(("accelerometer", "gyroscope"), there, strict=True)
+            if not is_there
+        ]
     if warm is not None:
         taken.append(slice(0, 1))
         streams.append(Stream("temperature", {"temperature": "degC"}, slow=True))

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
@@ -285,7 +285,7 @@ class Sqlite:
             keys = np.array([number for number, _ in rows], dtype=np.int64)
             yield logs.Records(b"".join(data for _, data in rows), offsets, sizes, keys)
 
-    def _query(self, text: str) -> Iterator[list[tuple[int, ...]]]:
+    def _query(self, text: str) -> Iterator[list[tuple[Any, ...]]]:
         try:
             connection = sqlite3.connect(f"{self._path.resolve().as_uri()}?immutable=1", uri=True)
             try:
@@ -333,9 +333,7 @@ def _text(path: Path) -> str:
 
 
 def _kept(records: logs.Records, indices: logs.Integers) -> logs.Records:
-    return logs.Records(
-        records.block, records.offsets[indices], records.sizes[indices], records.keys[indices] >> 8
-    )
+    return logs.Records(records.block, records.offsets[indices], records.sizes[indices], records.keys[indices] >> 8)
 
 
 def _decompressed(data: bytes, method: str, size: int, name: str, where: str) -> bytes:

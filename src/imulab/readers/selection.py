@@ -78,4 +78,6 @@ def windowed(
         if found and finite.size and finite.min() > last:
             break
     if not found:
-        raise OptionError(f"{name}: nothing in the window {first:g} to {last:g} s; the file runs from {low:g} to {high:g} s")
+        raise OptionError(
+            f"{name}: nothing in the window {first:g} to {last:g} s; the file runs from {low:g} to {high:g} s"
+        )

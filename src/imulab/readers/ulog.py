@@ -165,8 +165,10 @@ def _choose(
         if contents.counts.get(number) and title in _TOPICS
     }
     if not there:
-        found = sorted({contents.subscriptions[n][0] for n in contents.counts if n in contents.subscriptions})
-        raise ReadError(f"{name}: no {' '.join(_TOPICS[:2])} or {_TOPICS[2]}; topics found: {' '.join(found) or 'none'}")
+        others = sorted({contents.subscriptions[n][0] for n in contents.counts if n in contents.subscriptions})
+        raise ReadError(
+            f"{name}: no {' '.join(_TOPICS[:2])} or {_TOPICS[2]}; topics found: {' '.join(others) or 'none'}"
+        )
     titles = {title for title, _ in there}
     wanted = [topic] if topic else [t for t in _TOPICS[:2] if t in titles] or ["sensor_combined"]
     if wanted == ["sensor_accel"] and "sensor_gyro" in titles:
