@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from imulab.tumble.fit import TumbleFit as TumbleFit
     from imulab.tumble.fit import fit_tumble as fit_tumble
     from imulab.tumble.simulate import simulate_tumble as simulate_tumble
+    from imulab.writers import write as write
     from imulab.writers import write_csv as write_csv
 
 _HOME = {
@@ -58,6 +59,7 @@ _HOME = {
     "read": "readers",
     "read_blocks": "readers",
     "simulate_tumble": "tumble.simulate",
+    "write": "writers",
     "write_csv": "writers",
     "write_report": "present",
 }

@@ -249,6 +249,15 @@ def array_stream(method: str = "robust", elements: int = 0, axes: int = 1, **set
     return Stream(ArraySettings(method, elements, axes, **settings))
 
 
+def fuse_table(table: Table, readings: Array) -> Array:
+    """Return the rates (m, axes) of readings (m, axes * elements) fused from the start by an array's table."""
+    unit = _runtime.load(pack([table], 8))
+    rate = np.empty((len(readings), table.columns["axes"]))
+    block = np.ascontiguousarray(readings, dtype=np.float64)
+    _runtime.array_block(unit, _runtime.array_start(unit), block, None, rate, None, None)
+    return rate
+
+
 def array_table(settings: ArraySettings) -> Table:
     """Return the table of an array's settings.
 
@@ -305,8 +314,8 @@ def array_table(settings: ArraySettings) -> Table:
         "weight": _shaped(s.weights, (axes, n), "weights"),
         "gain": _shaped(s.gain, (axes, n + 1, n), "gain"),
     }
-    fields = [Field(name, np.array([value], dtype=np.int64)) for name, value in words.items()]
-    fields += [Field(name, np.array([value], dtype=np.float64)) for name, value in numbers.items()]
+    fields = [Field(name, np.array(value, dtype=np.int64)) for name, value in words.items()]
+    fields += [Field(name, np.array(value, dtype=np.float64)) for name, value in numbers.items()]
     fields += [Field(name, values, pointed=True) for name, values in pointed.items()]
     return Table("array", tuple(fields), {"elements": n, "axes": axes, "method": s.method})
 

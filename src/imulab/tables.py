@@ -31,7 +31,10 @@ _AXES = "xyz"
 
 @dataclass(frozen=True)
 class Field:
-    """One member of a C struct: whole numbers, real numbers, or real numbers that the struct points to (None: NULL)."""
+    """One member of a C struct: whole or real numbers, of shape () for a scalar, or real numbers that it points to.
+
+    None stands for NULL.
+    """
 
     name: str
     values: NDArray[Any] | None
@@ -182,7 +185,7 @@ def _centrifuge(record: Calibration) -> tuple[Table, ...]:
         "centrifuge",
         (
             Field("has", np.array([axis in axes for axis in "xy"], dtype=np.int64)),
-            Field("highest", np.array([highest])),
+            Field("highest", np.array(highest)),
             *(Field(name.lower(), both(name)) for name in ("K0", "c1", "c2")),
             Field("cosine", np.cos(both("direction"))),
             Field("sine", np.sin(both("direction"))),
@@ -228,9 +231,9 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
         Field("temperatures", _whole(len(temperatures))),
         Field("axes", _whole(len(axes))),
         Field("terms", _whole(terms)),
-        Field("settling_time", np.array([float(table["settling_time"])])),
-        Field("taper_time", np.array([float(table.get("taper_time") or 0.0)])),
-        Field("time_scale", np.array([float(table.get("time_scale") or 0.0)])),
+        Field("settling_time", np.array(float(table["settling_time"]))),
+        Field("taper_time", np.array(float(table.get("taper_time") or 0.0))),
+        Field("time_scale", np.array(float(table.get("time_scale") or 0.0))),
         Field("time_constant", constants),
         Field("temperature", temperatures, pointed=True),
         Field("coefficient", coefficients, pointed=True),
@@ -243,7 +246,7 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
 
 
 def _whole(value: int) -> NDArray[np.int64]:
-    return np.array([int(value)], dtype=np.int64)
+    return np.array(int(value), dtype=np.int64)
 
 
 def _each(record: Calibration, name: str, places: Sequence[str], unit: str) -> Array:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import records, tumble
+from imulab.cli import convert, export, records, tumble
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -24,6 +24,8 @@ def command() -> Any:
         tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
     )
     records.add_commands(app)
+    app.command("convert")(convert.convert)
+    app.command("export")(export.export)
     return typer.main.get_command(app)
 
 

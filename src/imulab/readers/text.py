@@ -26,11 +26,11 @@ _LONGEST_LINE = 1 << 20
 class TextFile:
     """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
 
-    def __init__(self, stream: BinaryIO, name: str, layout: Layout | None) -> None:
+    def __init__(self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True) -> None:
         self._stream = stream
         self._name = name
         self._layout = layout
-        self._hash = hashlib.sha256()
+        self._hash = hashlib.sha256() if hashed else None
         self._rest = b""
         self._ended = False
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
@@ -51,7 +51,13 @@ class TextFile:
 
     def sha256(self) -> str:
         """Return the SHA-256 of the bytes read so far, hexadecimal."""
-        return self._hash.hexdigest()
+        return self._hash.hexdigest() if self._hash else ""
+
+    def drain(self) -> None:
+        """Read on to the end, so that the hash is that of the whole file."""
+        while not self._ended:
+            self._read_more()
+            self._rest = b""
 
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
@@ -74,7 +80,8 @@ class TextFile:
         except OSError as error:
             raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
         self._ended = not data
-        self._hash.update(data)
+        if self._hash:
+            self._hash.update(data)
         self._rest += data
 
     def _next_lines(self) -> bytes | None:
