@@ -35,7 +35,9 @@ docs: $(STAMP) $(VENV)/.docs
 clean:
 	rm -rf $(VENV) demo docs/_build build dist
 
-$(STAMP): pyproject.toml CMakeLists.txt src/imulab/readers/_text.c
+C_SOURCES := src/imulab/readers/_text.c src/imulab/_runtime.c $(wildcard runtime/*.[ch])
+
+$(STAMP): pyproject.toml CMakeLists.txt $(C_SOURCES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imulab needs Python 3.11 or later")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'

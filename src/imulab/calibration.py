@@ -26,6 +26,7 @@ from imulab.recording import Source
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
+BLOB_MAGIC = b"\x89IMULAB\n"
 PROCEDURES = ("tumble", "gyro_array", "warmup", "centrifuge")
 
 
@@ -118,7 +119,7 @@ class Calibration:
             **self.sections,
             "data": self.data,
         }
-        plain: dict[str, Any] = _plain(content, "")
+        plain: dict[str, Any] = plain_values(content, "")
         return {**plain, "content_sha256": content_sha256(plain)}
 
     def to_json(self) -> str:
@@ -164,6 +165,11 @@ def load(path: str | Path) -> Calibration:
 
 def loads(data: bytes, name: str) -> Calibration:
     """Read a calibration record from the bytes of its file; errors as for `load`."""
+    if data.startswith(BLOB_MAGIC):
+        raise RecordError(
+            f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
+            "was made from (show, apply and array fuse take blobs)"
+        )
     try:
         content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
@@ -244,7 +250,7 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
     return record
 
 
-def _plain(value: Any, where: str) -> Any:
+def plain_values(value: Any, where: str) -> Any:
     """Return `value` as plain JSON types; refuse numbers that are not finite."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
@@ -253,9 +259,9 @@ def _plain(value: Any, where: str) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise RecordError(f"record: {where.lstrip('.')} is {value}; a record holds finite numbers only")
     if isinstance(value, Mapping):
-        return {str(key): _plain(item, f"{where}.{key}") for key, item in value.items()}
+        return {str(key): plain_values(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(item, f"{where}[{index}]") for index, item in enumerate(value)]
+        return [plain_values(item, f"{where}[{index}]") for index, item in enumerate(value)]
     return value
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator
 from itertools import chain
+from json import dumps
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,6 +14,7 @@ from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, check
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
+    from imulab.blob import Blob
     from imulab.calibration import Calibration
     from imulab.recording import Recording
 
@@ -30,7 +32,7 @@ def apply(
 ) -> None:
     """Correct a recording by one or more records, in the order given; native CSV to OUT or standard output."""
     from imulab.applying import apply_blocks
-    from imulab.calibration import load
+    from imulab.blob import load_any
     from imulab.readers import read_blocks
     from imulab.writers import write_csv, write_csv_to
 
@@ -38,7 +40,7 @@ def apply(
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
     *names, file = files
     check_outputs([output], files)
-    records = [load(name) for name in names]
+    records = [load_any(name) for name in names]
     blocks = apply_blocks(records, _warned(records, read_blocks(file, layout)))
     if output:
         write_csv(blocks, output)
@@ -49,16 +51,16 @@ def apply(
         sys.stdout.buffer.flush()
 
 
-def _warned(records: list[Calibration], blocks: Iterable[Recording]) -> Iterator[Recording]:
+def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say at the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.applying import beyond_test_of, warnings_of
+    from imulab.applying import beyond_test_of, identity, warnings_of
     from imulab.units import from_si
 
     count, largest, name = 0, 0.0, ""
     for number, block in enumerate(blocks):
         if number == 0:
             messages = [message for record in records for message in warnings_of(record, block)]
-            if len({record.to_dict()["content_sha256"] for record in records}) < len(records):
+            if len({identity(record) for record in records}) < len(records):
                 messages.append("the same record is applied twice")
             for message in dict.fromkeys(messages):
                 warn(message)
@@ -84,10 +86,15 @@ def show(
         _show_changes(*files, json=json)
         return
     (file,) = files
+    from imulab.blob import is_blob, load_blob
     from imulab.calibration import load
-    from imulab.cli.show import describe_record, describe_recording
+    from imulab.cli.show import describe_blob, describe_record, describe_recording
     from imulab.readers import read
 
+    if layout is None and is_blob(file):
+        blob = load_blob(file)
+        print(dumps(blob.text, indent=1, ensure_ascii=False) if json else describe_blob(blob))
+        return
     if layout is None and is_json(file):
         record = load(file)
         print(record.to_json().rstrip("\n") if json else describe_record(record))
@@ -106,7 +113,6 @@ def _show_changes(first: str, second: str, *, json: bool) -> None:
     comparison = compare_records(*records)
     if json:
         from dataclasses import asdict
-        from json import dumps
 
         print(dumps(asdict(comparison), indent=1))
         return

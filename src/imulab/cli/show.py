@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.blob import Blob
 from imulab.calibration import Calibration
 from imulab.exhibit import Table
 from imulab.present import exhibits_of
@@ -29,6 +30,21 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
         lines += [f"source {source.file} SHA-256 {source.sha256}" for source in record.sources]
         lines += [f"warning: {message}" for message in record.warnings]
     return "\n".join(lines).rstrip()
+
+
+def describe_blob(blob: Blob) -> str:
+    """Return what a blob holds: its unit, its size, and the columns and units of each section."""
+    serial = blob.text["sensor"].get("serial", "a unit without serial number")
+    lines = [f"blob of {serial}: {len(blob.data)} bytes, float numbers, written by {blob.text['software']}"]
+    for section in blob.text["sections"]:
+        about = ", ".join(f"{key} {_joined(value)}" for key, value in section.items() if key != "kind")
+        lines.append(f"  {section['kind']}: {about}")
+    lines += [f"record SHA-256 {digest}" for digest in blob.text["records"]]
+    return "\n".join(lines)
+
+
+def _joined(value: object) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def describe_changes(first: str, second: str, comparison: Comparison, output: str) -> str:

@@ -1,0 +1,296 @@
+/* Gyro array: the plain methods, and the frame that all methods share. The robust method is in robust.c. */
+#include "array.h"
+
+/* A reading may come with an alignment of its element over the axes; then one lost axis loses all. */
+static void aligned(const il_array *a, const il_real *reading, il_real *z) {
+    int32_t n = a->elements;
+    for (int32_t i = 0; i < n * a->axes; i++) z[i] = a->offset != NULL ? reading[i] - a->offset[i] : reading[i];
+    if (a->matrix == NULL) return;
+    for (int32_t i = 0; i < n; i++) {
+        const il_real *m = a->matrix + i * a->axes * a->axes;
+        il_real out[3] = {IL_C(0.0), IL_C(0.0), IL_C(0.0)};
+        for (int32_t r = 0; r < a->axes; r++) {
+            for (int32_t c = 0; c < a->axes; c++) out[r] += m[r * a->axes + c] * z[c * n + i];
+        }
+        for (int32_t r = 0; r < a->axes; r++) z[r * n + i] = out[r];
+    }
+}
+
+il_real il_array_gain(const il_array *a, uint32_t k) {
+    return a->memory > IL_C(0.0) ? a->memory : IL_C(1.0) / (il_real)k;
+}
+
+/* Mean of the finite readings; flags those that are not, and counts the others. */
+static il_real finite_mean(const il_array *a, il_array_axis *s, const il_real *z, int32_t *count) {
+    il_real sum = IL_C(0.0);
+    *count = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        int fine = il_finite(z[i]);
+        s->flags[i] = fine ? 0 : (uint8_t)(IL_NOT_FINITE | IL_EXCLUDED);
+        if (fine) {
+            sum += z[i];
+            ++*count;
+        }
+    }
+    return *count > 0 ? sum / (il_real)*count : il_nan();
+}
+
+/* Sum of weight times value over the finite readings, their weights made to sum to one and kept. */
+static il_real weighted(const il_array *a, il_array_axis *s, const il_real *z) {
+    il_real total = IL_C(0.0), sum = IL_C(0.0);
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (s->flags[i]) s->weight[i] = IL_C(0.0);
+        total += s->weight[i];
+    }
+    if (total == IL_C(0.0)) return il_nan();
+    for (int32_t i = 0; i < a->elements; i++) {
+        s->weight[i] /= total;
+        if (!s->flags[i]) sum += s->weight[i] * z[i];
+    }
+    return sum;
+}
+
+static il_real mean_step(const il_array *a, il_array_axis *s, const il_real *z) {
+    int32_t count;
+    il_real mean = finite_mean(a, s, z, &count);
+    for (int32_t i = 0; i < a->elements; i++) s->weight[i] = s->flags[i] ? IL_C(0.0) : IL_C(1.0) / (il_real)count;
+    return mean;
+}
+
+/* Support degree: a reading weighs as much as the others support it, by a kernel of the distance of each pair, in
+ * units of the root mean square distance so far. */
+static il_real support_step(const il_array *a, il_array_axis *s, const il_real *z) {
+    int32_t n = a->elements, count;
+    il_real sum = IL_C(0.0);
+    finite_mean(a, s, z, &count);
+    for (int32_t i = 0; i < n; i++) {
+        s->weight[i] = IL_C(0.0);
+        for (int32_t j = 0; j < i; j++) sum += s->flags[i] | s->flags[j] ? IL_C(0.0) : (z[i] - z[j]) * (z[i] - z[j]);
+    }
+    if (count > 1) {
+        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : il_array_gain(a, s->seen[0] + a->start);
+        s->spread += gain * (sum / ((il_real)count * (il_real)(count - 1) / IL_C(2.0)) - s->spread);
+        il_count(&s->seen[0]);
+    }
+    il_real scale = s->spread > IL_C(0.0) ? IL_C(1.0) / s->spread : IL_C(0.0);
+    for (int32_t i = 0; i < n; i++) {
+        for (int32_t j = 0; j < i; j++) {
+            if (s->flags[i] | s->flags[j]) continue;
+            il_real square = (z[i] - z[j]) * (z[i] - z[j]) * scale;
+            il_real kernel = a->kernel == IL_GAUSSIAN ? il_exp(-square / IL_C(2.0)) : il_exp(-il_sqrt(square));
+            s->weight[i] += kernel;
+            s->weight[j] += kernel;
+        }
+    }
+    if (count == 1) return mean_step(a, s, z);
+    return weighted(a, s, z);
+}
+
+/* Inverse-variance weights, the variance of each gyro about the mean of the array. */
+static il_real least_squares_step(const il_array *a, il_array_axis *s, const il_real *z) {
+    int32_t count;
+    il_real mean = finite_mean(a, s, z, &count);
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!s->flags[i] && count > 1) {
+            uint32_t k = s->seen[i] + a->start;
+            il_real gain = s->seen[i] == 0 ? IL_C(1.0) : il_array_gain(a, k), residual = z[i] - mean - s->bias[i];
+            s->bias[i] += gain * residual;
+            s->variance[i] += gain * ((IL_C(1.0) - gain) * residual * residual - s->variance[i]);
+            il_count(&s->seen[i]);
+        }
+        /* equal weights until every variance rests on two residuals */
+        s->weight[i] = s->count < a->start + 2 ? IL_C(1.0) : IL_C(1.0) / (s->variance[i] + IL_TINY);
+    }
+    return weighted(a, s, z);
+}
+
+static il_real fixed_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+    int32_t count;
+    finite_mean(a, s, z, &count);
+    for (int32_t i = 0; i < a->elements; i++) s->weight[i] = a->weight[axis * a->elements + i];
+    return weighted(a, s, z);
+}
+
+/* Bias at the first sample, for the methods that estimate one. */
+static il_real start_bias(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+    int32_t n = a->elements;
+    il_real sum = IL_C(0.0), fused = IL_C(0.0);
+    for (int32_t i = 0; i < n; i++) sum += z[i];
+    for (int32_t i = 0; i < n; i++) {
+        s->bias[i] = IL_C(0.0);
+        if (a->initial == IL_FIRST) s->bias[i] = z[i] - sum / (il_real)n;
+        if (a->initial == IL_GIVEN) s->bias[i] = a->bias[axis * n + i];
+        s->weight[i] = IL_C(1.0) / (il_real)n;
+        fused += z[i] - s->bias[i];
+    }
+    return fused / (il_real)n;
+}
+
+/* The recursion of CN109443333B, to the letter: it has no defence against readings that are no numbers.
+ *   b = (1-g) b + g (Z - Zr'),  Y = Z - b,  D = (1-g) D + g (Y - Zr')^2,  Zr = sum Y/D / sum 1/D,  Zr' one sample old */
+static inline il_real feedback_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+    int32_t n = a->elements;
+    if (s->count == a->start) return start_bias(a, s, z, axis);
+    il_real gain = il_array_gain(a, s->count), keep = IL_C(1.0) - gain, before = s->rate;
+    il_real total = IL_C(0.0), sum = IL_C(0.0);
+    for (int32_t i = 0; i < n; i++) {
+        il_real b = keep * s->bias[i] + gain * (z[i] - before), y = z[i] - b, error = y - before;
+        il_real d = keep * s->variance[i] + gain * (error * error);
+        il_real share = IL_C(1.0) / (d < IL_TINY ? IL_TINY : d);
+        s->bias[i] = b;
+        s->variance[i] = d;
+        s->weight[i] = share;
+        total += share;
+        sum += share * y;
+    }
+    return sum / total;
+}
+
+/* Virtual gyro: state (rate, bias_1 .. bias_n), a random walk each, with the steady-state gain. */
+static il_real kalman_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+    int32_t n = a->elements, count;
+    const il_real *gain = a->gain + axis * (n + 1) * n;
+    il_real innovation[IL_ARRAY_ELEMENTS], correction = IL_C(0.0), usual = IL_C(0.0);
+    il_real mean = finite_mean(a, s, z, &count);
+    if (count == 0) return il_nan();
+    if (s->seen[0] == 0) { /* the first sample with a reading starts the filter at the array's mean */
+        s->seen[0] = 1;
+        for (int32_t i = 0; i < n; i++) {
+            s->bias[i] = IL_C(0.0);
+            if (a->initial == IL_FIRST && !s->flags[i]) s->bias[i] = z[i] - mean;
+            if (a->initial == IL_GIVEN) s->bias[i] = a->bias[axis * n + i];
+        }
+        s->filtered = IL_C(0.0); /* apart from s->rate, which is no number while all gyros are lost */
+        for (int32_t i = 0; i < n; i++) s->filtered += s->flags[i] ? IL_C(0.0) : (z[i] - s->bias[i]) / (il_real)count;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        innovation[i] = s->flags[i] ? IL_C(0.0) : z[i] - s->filtered - s->bias[i];
+        usual += innovation[i] / (il_real)count;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        if (s->flags[i]) innovation[i] = usual; /* a missing gyro says what the others say */
+        correction += gain[i] * innovation[i];
+        s->weight[i] = gain[i];
+    }
+    s->filtered += correction;
+    for (int32_t i = 0; i < n; i++) {
+        for (int32_t j = 0; j < n; j++) s->bias[i] += gain[(i + 1) * n + j] * innovation[j];
+    }
+    return s->filtered;
+}
+
+static il_real axis_step(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, int32_t axis) {
+    switch (a->method) {
+        case IL_SUPPORT: return support_step(a, s, z);
+        case IL_LEAST_SQUARES: return least_squares_step(a, s, z);
+        case IL_ROBUST: return il_robust_step(a, s, z, reading);
+        case IL_COVARIANCE: return fixed_step(a, s, z, axis);
+        case IL_KALMAN: return kalman_step(a, s, z, axis);
+        default: return mean_step(a, s, z);
+    }
+}
+
+/* Flags of a feedback sample, and its weights in the sum of one; apart, because its speed is the recursion's. */
+static void feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
+    il_real total = IL_C(0.0);
+    for (int32_t i = 0; i < a->elements; i++) {
+        s->flags[i] = il_finite(z[i]) ? 0 : (uint8_t)IL_NOT_FINITE;
+        total += s->weight[i];
+    }
+    for (int32_t i = 0; i < a->elements; i++) s->weight[i] /= total;
+}
+
+static inline unsigned step(const il_array *a, il_array_state *state, const il_real *reading, il_real *rate,
+                            int want_health) {
+    il_real moved[3 * IL_ARRAY_ELEMENTS];
+    const il_real *z = reading;
+    unsigned flags = 0;
+    if (a->offset != NULL || a->matrix != NULL) {
+        aligned(a, reading, moved);
+        z = moved;
+    }
+    for (int32_t axis = 0; axis < a->axes; axis++) {
+        il_array_axis *s = &state->axis[axis];
+        const il_real *mine = z + axis * a->elements;
+        il_count(&s->count);
+        if (a->method == IL_FEEDBACK) {
+            s->rate = feedback_step(a, s, mine, axis);
+            if (want_health) feedback_health(a, s, mine);
+        } else {
+            s->rate = axis_step(a, s, mine, reading + axis * a->elements, axis);
+        }
+        rate[axis] = s->rate - s->common;
+        if (!il_finite(s->rate)) flags |= IL_NOT_FINITE;
+        if (want_health) {
+            for (int32_t i = 0; i < a->elements; i++) flags |= s->flags[i];
+        }
+    }
+    return flags;
+}
+
+il_status il_array_check(const il_array *a) {
+    int32_t least = a->method == IL_ROBUST ? 3 : 1;
+    if (a->method < 0 || a->method >= IL_METHODS || (a->axes != 1 && a->axes != 3)) return IL_ARGUMENT;
+    if (a->elements < least || a->elements > IL_ARRAY_ELEMENTS || a->start < 1) return IL_ARGUMENT;
+    if (!(a->memory >= IL_C(0.0) && a->memory < IL_C(1.0))) return IL_ARGUMENT;
+    if (a->initial == IL_GIVEN && a->bias == NULL) return IL_ARGUMENT;
+    if (a->method == IL_COVARIANCE && a->weight == NULL) return IL_ARGUMENT;
+    if (a->method == IL_KALMAN && a->gain == NULL) return IL_ARGUMENT;
+    for (int32_t i = 0; a->method == IL_ROBUST && a->weight != NULL && i < a->axes * a->elements; i++) {
+        if (!(a->weight[i] > IL_C(0.0))) return IL_ARGUMENT;
+    }
+    if (a->method == IL_ROBUST && (a->jump < 2 || a->cap < 2 || a->stuck < 2 || a->quiet < 1)) return IL_ARGUMENT;
+    return IL_OK;
+}
+
+il_status il_array_start(const il_array *settings, il_array_state *state) {
+    memset(state, 0, sizeof *state);
+    if (il_array_check(settings) != IL_OK) return IL_ARGUMENT;
+    for (int32_t axis = 0; axis < settings->axes; axis++) {
+        il_array_axis *s = &state->axis[axis];
+        int32_t n = settings->elements;
+        il_real sum = IL_C(0.0);
+        s->count = settings->start - 1;
+        for (int32_t i = 0; i < n; i++) {
+            s->ratio[i] = settings->weight != NULL ? IL_C(1.0) / settings->weight[axis * n + i] : IL_C(1.0);
+            s->bias[i] = settings->initial == IL_GIVEN ? settings->bias[axis * n + i] : IL_C(0.0);
+            sum += s->ratio[i] / (il_real)n;
+        }
+        for (int32_t i = 0; i < n; i++) s->ratio[i] /= sum;
+    }
+    return IL_OK;
+}
+
+unsigned il_array_step(const il_array *settings, il_array_state *state, const il_real *reading, il_real *rate) {
+    return step(settings, state, reading, rate, 1);
+}
+
+void il_array_still(const il_array *settings, il_array_state *state) {
+    for (int32_t axis = 0; axis < settings->axes; axis++) {
+        il_array_axis *s = &state->axis[axis];
+        if (!il_finite(s->rate)) continue;
+        il_count(&s->still);
+        il_real k = (il_real)(s->still < settings->cap || settings->cap == 0 ? s->still : settings->cap);
+        s->common += (s->rate - s->common) / k;
+    }
+}
+
+unsigned il_array_block(const il_array *settings, il_array_state *state, size_t n, const il_real *reading,
+                        const uint8_t *still, il_real *rate, uint8_t *flags, il_real *weight) {
+    const il_array a = *settings; /* a copy cannot alias the samples */
+    size_t width = (size_t)a.axes * (size_t)a.elements, elements = (size_t)a.elements;
+    unsigned all = 0;
+    int want_health = flags != NULL || weight != NULL;
+    for (size_t k = 0; k < n; k++) {
+        /* the last sample leaves flags and weights in the state, as single steps do */
+        all |= step(&a, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
+        if (still != NULL && still[k]) il_array_still(&a, state);
+        for (size_t axis = 0; want_health && axis < (size_t)a.axes; axis++) {
+            const il_array_axis *s = &state->axis[axis];
+            size_t place = k * width + axis * elements;
+            if (flags != NULL) memcpy(flags + place, s->flags, elements);
+            if (weight != NULL) memcpy(weight + place, s->weight, elements * sizeof(il_real));
+        }
+    }
+    return all;
+}

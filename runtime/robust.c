@@ -1,0 +1,435 @@
+/* Gyro array, the robust method: one sample of one axis.
+ *
+ * Residuals are taken against the mean of the same sample, so that motion, which all gyros share, cancels in them; biases
+ * follow the residuals so that their sum, which the array cannot see, never changes. Variances come from the residuals by
+ * the N-cornered hat (Grubbs 1948): of e_i = r_i - mean(r), E e_i^2 = (1 - 2/m) v_i + sum_j v_j / m^2, hence
+ *   v_i = m/(m-2) [e_i^2 - sum_j e_j^2 / (m(m-1))],
+ * averaged sample by sample, which stays right when the set of gyros changes. A gyro's reading counts in the output while it
+ * is inside the gate about the median, and teaches while it is inside the narrower gate of its own noise.
+ */
+#include "array.h"
+
+#if IL_FLOAT
+#define ROUNDING 1e-5f /* of a reading: closer than this, two readings agree */
+#else
+#define ROUNDING 1e-12
+#endif
+#define OWN IL_C(16.0)        /* residuals that the mean variance of the array counts for in each gyro's own */
+#define CALIBRATED IL_C(200.0) /* the same where a calibration says how the variances compare */
+#define DEVIATION IL_C(1.4826) /* median absolute deviation to standard deviation */
+
+enum { STUCK = 1, OUT = 2, FRESH = 4, JUMPED = 8 }; /* standing of a gyro, from sample to sample */
+enum { ENOUGH = 20 };                               /* repeats that nobody takes for chance */
+
+/* One sample at work. */
+typedef struct {
+    uint8_t usable[IL_ARRAY_ELEMENTS], core[IL_ARRAY_ELEMENTS], inside[IL_ARRAY_ELEMENTS];
+    uint8_t learns[IL_ARRAY_ELEMENTS], used[IL_ARRAY_ELEMENTS];
+    il_real r[IL_ARRAY_ELEMENTS];    /* reading less bias */
+    il_real trust[IL_ARRAY_ELEMENTS]; /* variance as far as it can be trusted */
+    il_real half[IL_ARRAY_ELEMENTS];  /* width of the gate */
+    il_real middle;                  /* median of those trusted */
+    il_real mean_variance;
+    uint32_t learnt; /* residuals of the most experienced gyro */
+    int waived;      /* nobody is trusted: the quiet period does not count */
+} sample;
+
+static il_real larger(il_real a, il_real b) {
+    return a > b ? a : b;
+}
+
+static il_real median(il_real *values, int32_t n) {
+    for (int32_t i = 1; i < n; i++) { /* insertion sort: n is small */
+        il_real v = values[i];
+        int32_t j = i;
+        for (; j > 0 && values[j - 1] > v; j--) values[j] = values[j - 1];
+        values[j] = v;
+    }
+    return n % 2 ? values[n / 2] : IL_C(0.5) * (values[n / 2 - 1] + values[n / 2]);
+}
+
+/* Median of the chosen values, and their typical distance from it as a standard deviation. */
+static il_real median_of(int32_t n, const uint8_t *chosen, const il_real *values, il_real *typical) {
+    il_real sorted[IL_ARRAY_ELEMENTS];
+    int32_t count = 0;
+    for (int32_t i = 0; i < n; i++) {
+        if (chosen[i]) sorted[count++] = values[i];
+    }
+    il_real middle = median(sorted, count);
+    for (int32_t i = 0; i < count; i++) sorted[i] = il_fabs(sorted[i] - middle);
+    *typical = DEVIATION * median(sorted, count);
+    return middle;
+}
+
+/* Most of what this gyro taught was wrong: the others settle among themselves, and it starts anew. */
+static void forget(const il_array *a, il_array_axis *s, int32_t i) {
+    il_real sum = IL_C(0.0);
+    int32_t others = 0;
+    for (int32_t j = 0; j < a->elements; j++) {
+        if (j == i || s->seen[j] == 0) continue;
+        sum += s->bias[j];
+        others++;
+    }
+    for (int32_t j = 0; j < a->elements; j++) {
+        if (j != i && s->seen[j] != 0) s->bias[j] -= sum / (il_real)others;
+    }
+    s->bias[i] = s->variance[i] = IL_C(0.0);
+    s->seen[i] = 0;
+}
+
+static void jump(il_array_axis *s, int32_t i) {
+    s->standing[i] |= OUT | FRESH | JUMPED;
+    s->calm[i] = s->away[i] = 0;
+    s->fast[i] = IL_C(0.0);
+}
+
+/* Repeated and missing readings. Returns whether there is anything that needs a closer look. */
+static int examine(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, sample *p) {
+    int closer = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        int fine = il_finite(z[i]);
+        p->usable[i] = (uint8_t)fine;
+        s->flags[i] = fine ? 0 : (uint8_t)IL_NOT_FINITE;
+        closer |= !fine;
+        if (!fine) continue;
+        il_real change = il_fabs(reading[i] - s->last[i]);
+        int same = change == IL_C(0.0) && s->compared[i] > 0;
+        s->repeats[i] = same ? s->repeats[i] + (s->repeats[i] < UINT32_MAX) : 0;
+        if (s->compared[i] > 1 && s->changed[i] == UINT32_MAX) { /* halve both, so that their ratio goes on */
+            s->changed[i] >>= 1;
+            s->compared[i] >>= 1;
+        }
+        if (s->compared[i] > 0 && !same) {
+            s->changed[i]++;
+            if (change < s->resolution || s->resolution == IL_C(0.0)) s->resolution = change;
+        }
+        il_count(&s->compared[i]); /* pairs seen, plus one: 0 means that there is no reading to compare with */
+        s->last[i] = reading[i];
+        closer |= (s->repeats[i] >= a->stuck) | (s->standing[i] & STUCK);
+    }
+    return closer;
+}
+
+static il_real share_changed(const il_array_axis *s, int32_t i) {
+    uint32_t pairs = s->compared[i] > 1 ? s->compared[i] - 1 : 1;
+    return (il_real)s->changed[i] / (il_real)pairs;
+}
+
+/* A gyro is stuck when its readings repeat longer than they usually do while somebody else is alive. */
+static void find_stuck(const il_array *a, il_array_axis *s, sample *p) {
+    il_real shares[IL_ARRAY_ELEMENTS], usual = IL_C(0.0);
+    int32_t alive = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (p->usable[i] && s->repeats[i] < a->stuck) shares[alive++] = share_changed(s, i);
+    }
+    if (alive > 0) usual = median(shares, alive);
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->usable[i]) continue;
+        il_real share = s->changed[i] ? share_changed(s, i) : usual;
+        int stuck = alive > 0 && s->repeats[i] >= a->stuck && (il_real)s->repeats[i] * share >= (il_real)ENOUGH;
+        if (stuck) {
+            s->flags[i] |= IL_STUCK;
+            p->usable[i] = 0;
+            if (!(s->standing[i] & STUCK) && (uint64_t)s->repeats[i] * 2 >= s->seen[i]) forget(a, s, i);
+        }
+        s->standing[i] = (uint8_t)((s->standing[i] & ~STUCK) | (stuck ? STUCK : 0));
+    }
+}
+
+/* Who is trusted in this sample: usable, and not waiting. Newcomers wait. */
+static int32_t roll_call(const il_array *a, il_array_axis *s, sample *p) {
+    int32_t core = 0, usable = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (p->usable[i] && s->seen[i] == 0 && p->learnt > 2 && !(s->standing[i] & FRESH)) {
+            s->standing[i] |= OUT | FRESH;
+            s->calm[i] = 0;
+        }
+        p->core[i] = p->usable[i] && !(s->standing[i] & OUT);
+        core += p->core[i];
+        usable += p->usable[i];
+    }
+    p->waived = core == 0;
+    if (!p->waived) return core;
+    for (int32_t i = 0; i < a->elements; i++) p->core[i] = p->usable[i];
+    return usable;
+}
+
+static il_real mean_variance(const il_array *a, const il_array_axis *s) {
+    il_real sum = IL_C(0.0);
+    int32_t known = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (s->seen[i] < 2) continue;
+        sum += s->variance[i];
+        known++;
+    }
+    return known > 0 ? larger(sum / (il_real)known, IL_C(0.0)) : IL_C(0.0);
+}
+
+/* Residuals that a variance rests on. */
+static il_real weight_of_evidence(const il_array *a, const il_array_axis *s, int32_t i) {
+    il_real count = (il_real)(s->seen[i] < a->cap ? s->seen[i] : a->cap);
+    return a->memory > IL_C(0.0) && count * a->memory > IL_C(1.0) ? IL_C(1.0) / a->memory : count;
+}
+
+/* Variance of a gyro, drawn to the mean of all while it rests on few residuals. */
+static il_real trusted(const il_array *a, const il_array_axis *s, const sample *p, int32_t i) {
+    il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = weight_of_evidence(a, s, i);
+    il_real mixed = (prior * s->ratio[i] * p->mean_variance + count * s->variance[i]) / (prior + count);
+    return larger(larger(mixed, a->weight_floor * p->mean_variance), IL_TINY);
+}
+
+/* Both gates about the median: inside[] counts in the output, learns[] teaches as well. */
+static void gates(const il_array *a, il_array_axis *s, const il_real *z, sample *p, int32_t core) {
+    il_real spread = IL_C(0.0);
+    p->middle = il_nan();
+    if (core > 0) p->middle = median_of(a->elements, p->core, p->r, &spread);
+    for (int32_t i = 0; i < a->elements; i++) {
+        p->inside[i] = p->learns[i] = (uint8_t)(p->usable[i] && core < 3);
+        p->half[i] = IL_C(0.0);
+        if (!p->usable[i] || core < 3) continue;
+        il_real narrow = (core > 3 ? IL_C(30.0) : IL_C(100.0)) * spread; /* three gyros tell little about their noise */
+        if (p->learnt >= 2) {
+            il_real young = IL_C(1.0) + OWN / (il_real)(s->seen[i] > 0 ? s->seen[i] : 1);
+            il_real noise = p->trust[i] + IL_C(2.0) * p->mean_variance / (il_real)core;
+            narrow = a->gate * young * il_sqrt(noise);
+        }
+        /* a coarse gyro, whose variance may still be zero, must be able to toggle; and rounding is no fault */
+        narrow = larger(narrow, IL_C(1.5) * s->resolution);
+        narrow = larger(narrow, ROUNDING * larger(il_fabs(z[i]), il_fabs(p->middle)));
+        p->half[i] = larger(narrow, a->spread_gate * spread);
+        il_real distance = il_fabs(p->r[i] - p->middle);
+        p->learns[i] = distance <= narrow;
+        p->inside[i] = distance <= p->half[i] || (s->standing[i] & FRESH) != 0;
+    }
+}
+
+/* A gyro beyond the gate that stays off by the same amount has jumped. */
+static void follow(const il_array *a, il_array_axis *s, const sample *p, int32_t i) {
+    il_real distance = p->r[i] - p->middle;
+    if (++s->away[i] == 1) {
+        s->away_mean[i] = distance;
+        s->away_square[i] = IL_C(0.0);
+    } else {
+        il_real step = distance - s->away_mean[i];
+        s->away_mean[i] += step / (il_real)s->away[i];
+        s->away_square[i] += step * (distance - s->away_mean[i]);
+    }
+    if (s->away[i] < a->jump) return;
+    il_real scatter = il_sqrt(s->away_square[i] / (il_real)(s->away[i] - 1));
+    if (scatter <= p->half[i] / IL_C(2.0) && il_fabs(s->away_mean[i]) > a->scale_tolerance * il_fabs(p->middle)) {
+        if (s->away[i] >= s->seen[i]) forget(a, s, i);
+        jump(s, i);
+    }
+    s->away[i] = 0;
+}
+
+/* What the sample does to the standing of each gyro. */
+static void judge(const il_array *a, il_array_axis *s, const sample *p) {
+    uint32_t patience = a->quiet / 5 > 0 ? a->quiet / 5 : 1;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->usable[i] || !p->inside[i]) {
+            il_count(&s->bad[i]);
+            s->calm[i] = 0;
+            if (s->bad[i] >= patience || (s->standing[i] & STUCK)) s->standing[i] |= OUT;
+            if (p->usable[i]) {
+                s->flags[i] |= IL_GATED;
+                follow(a, s, p, i);
+                continue;
+            }
+            s->away[i] = 0;
+            s->fast[i] = IL_C(0.0);
+            if (s->standing[i] & STUCK) s->standing[i] &= (uint8_t)~JUMPED;
+            continue;
+        }
+        s->bad[i] = s->away[i] = 0;
+        if (!(s->standing[i] & OUT) || ++s->calm[i] <= a->quiet) continue;
+        if (s->standing[i] & FRESH) {
+            if (s->seen[i] == 0) s->variance[i] = p->mean_variance;
+            if (s->seen[i] < a->quiet) s->seen[i] = a->quiet;
+        }
+        s->standing[i] &= (uint8_t) ~(OUT | FRESH | JUMPED);
+        s->fast[i] = IL_C(0.0);
+    }
+}
+
+/* Inverse-variance weights of the gyros used, none above the cap; two count alike, one passes through. */
+static void weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t used) {
+    il_real total = IL_C(0.0), most = IL_C(0.0);
+    int32_t top = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        s->weight[i] = !p->used[i] ? IL_C(0.0) : used < 3 ? IL_C(1.0) : IL_C(1.0) / p->trust[i];
+        total += s->weight[i];
+        if (s->weight[i] > most) {
+            most = s->weight[i];
+            top = i;
+        }
+    }
+    il_real scale = IL_C(1.0) / total, cap = used < 3 ? IL_C(1.0) : a->weight_cap;
+    for (int32_t i = 0; i < a->elements; i++) s->weight[i] *= scale;
+    if (s->weight[top] <= cap) return;
+    il_real factor = (IL_C(1.0) - cap) / (IL_C(1.0) - s->weight[top]);
+    for (int32_t i = 0; i < a->elements; i++) s->weight[i] = i == top ? cap : s->weight[i] * factor;
+}
+
+/* A jump too small for the gate shows in the mean of a second, where the others' means agree. */
+static void find_small_jumps(const il_array *a, il_array_axis *s, const sample *p) {
+    il_real share = IL_C(1.0) / (IL_C(2.0) * (il_real)a->quiet), largest = IL_C(0.0), smallest = IL_C(-1.0), scatter;
+    il_real least = larger(IL_C(64.0) * share, IL_C(1.0)); /* variances: (8 sqrt(f / 2))^2 */
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->learns[i]) continue;
+        largest = larger(largest, s->fast[i] * s->fast[i]);
+        if (smallest < IL_C(0.0) || p->trust[i] < smallest) smallest = p->trust[i];
+    }
+    /* No two means are further apart than twice the largest; half, because one sample moves a variance a little. */
+    if (IL_C(4.0) * largest <= IL_C(0.5) * least * smallest) return;
+    il_real usual = median_of(a->elements, p->learns, s->fast, &scatter);
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->learns[i] || s->seen[i] < 5 * a->quiet) continue;
+        il_real limit = larger(il_sqrt(least * trusted(a, s, p, i)), IL_C(8.0) * scatter);
+        limit = larger(limit, a->scale_tolerance * il_fabs(p->middle));
+        if (il_fabs(s->fast[i] - usual) > limit) jump(s, i);
+    }
+}
+
+/* Gain of a bias and of a variance after `seen` residuals. */
+static il_real learning_gain(const il_array *a, uint32_t seen) {
+    il_real growing = IL_C(1.0) / (il_real)(seen < a->cap ? seen : a->cap);
+    return a->memory > IL_C(0.0) ? larger(a->memory, IL_C(1.0) / (il_real)seen) : growing;
+}
+
+/* Biases, variances and means of a second take in the sample; learns[] says whose. */
+static void learn(const il_array *a, il_array_axis *s, const sample *p, int32_t pupils) {
+    il_real m = (il_real)pupils, centre = IL_C(0.0), squares = IL_C(0.0), shift = IL_C(0.0), gain = IL_C(0.0);
+    il_real e[IL_ARRAY_ELEMENTS], gains[IL_ARRAY_ELEMENTS], recent = IL_C(1.0) / (il_real)a->quiet;
+    uint32_t known = 0; /* nearly always all gyros have seen the same: one division serves */
+    for (int32_t i = 0; i < a->elements; i++) centre += p->learns[i] ? p->r[i] : IL_C(0.0);
+    centre /= m;
+    for (int32_t i = 0; i < a->elements; i++) {
+        e[i] = gains[i] = IL_C(0.0);
+        if (!p->learns[i]) continue;
+        il_count(&s->seen[i]);
+        if (s->seen[i] != known) {
+            known = s->seen[i];
+            gain = learning_gain(a, known);
+        }
+        e[i] = p->r[i] - centre;
+        gains[i] = gain;
+        squares += e[i] * e[i];
+        /* a start other than 1 is experience in the bias, from the second residual on */
+        il_real bias_gain = gain;
+        if (a->start > 1 && a->memory == IL_C(0.0) && !(known == 1 && a->initial == IL_FIRST)) {
+            bias_gain = learning_gain(a, known > UINT32_MAX - a->start ? known : known + a->start - 1);
+        }
+        s->bias[i] += bias_gain * e[i];
+        shift += bias_gain * e[i];
+    }
+    shift /= m;
+    il_real hat = pupils > 2 ? m / (m - IL_C(2.0)) : IL_C(0.0);
+    squares /= m * (m - IL_C(1.0));
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->learns[i]) continue;
+        s->bias[i] -= shift;
+        if (pupils < 3) continue;
+        il_real grubbs = hat * (e[i] * e[i] - squares);
+        s->variance[i] = (IL_C(1.0) - gains[i]) * (s->variance[i] + gains[i] * grubbs);
+        s->fast[i] = (IL_C(1.0) - recent) * s->fast[i] + recent * e[i];
+    }
+    if (pupils > 2) find_small_jumps(a, s, p);
+}
+
+/* All is well in nearly every sample; then the gates need no median. Of any numbers, the median is no further from the
+ * mean than the root mean square deviation, so that |r - median|^2 <= 2 (e^2 + mean e^2). */
+static int all_inside(const il_array *a, const il_array_axis *s, sample *p) {
+    il_real n = (il_real)a->elements, sum = IL_C(0.0), squares = IL_C(0.0), gate = a->gate * a->gate;
+    int out = p->learnt < 2;
+    uint32_t trouble = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        sum += p->r[i];
+        trouble |= s->standing[i] | s->bad[i] | (uint32_t)(s->seen[i] == 0);
+    }
+    if (out | (trouble != 0)) return 0;
+    p->middle = sum / n; /* stands for the median where only its size matters */
+    for (int32_t i = 0; i < a->elements; i++) {
+        il_real e = p->r[i] - p->middle;
+        squares += e * e;
+    }
+    squares /= n;
+    il_real extra = IL_C(2.0) * p->mean_variance / n;
+    for (int32_t i = 0; i < a->elements; i++) {
+        il_real e = p->r[i] - p->middle;
+        out |= IL_C(2.0) * (e * e + squares) > gate * (p->trust[i] + extra);
+    }
+    return !out;
+}
+
+/* The long way: who is trusted, who is inside, who is used, who teaches. Returns the number used. */
+static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, sample *p) {
+    int32_t used = 0, nearest = -1;
+    gates(a, s, z, p, roll_call(a, s, p));
+    judge(a, s, p);
+    for (int32_t i = 0; i < a->elements; i++) {
+        int here = p->waived ? p->core[i] : p->usable[i] && !(s->standing[i] & OUT);
+        p->used[i] = (uint8_t)(here && p->inside[i]);
+        p->trust[i] = trusted(a, s, p, i);
+        used += p->used[i];
+        if (!p->core[i]) continue;
+        if (nearest < 0 || il_fabs(p->r[i] - p->middle) < il_fabs(p->r[nearest] - p->middle)) nearest = i;
+    }
+    if (used == 0 && nearest >= 0) { /* rather the most central one than none */
+        p->used[nearest] = 1;
+        used = 1;
+    }
+    for (int32_t i = 0; i < a->elements; i++) p->learns[i] = p->learns[i] && p->used[i];
+    return used;
+}
+
+static void report(const il_array *a, il_array_axis *s, const sample *p, int32_t used) {
+    for (int32_t i = 0; i < a->elements; i++) {
+        unsigned told = p->used[i] ? 0u : (unsigned)IL_EXCLUDED;
+        if (p->usable[i] && (s->standing[i] & OUT)) told |= IL_QUIET;
+        if (s->standing[i] & JUMPED) told |= IL_JUMPED;
+        if (used < 3) told |= IL_ALONE;
+        s->flags[i] = (uint8_t)(s->flags[i] | told);
+    }
+}
+
+/* A gyro that waits after a jump or a stuck spell learns its bias anew, against the output. */
+static void teach_fresh(const il_array *a, il_array_axis *s, const sample *p, il_real rate) {
+    for (int32_t i = 0; i < a->elements; i++) {
+        int fresh = p->usable[i] && (s->standing[i] & OUT) && (s->standing[i] & FRESH);
+        if (fresh && !p->used[i] && s->calm[i] > 0) s->bias[i] += (p->r[i] - rate) / (il_real)s->calm[i];
+    }
+}
+
+il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading) {
+    sample p;
+    il_real rate = IL_C(0.0);
+    int32_t used = a->elements, pupils = 0;
+    int closer = examine(a, s, z, reading, &p);
+    if (closer) find_stuck(a, s, &p);
+    p.learnt = 0;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (s->seen[i] > p.learnt) p.learnt = s->seen[i];
+    }
+    p.mean_variance = mean_variance(a, s);
+    for (int32_t i = 0; i < a->elements; i++) {
+        p.r[i] = z[i] - s->bias[i];
+        p.trust[i] = trusted(a, s, &p, i);
+        p.used[i] = p.learns[i] = 1;
+    }
+    if (closer || !all_inside(a, s, &p)) used = choose(a, s, z, &p);
+    if (used == 0) {
+        report(a, s, &p, used);
+        for (int32_t i = 0; i < a->elements; i++) s->weight[i] = IL_C(0.0);
+        return il_nan();
+    }
+    weigh(a, s, &p, used);
+    for (int32_t i = 0; i < a->elements; i++) {
+        rate += p.used[i] ? s->weight[i] * p.r[i] : IL_C(0.0);
+        pupils += p.learns[i];
+    }
+    report(a, s, &p, used);
+    if (used < a->elements) teach_fresh(a, s, &p, rate);
+    if (pupils >= 2) learn(a, s, &p, pupils);
+    return rate;
+}

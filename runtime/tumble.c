@@ -1,0 +1,109 @@
+/* Accelerometer and gyroscope triads: outputs to specific force and angular rate. */
+#include "real.h"
+
+/* Newton's method doubles the correct digits: at MEMS size three or four steps reach the last bit of a double; twelve get
+ * within a thousandth of a turning point. No more are ever made. */
+enum { NEWTON_STEPS = 12 };
+static const il_real SOLVED = IL_C(64.0) * IL_EPSILON; /* last step, relative, below which a solution stands */
+
+/* Solve s + k2 s^2 + ... = a for one axis. */
+static il_real unbent(const il_tumble *t, int axis, il_real a, unsigned *flags) {
+    il_real s = a, step = IL_C(0.0), slope = IL_C(1.0);
+    if (!(a >= t->low[axis] && a <= t->high[axis])) {
+        *flags |= il_finite(a) ? (unsigned)IL_BEYOND : (unsigned)IL_NOT_FINITE;
+        return il_nan();
+    }
+    for (int k = 0; k < NEWTON_STEPS; k++) {
+        il_real value = IL_C(0.0), tilt = IL_C(0.0);
+        for (int p = t->order - 2; p >= 0; p--) {
+            tilt = tilt * s + value;
+            value = value * s + t->nonlinearity[p][axis];
+        }
+        slope = IL_C(1.0) + s * (IL_C(2.0) * value + s * tilt);
+        step = (s * (IL_C(1.0) + s * value) - a) / slope;
+        s -= step;
+        if (il_fabs(step) <= IL_EPSILON * il_fabs(s)) break; /* the next one would move nothing */
+    }
+    if (slope > IL_C(0.0) && il_fabs(step) <= SOLVED * (il_fabs(s) + IL_C(1.0))) return s;
+    *flags |= IL_BEYOND;
+    return il_nan();
+}
+
+/* One sample; inlined, so that the block function compiles to straight code for each stride. */
+static inline unsigned tumble_sample(const il_tumble *t, il_real mx, il_real my, il_real mz, il_real *fx, il_real *fy,
+                                     il_real *fz) {
+    il_real x = mx * t->gain[0] - t->bias[0], y = my * t->gain[1] - t->bias[1], z = mz * t->gain[2] - t->bias[2];
+    unsigned flags = il_finite(x + y + z) ? 0u : (unsigned)IL_NOT_FINITE;
+    if (t->order > 1) {
+        x = unbent(t, 0, x, &flags);
+        y = unbent(t, 1, y, &flags);
+        z = unbent(t, 2, z, &flags);
+    }
+    y = y - t->misalignment[0] * x;
+    z = z - t->misalignment[1] * x - t->misalignment[2] * y;
+    *fx = x;
+    *fy = y;
+    *fz = z;
+    return flags;
+}
+
+unsigned il_tumble_apply(const il_tumble *settings, const il_real output[3], il_real force[3]) {
+    return tumble_sample(settings, output[0], output[1], output[2], &force[0], &force[1], &force[2]);
+}
+
+unsigned il_tumble_block(const il_tumble *settings, size_t n, const il_real *const output[3], size_t stride,
+                         il_real *const force[3], size_t force_stride) {
+    const il_tumble t = *settings; /* a copy cannot alias the samples */
+    const il_real *mx = output[0], *my = output[1], *mz = output[2];
+    il_real *fx = force[0], *fy = force[1], *fz = force[2];
+    unsigned flags = 0;
+    if (stride == 1 && force_stride == 1) {
+        for (size_t k = 0; k < n; k++) flags |= tumble_sample(&t, mx[k], my[k], mz[k], &fx[k], &fy[k], &fz[k]);
+        return flags;
+    }
+    for (size_t k = 0; k < n; k++) {
+        size_t i = k * stride, o = k * force_stride;
+        flags |= tumble_sample(&t, mx[i], my[i], mz[i], &fx[o], &fy[o], &fz[o]);
+    }
+    return flags;
+}
+
+static inline unsigned gyro_sample(const il_gyro *g, il_real mx, il_real my, il_real mz, il_real ax, il_real ay,
+                                   il_real az, il_real *rx, il_real *ry, il_real *rz) {
+    il_real x = mx * g->gain[0] - g->bias[0], y = my * g->gain[1] - g->bias[1], z = mz * g->gain[2] - g->bias[2];
+    if (g->has_sensitivity) {
+        x -= g->sensitivity[0][0] * ax + g->sensitivity[0][1] * ay + g->sensitivity[0][2] * az;
+        y -= g->sensitivity[1][0] * ax + g->sensitivity[1][1] * ay + g->sensitivity[1][2] * az;
+        z -= g->sensitivity[2][0] * ax + g->sensitivity[2][1] * ay + g->sensitivity[2][2] * az;
+    }
+    *rx = g->turn[0][0] * x + g->turn[0][1] * y + g->turn[0][2] * z;
+    *ry = g->turn[1][0] * x + g->turn[1][1] * y + g->turn[1][2] * z;
+    *rz = g->turn[2][0] * x + g->turn[2][1] * y + g->turn[2][2] * z;
+    return il_finite(x + y + z) ? 0u : (unsigned)IL_NOT_FINITE;
+}
+
+unsigned il_gyro_apply(const il_gyro *settings, const il_real output[3], const il_real force[3], il_real rate[3]) {
+    static const il_real none[3] = {IL_C(0.0), IL_C(0.0), IL_C(0.0)};
+    const il_real *f = settings->has_sensitivity ? force : none;
+    if (f == NULL) {
+        rate[0] = rate[1] = rate[2] = il_nan();
+        return IL_NOT_FINITE;
+    }
+    return gyro_sample(settings, output[0], output[1], output[2], f[0], f[1], f[2], &rate[0], &rate[1], &rate[2]);
+}
+
+unsigned il_gyro_block(const il_gyro *settings, size_t n, const il_real *const output[3], const il_real *const force[3],
+                       size_t stride, il_real *const rate[3], size_t rate_stride) {
+    unsigned flags = 0;
+    for (size_t k = 0; k < n; k++) {
+        size_t i = k * stride;
+        const il_real m[3] = {output[0][i], output[1][i], output[2][i]};
+        il_real f[3] = {IL_C(0.0), IL_C(0.0), IL_C(0.0)}, w[3];
+        if (force != NULL) {
+            for (int a = 0; a < 3; a++) f[a] = force[a][i];
+        }
+        flags |= il_gyro_apply(settings, m, force != NULL ? f : NULL, w);
+        for (int a = 0; a < 3; a++) rate[a][k * rate_stride] = w[a];
+    }
+    return flags;
+}

@@ -1,0 +1,326 @@
+"""Python face of the C core: tables loaded once, arrays in and out, streams that keep the core's state.
+
+What runs here is the source that `imulab export` writes for a unit; nothing is computed in this module. Arithmetic is
+double on the desk; a blob brings its float numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab import _runtime
+from imulab.errors import DataError, OptionError, RecordError
+from imulab.recording import Array
+from imulab.tables import METHODS, Field, Table, pack
+
+NOT_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, BEYOND, ALONE = (1 << bit for bit in range(8))
+MOST_ELEMENTS = 64
+_STATE = b"imulab.stream 1\n"
+
+
+class Unit:
+    """The tables of one unit in the C core.
+
+    Parameters
+    ----------
+    blob
+        The bytes of `imulab.tables.pack`, or of an exported blob.
+
+    Raises
+    ------
+    RecordError
+        The core refuses them: cut, corrupt, newer, or with contents that cannot be.
+    """
+
+    def __init__(self, blob: bytes) -> None:
+        try:
+            self._unit = _runtime.load(blob)
+        except ValueError as error:
+            raise RecordError(str(error)) from None
+
+    @classmethod
+    def of(cls, *tables: Table) -> Unit:
+        """Return the unit of these tables, in double."""
+        return cls(pack(tables, 8))
+
+    def tumble(self, output: Sequence[Array]) -> tuple[list[Array], int]:
+        """Return the specific force, m/s^2, of three columns of outputs, each (n,), and the flags met."""
+        force = [np.empty(len(output[0])) for _ in range(3)]
+        return force, _runtime.tumble(self._unit, _columns(output), tuple(force))
+
+    def gyro(self, output: Sequence[Array], force: Sequence[Array] | None) -> tuple[list[Array], int]:
+        """Return the angular rate, rad/s, of outputs under a specific force, m/s^2 (needed for g-sensitivity only)."""
+        rate = [np.empty(len(output[0])) for _ in range(3)]
+        under = None if force is None else _columns(force)
+        return rate, _runtime.gyro(self._unit, _columns(output), under, tuple(rate))
+
+    def centrifuge(self, force: Sequence[Array], rate: Sequence[Array | None]) -> tuple[list[Array | None], int]:
+        """Return the rates of the x and y input axes, rad/s, less their drift under the level specific force, m/s^2."""
+        out = [None if column is None else np.array(column, dtype=np.float64) for column in rate]
+        return out, _runtime.centrifuge(self._unit, _columns(force), tuple(out))
+
+    def warmup(
+        self, temperature: float, tick: float, ticks: NDArray[np.uint32], output: Sequence[Array | None]
+    ) -> tuple[list[Array | None], bool]:
+        """Return outputs less the warm-up bias, and whether the table covers the power-on temperature, degC.
+
+        `ticks` counts time since power-on in ticks of `tick` seconds; None stands for a column that is not there.
+        """
+        out = [None if column is None else np.array(column, dtype=np.float64) for column in output]
+        count = np.ascontiguousarray(ticks, dtype=np.uint32)
+        return out, _runtime.warmup(self._unit, float(temperature), float(tick), count, tuple(out))
+
+
+def _columns(columns: Sequence[Array]) -> tuple[Array, ...]:
+    return tuple(np.ascontiguousarray(column, dtype=np.float64) for column in columns)
+
+
+# ---- gyro array ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ArraySettings:
+    """How an array is fused; times in s become samples at `rate`.
+
+    Attributes
+    ----------
+    method, elements, axes
+        Name of the method, gyros per axis, 1 or 3 axes.
+    memory, start
+        None for the growing memory that begins at k = `start`, or a fixed gain in (0, 1).
+    initial_bias
+        ``first``, ``zero``, or biases (axes, elements) in the unit of the data.
+    kernel
+        Of ``support``: ``gaussian`` or ``exponential``.
+    bias, matrices
+        Calibration, removed first: z = matrix (reading - bias); (axes, elements) and (elements, axes, axes).
+    weights
+        (axes, elements): of ``covariance``; for ``robust`` inverse variances, relative, to start with.
+    gain
+        Of ``kalman``: (axes, elements + 1, elements), steady-state gain of rate and biases.
+    rate
+        Samples per second.
+    gate, spread_gate
+        Of ``robust``: standard deviations of a gyro's own noise, and of the array in this sample.
+    weight_cap, weight_floor, scale_tolerance
+        Largest weight; smallest variance in mean variances; share of the rate by which healthy gyros may differ.
+    memory_time, stuck_time, jump_time, quiet_time
+        Of ``robust``, s.
+    """
+
+    method: str
+    elements: int
+    axes: int = 1
+    memory: float | None = None
+    start: int = 1
+    initial_bias: Any = "first"
+    kernel: str = "gaussian"
+    bias: Any = None
+    matrices: Any = None
+    weights: Any = None
+    gain: Any = None
+    rate: float = 100.0
+    gate: float = 6.0
+    spread_gate: float = 4.0
+    weight_cap: float = 0.5
+    weight_floor: float = 0.05
+    scale_tolerance: float = 0.01
+    memory_time: float = 100.0
+    stuck_time: float = 0.5
+    jump_time: float = 0.5
+    quiet_time: float = 1.0
+
+
+@dataclass(frozen=True)
+class Fused:
+    """Fused samples: `rate` (m, axes); `flags` (m, axes, elements) uint8 and `weights` (m, axes, elements) if asked."""
+
+    rate: Array
+    flags: NDArray[np.uint8] | None
+    weights: Array | None
+
+
+class Stream:
+    """A gyro array being fused: owns the core's state, so that blocks give what one call over the whole gives.
+
+    Raises
+    ------
+    OptionError
+        A setting cannot be.
+    """
+
+    def __init__(self, settings: ArraySettings) -> None:
+        self._configure(settings)
+        try:
+            self._state: bytearray = _runtime.array_start(self._unit)
+        except ValueError as error:
+            raise OptionError(f"{settings.method}: {error}") from None
+
+    def _configure(self, settings: ArraySettings) -> None:
+        blob = pack([array_table(settings)], 8)
+        try:
+            self._unit = _runtime.load(blob)
+        except ValueError as error:
+            raise OptionError(f"{settings.method}: {error}") from None
+        self.settings = settings
+
+    @property
+    def rate(self) -> float:
+        """Samples per second, which turns the times in the settings into samples; may change on the way."""
+        return self.settings.rate
+
+    @rate.setter
+    def rate(self, value: float) -> None:
+        self._configure(replace(self.settings, rate=float(value)))
+
+    def process(
+        self, readings: Array, *, flags: bool = True, weights: bool = False, still: NDArray[np.bool_] | None = None
+    ) -> Fused:
+        """Fuse the next samples.
+
+        Parameters
+        ----------
+        readings
+            Shape (m, axes, elements), or (m, elements) for one axis; any unit, which the rate has as well.
+        flags, weights
+            Whether to return them per sample.
+        still
+            Samples in which the unit is known to stand still, shape (m,): zero-rate updates.
+
+        Raises
+        ------
+        DataError
+            The shape does not fit.
+        """
+        n, axes = self.settings.elements, self.settings.axes
+        block = np.ascontiguousarray(readings, dtype=np.float64)
+        if block.shape[1:] not in ((axes, n), (axes * n,)):
+            raise DataError(f"expected readings of shape (m, {axes}, {n}), found {block.shape}")
+        rate = np.empty((len(block), axes))
+        out_flags = np.empty((len(block), axes, n), dtype=np.uint8) if flags else None
+        out_weights = np.empty((len(block), axes, n)) if weights else None
+        quiet = None if still is None else np.ascontiguousarray(still, dtype=np.bool_)
+        if quiet is not None and quiet.shape != (len(block),):
+            raise DataError(f"expected still of shape ({len(block)},), found {quiet.shape}")
+        _runtime.array_block(self._unit, self._state, block, quiet, rate, out_flags, out_weights)
+        return Fused(rate, out_flags, out_weights)
+
+    def state(self) -> bytes:
+        """Return settings and state as bytes, to go on with later by `from_state`, also in another process."""
+        head = json.dumps(asdict(self.settings), default=_listed, sort_keys=True).encode("utf-8")
+        body = _STATE + struct.pack("<I", len(head)) + head + bytes(self._state)
+        return body + struct.pack("<I", zlib.crc32(body))
+
+    @classmethod
+    def from_state(cls, state: bytes) -> Stream:
+        """Return the stream that `state` was taken from.
+
+        Raises
+        ------
+        RecordError
+            The bytes are no such state, are cut or altered, or of another build of the core.
+        """
+        at = len(_STATE) + 4
+        if not state.startswith(_STATE) or len(state) < at + 4:
+            raise RecordError("not the state of a stream")
+        if struct.unpack("<I", state[-4:])[0] != zlib.crc32(state[:-4]):
+            raise RecordError("the state of the stream is cut or altered (CRC-32)")
+        size = struct.unpack("<I", state[at - 4 : at])[0]
+        stream = cls(ArraySettings(**json.loads(state[at : at + size])))
+        inner = state[at + size : -4]
+        if len(inner) != len(stream._state):
+            raise RecordError("the state of the stream is of another build of the core")
+        stream._state[:] = inner
+        return stream
+
+
+def array_stream(method: str = "robust", elements: int = 0, axes: int = 1, **settings: Any) -> Stream:
+    """Return a stream of the C core that fuses an array; settings are those of `ArraySettings`."""
+    if settings.get("memory") == "growing":
+        settings["memory"] = None
+    return Stream(ArraySettings(method, elements, axes, **settings))
+
+
+def array_table(settings: ArraySettings) -> Table:
+    """Return the table of an array's settings.
+
+    Raises
+    ------
+    OptionError
+        The method is unknown, or an array has another shape.
+    """
+    s, n, axes = settings, settings.elements, settings.axes
+    if s.method not in METHODS:
+        raise OptionError(f"unknown method {s.method!r}; known methods: {' '.join(METHODS)}")
+    if s.kernel not in ("gaussian", "exponential"):
+        raise OptionError(f"unknown kernel {s.kernel!r}; known kernels: gaussian exponential")
+    if axes not in (1, 3):
+        raise OptionError(f"{axes} axes: expected 1 or 3")
+    least = 3 if s.method == "robust" else 1
+    if not least <= n <= MOST_ELEMENTS:
+        raise OptionError(f"{s.method}: expected {least} to {MOST_ELEMENTS} gyros per axis, found {n}")
+    if s.memory is not None and not 0 < s.memory < 1:
+        raise OptionError(f"memory {s.memory}: expected growing, or a gain between 0 and 1")
+    if not (s.rate > 0 and np.isfinite(s.rate)):
+        raise OptionError(f"rate {s.rate}: expected more than 0 Hz")
+    given = s.initial_bias if not isinstance(s.initial_bias, str) else None
+    if given is None and s.initial_bias not in ("first", "zero"):
+        raise OptionError(f"initial bias {s.initial_bias!r}: expected first, zero or biases")
+
+    def samples(time: float, least: int) -> np.int64:
+        return np.int64(min(max(round(time * s.rate), least), 2**31))
+
+    words = {
+        "method": METHODS.index(s.method),
+        "elements": n,
+        "axes": axes,
+        "initial": 2 if given is not None else ("first", "zero").index(s.initial_bias),
+        "kernel": ("gaussian", "exponential").index(s.kernel),
+        "start": s.start,
+        "cap": samples(s.memory_time, 100),
+        "stuck": samples(s.stuck_time, 20),
+        "jump": samples(s.jump_time, 10),
+        "quiet": samples(s.quiet_time, 5),
+    }
+    numbers = {
+        "memory": s.memory or 0.0,
+        "gate": s.gate,
+        "spread_gate": s.spread_gate,
+        "scale_tolerance": s.scale_tolerance,
+        "weight_cap": s.weight_cap,
+        "weight_floor": s.weight_floor,
+    }
+    pointed = {
+        "offset": _shaped(s.bias, (axes, n), "bias"),
+        "matrix": _shaped(s.matrices, (n, axes, axes), "matrices"),
+        "bias": _shaped(given, (axes, n), "initial bias"),
+        "weight": _shaped(s.weights, (axes, n), "weights"),
+        "gain": _shaped(s.gain, (axes, n + 1, n), "gain"),
+    }
+    fields = [Field(name, np.array([value], dtype=np.int64)) for name, value in words.items()]
+    fields += [Field(name, np.array([value], dtype=np.float64)) for name, value in numbers.items()]
+    fields += [Field(name, values, pointed=True) for name, values in pointed.items()]
+    return Table("array", tuple(fields), {"elements": n, "axes": axes, "method": s.method})
+
+
+def _shaped(values: Any, shape: tuple[int, ...], name: str) -> Array | None:
+    if values is None:
+        return None
+    found = np.asarray(values, dtype=np.float64)
+    if found.size != np.prod(shape):
+        raise OptionError(f"{name}: expected shape {shape}, found {found.shape}")
+    if not np.isfinite(found).all():
+        raise OptionError(f"{name}: expected finite numbers")
+    return found.reshape(shape)
+
+
+def _listed(value: Any) -> Any:
+    return np.asarray(value).tolist()
