@@ -24,7 +24,8 @@ _LONGEST = 5  # coefficients are read from averaging times up to this part of th
 _GAP = 1.5
 _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
-"""Correlation of estimates an octave apart; measured on white noise and random walk (.45 to .6), falling as its power."""
+"""Correlation of estimates an octave apart; measured on white noise and random walk (.45 to .6), falling as its
+power."""
 _SENSORS = ("gyro", "dtg", "fog", "accel")
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 
@@ -118,7 +119,8 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
 def read_coefficients(curve: AllanCurve) -> NoiseCoefficients:
     """Read angle random walk, bias instability and rate random walk from an Allan curve, with uncertainties.
 
-    Non-negative generalised least squares of ``sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3`` over averaging
+    Non-negative generalised least squares of ``sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3`` over
+    averaging
     times up to a fifth of the recording; an estimate's relative variance is 2 / freedom, neighbours are correlated.
     A coefficient that the curve does not show is 0 with the size that it may have as its uncertainty.
 
@@ -184,7 +186,8 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
         return (len(time) - 1) / float(time[-1] - time[0]), []
     worst = int(wide[np.argmax(step[wide])])
     return 1 / usual, [
-        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s after "
+        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest "
+        f"{step[worst]:.3g} s after "
         f"{recording.place(worst)}; the samples on both sides are taken as neighbours"
     ]
 

@@ -83,10 +83,7 @@ class LeastSquares:
             e = z[i] - zbar - self.mean[i]
             self.mean[i] += g * e
             self.var[i] = (1 - g) * (self.var[i] + g * e * e)
-        if self.k < 3:
-            inverse = [1.0] * self.n
-        else:
-            inverse = [1 / max(v, 1e-300) for v in self.var]
+        inverse = [1.0] * self.n if self.k < 3 else [1 / max(v, 1e-300) for v in self.var]
         total = sum(inverse)
         self.weights = [x / total for x in inverse]
         return sum(self.weights[i] * z[i] for i in range(self.n))
@@ -98,8 +95,22 @@ class Robust:
     `reliability` are start weights from a calibration, or None.
     """
 
-    def __init__(self, elements, rate=50.0, memory=None, gate=6.0, spread_gate=4.0, weight_cap=0.5, floor=0.05,
-                 cap_time=100.0, stuck_time=0.5, jump_time=0.5, quiet_time=1.0, motion=0.01, reliability=None):
+    def __init__(
+        self,
+        elements,
+        rate=50.0,
+        memory=None,
+        gate=6.0,
+        spread_gate=4.0,
+        weight_cap=0.5,
+        floor=0.05,
+        cap_time=100.0,
+        stuck_time=0.5,
+        jump_time=0.5,
+        quiet_time=1.0,
+        motion=0.01,
+        reliability=None,
+    ):
         n = self.n = elements
         self.memory, self.gate, self.spread_gate = memory, gate, spread_gate
         self.weight_cap, self.floor, self.motion = weight_cap, floor, motion
@@ -110,24 +121,24 @@ class Robust:
         self.prior = 16.0 if reliability is None else 200.0
         inverse = [1.0] * n if reliability is None else [1 / x for x in reliability]
         self.ratio = [x / mean_of(inverse) for x in inverse]
-        self.b = [0.0] * n          # bias against the array's consensus
-        self.v = [0.0] * n          # running Grubbs variance
-        self.count = [0] * n        # samples learnt from
-        self.last = [NAN] * n       # last finite reading
-        self.repeats = [0] * n      # identical readings in a row, less one
-        self.compared = [0] * n     # pairs of successive readings seen
-        self.changed = [0] * n      # of these, pairs that differ
+        self.b = [0.0] * n  # bias against the array's consensus
+        self.v = [0.0] * n  # running Grubbs variance
+        self.count = [0] * n  # samples learnt from
+        self.last = [NAN] * n  # last finite reading
+        self.repeats = [0] * n  # identical readings in a row, less one
+        self.compared = [0] * n  # pairs of successive readings seen
+        self.changed = [0] * n  # of these, pairs that differ
         self.resolution = math.inf  # the smallest change ever seen
         self.stuck = [False] * n
-        self.out = [False] * n      # not in use until it was quiet long enough
-        self.fresh = [False] * n    # out, and its bias is being estimated anew
-        self.jumped = [False] * n   # fresh because of a jump
-        self.bad = [0] * n          # samples in a row that were not usable or gated
-        self.calm = [0] * n         # good samples in a row while out
-        self.away = [0] * n         # gated samples in a row, with their mean and sum of squares
+        self.out = [False] * n  # not in use until it was quiet long enough
+        self.fresh = [False] * n  # out, and its bias is being estimated anew
+        self.jumped = [False] * n  # fresh because of a jump
+        self.bad = [0] * n  # samples in a row that were not usable or gated
+        self.calm = [0] * n  # good samples in a row while out
+        self.away = [0] * n  # gated samples in a row, with their mean and sum of squares
         self.away_mean = [0.0] * n
         self.away_square = [0.0] * n
-        self.fast = [0.0] * n       # mean residual of the last second or so
+        self.fast = [0.0] * n  # mean residual of the last second or so
 
     def step(self, z):
         n = self.n

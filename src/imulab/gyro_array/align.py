@@ -1,12 +1,14 @@
 """Alignment of an array's elements against their consensus, from a recording in motion.
 
-All readings are one motion seen n times. The largest eigenvectors of their covariance, whitened by the noise at rest, span
+All readings are one motion seen n times. The largest eigenvectors of their covariance, whitened by the noise at
+rest, span
 what the elements sense of it (maximum likelihood of the factor model); the frame within is fixed by a convention.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -42,7 +44,8 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
     """Estimate what each element senses of the array's rate.
 
     Without `truth`, element 1 in its nominal orientation gives the directions and the mean over all elements of
-    ``P_i' A_i`` is the unit matrix, P_i the nominal orientation of element i (a signed permutation where it is near one).
+    ``P_i' A_i`` is the unit matrix, P_i the nominal orientation of element i (a signed permutation where it is near
+    one).
     With `truth`, A_i is the regression on it. Uncertainties: jackknife over 20 stretches of the recording.
 
     Parameters
@@ -63,7 +66,7 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
     stacked = np.moveaxis(readings, 2, 1).reshape(m, n * axes)  # element by element
     sigma = white.T.reshape(n * axes)
     edges = np.linspace(0, m, min(_BLOCKS, m // 4) + 1).astype(int)
-    moments = [_moments(stacked[a:b], truth if truth is None else truth[a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+    moments = [_moments(stacked[a:b], truth if truth is None else truth[a:b]) for a, b in pairwise(edges)]
     total = sum(moments[1:], start=moments[0].copy())
     sensing = _solve(total, sigma, axes, n, known=truth is not None)
     without = np.array([_solve(total - part, sigma, axes, n, known=truth is not None) for part in moments])
@@ -105,11 +108,15 @@ def _solve(moments: Array, sigma: Array, axes: int, n: int, *, known: bool) -> A
     parts = loading.reshape(n, axes, axes)
     if np.linalg.cond(parts[0]) > 1e6:
         return np.full((n, axes, axes), np.nan)
-    relative = parts @ np.linalg.inv(parts[0])
+    relative = _product(parts, np.linalg.inv(parts[0]))
     nominal = np.array([nominal_orientation(part) for part in relative])
     mean = np.einsum("iba,ibc->ac", nominal, relative) / n
-    aligned: Array = relative @ np.linalg.inv(mean)
-    return aligned
+    return _product(relative, np.linalg.inv(mean))
+
+
+def _product(a: Array, b: Array) -> Array:
+    product: Array = np.einsum("iab,bc->iac", a, b)
+    return product
 
 
 def nominal_orientation(matrix: Array) -> Array:

@@ -42,7 +42,8 @@ class Clock:
             return
         if self.last is not None and not time[0] > self.last:
             raise DataError(
-                f"{block.name}: {block.place(0)}, column time: time runs backwards: expected more than {self.last:.15g} s, "
+                f"{block.name}: {block.place(0)}, column time: time runs backwards: expected more than "
+                f"{self.last:.15g} s, "
                 f"found {time[0]:.15g} s"
             )
         known = time if self.last is None else np.concatenate([[self.last], time])
@@ -57,7 +58,9 @@ class Clock:
                 self.total += float(step[index])
                 if len(self.gaps) < _MOST_NAMED:
                     row = index + (0 if self.last is not None else 1)
-                    self.gaps.append(f"a gap of {step[index]:.6g} s before {block.place(row)} at {known[index + 1]:.6g} s")
+                    self.gaps.append(
+                        f"a gap of {step[index]:.6g} s before {block.place(row)} at {known[index + 1]:.6g} s"
+                    )
         self.last = float(time[-1])
 
     @property
@@ -76,7 +79,9 @@ class Clock:
         """Return what there is to say of gaps."""
         found = [f"{name}: {gap}" for gap in self.gaps]
         if self.count > len(self.gaps):
-            found.append(f"{name}: {self.count - len(self.gaps)} more gaps; {self.total:.6g} s in all {self.count} together")
+            found.append(
+                f"{name}: {self.count - len(self.gaps)} more gaps; {self.total:.6g} s in all {self.count} together"
+            )
         return found
 
 
@@ -139,7 +144,8 @@ def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]
         if apart.max() > _MOST_OFFSET:
             index = int(np.argmax(apart))
             raise DataError(
-                f"{recording.name}: {recording.place(index)}, column {name}: the clocks disagree: {own[number][index]:.9g} s "
+                f"{recording.name}: {recording.place(index)}, column {name}: the clocks disagree: "
+                f"{own[number][index]:.9g} s "
                 f"where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s apart"
             )
     return own

@@ -30,8 +30,10 @@ _HALVES = 2 * FEWEST_ROBUST
 class Figures:
     """The figures of one method on one axis; rates in the unit of the readings, angles in that unit times s.
 
-    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean single
-    gyro's rate_std over this one; ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; `bandwidth` in Hz
+    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean
+    single
+    gyro's rate_std over this one; ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; `bandwidth`
+    in Hz
     at -3 dB, half the sampling rate where nothing is filtered.
     """
 
@@ -246,16 +248,22 @@ def _halves(
     for first in (0, 1):
         chosen = range(first, elements.count, 2)
         names = [[row[i] for i in chosen] for row in elements.names]
-        half = replace(
-            elements, names=tuple(tuple(row) for row in names)
+        half = replace(elements, names=tuple(tuple(row) for row in names))
+        stream = (
+            open_stream(
+                replace(options, calibration=None, initial_bias="first"),
+                half,
+                options.rate or 1.0,
+                _part(recording, elements, options, chosen)[:10_000],
+            )
+            if options.method != "covariance"
+            else None
         )
-        stream = open_stream(
-            replace(options, calibration=None, initial_bias="first"), half, options.rate or 1.0, _part(recording, elements, options, chosen)[:10_000]
-        ) if options.method != "covariance" else None
         if stream is None:
             return None
         rates.append(stream.process(_part(recording, elements, options, chosen)).rate[start:stop])
-    return [float(np.nanstd(difference)) for difference in (rates[0] - rates[1]).T]
+    apart: Array = rates[0] - rates[1]
+    return [float(np.nanstd(difference)) for difference in apart.T]
 
 
 def _part(recording: Recording, elements: Elements, options: FuseOptions, chosen: range) -> Array:
@@ -301,7 +309,9 @@ def _transfer(probe: Array, response: Array) -> Array:
     size = min(_SEGMENT, len(probe))
     window = np.hanning(size)
     starts = range(0, len(probe) - size + 1, size // 2)
-    spectra = [(np.fft.rfft(window * probe[s : s + size]), np.fft.rfft(window * response[s : s + size])) for s in starts]
+    spectra = [
+        (np.fft.rfft(window * probe[s : s + size]), np.fft.rfft(window * response[s : s + size])) for s in starts
+    ]
     cross = sum(np.conj(p) * r for p, r in spectra)
     own = sum(np.abs(p) ** 2 for p, _ in spectra)
     gain: Array = np.abs(cross) / np.maximum(own, 1e-300)
@@ -344,7 +354,8 @@ def _filtering(figures: dict[str, tuple[Figures, ...] | str], rate: float) -> li
         for row in rows:
             if row.bandwidth < _FILTERED * rate / 2:
                 found.append(
-                    f"{method}: its bandwidth is {row.bandwidth:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower "
+                    f"{method}: its bandwidth is {row.bandwidth:.3g} Hz of {rate / 2:.3g} Hz: where its rate "
+                    f"noise is lower "
                     "that is low-pass filtering, which does not lower the angle error"
                 )
                 break

@@ -19,6 +19,7 @@ from imulab.units import parse_unit, to_si
 _FEWEST_SAMPLES = 200
 _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
 _MOVES = 10.0
+_OVERLAP = 8
 _CLIPPED_RUN = 3
 _SHARED = 0.5
 
@@ -48,7 +49,8 @@ def calibrate_array(
 ) -> ArrayFit:
     """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
 
-    At rest: each element's bias is its plain mean, the common part included, with ``u^2 = N^2/T + (2 ln 2/pi) B^2 + K^2 T/3``;
+    At rest: each element's bias is its plain mean, the common part included, with ``u^2 = N^2/T + (2 ln 2/pi) B^2 +
+    K^2 T/3``;
     N, B, K come from its Allan curve; the covariance matrix at `averaging_time` from half the products of successive
     differences of means (the Allan covariance; Vaccaro and Zaki 2017). In motion: `align`.
 
@@ -90,10 +92,11 @@ def calibrate_array(
     covariance, used, count = _covariance(readings, rest.rate, averaging_time)
     if used < averaging_time * 0.999:
         warnings.append(
-            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: taken at "
+            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} "
+            f"s: taken at "
             f"{used:.3g} s"
         )
-    warnings += _motion_warnings(still, readings, rest, elements)
+    _check_at_rest(still, readings, rest, elements)
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
     if serial is not None:
         record = Calibration(**{**record.__dict__, "sensor": {**record.sensor, "serial": serial}})
@@ -118,7 +121,8 @@ def _at_rest(still: Recording, elements: Elements) -> _AtRest:
             raise DataError(f"{still.name}: column {name}: all samples are {still.columns[name][0]:g}: a dead gyro")
     readings = _si(still, elements)
     curves = tuple(
-        tuple(allan_deviation(readings[:, a, i], rate) for i in range(elements.count)) for a in range(len(elements.axes))
+        tuple(allan_deviation(readings[:, a, i], rate) for i in range(elements.count))
+        for a in range(len(elements.axes))
     )
     noise = tuple(tuple(read_coefficients(curve) for curve in row) for row in curves)
     white = np.array([[curve.deviation[0] for curve in row] for row in curves])
@@ -161,18 +165,20 @@ def _clipped(readings: Array) -> np.ndarray:
 
 
 def _covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Array, float, int]:
-    """Allan covariance of each axis, shape (axes, n, n), the averaging time used, and the number of differences."""
+    """Allan covariance of each axis, shape (axes, n, n), the averaging time used, and the degrees of freedom."""
     m, axes, n = readings.shape
     size = max(1, min(round(averaging_time * rate), m // (_FEWEST_DIFFERENCES * n + 1)))
-    blocks = m // size
-    means = readings[: blocks * size].reshape(blocks, size, axes, n).mean(axis=1)
-    difference = np.diff(means, axis=0)
-    return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, len(difference)
+    total = np.concatenate([np.zeros((1, axes, n)), np.cumsum(readings, axis=0)])
+    starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
+    first, middle, last = total[starts], total[starts + size], total[starts + 2 * size]
+    difference = (last - 2 * middle + first) / size
+    # Equivalent number of independent differences under white noise: NIST SP 1065, table 5.
+    freedom = max(2, round(1.5 * m / size))
+    return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, freedom
 
 
-def _motion_warnings(still: Recording, readings: Array, rest: _AtRest, elements: Elements) -> list[str]:
-    """Refuse an array that moves while it should be at rest; warn of what its elements share."""
-    found = []
+def _check_at_rest(still: Recording, readings: Array, rest: _AtRest, elements: Elements) -> None:
+    """Refuse an array that moves while it should be at rest."""
     size = max(1, round(rest.rate))
     blocks = len(readings) // size
     means = readings[: blocks * size].reshape(blocks, size, len(elements.axes), elements.count).mean(axis=1)
@@ -182,10 +188,10 @@ def _motion_warnings(still: Recording, readings: Array, rest: _AtRest, elements:
         if blocks > 4 and common.std() > _MOVES * max(apart, 1e-300):
             where = f" about {axis}" if axis else ""
             raise DataError(
-                f"{still.name}: the array moves{where}: its elements go together by {math.degrees(common.std()):.3g} deg/s, "
+                f"{still.name}: the array moves{where}: its elements go together by "
+                f"{math.degrees(common.std()):.3g} deg/s, "
                 f"{common.std() / apart:.0f} times what they differ; expected a recording at rest"
             )
-    return found
 
 
 def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
@@ -235,7 +241,9 @@ def _record(
         for name, unit in zip(COEFFICIENTS, ("rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)"), strict=True):
             found = [getattr(rest.noise[a][i], name) for a in range(axes)]
             entry[name] = _with_unit(
-                scalar(np.array([c.value for c in found])), scalar(np.array([c.standard_uncertainty for c in found])), unit
+                scalar(np.array([c.value for c in found])),
+                scalar(np.array([c.standard_uncertainty for c in found])),
+                unit,
             )
         listed.append(entry)
     fixed = [fixed_weights(matrix) for matrix in covariance]
@@ -246,7 +254,8 @@ def _record(
     if shared > _SHARED:
         warnings = [
             *warnings,
-            f"the elements' noise is shared (mean correlation {shared:.2f}): was the array at rest? Fusion cannot remove it",
+            f"the elements' noise is shared (mean correlation {shared:.2f}): was the array at rest? Fusion "
+            f"cannot remove it",
         ]
     sources = tuple(r.source for r in (still, moving) if r is not None and r.source is not None)
     return Calibration(

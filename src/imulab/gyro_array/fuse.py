@@ -49,6 +49,8 @@ class FuseOptions:
         Sampling rate, Hz; from the recording's first steps of time where None.
     rate_walk
         Process noise of `kalman`, rad/s/sqrt(s).
+    still
+        From when to when the unit is known to be at rest, s: zero-rate updates take the common bias off from then on.
     """
 
     method: str = "robust"
@@ -58,6 +60,7 @@ class FuseOptions:
     calibration: Calibration | None = None
     rate: float | None = None
     rate_walk: float = RATE_WALK
+    still: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -141,7 +144,9 @@ def fuse(
     """
     fuser = Fuser(options or FuseOptions(), weights=weights)
     parts = list(fuser.fuse([recording]))
-    joined = [np.concatenate(column) for column in zip(*[(p.time, p.rate) for p in parts], strict=True)] if parts else None
+    joined = (
+        [np.concatenate(column) for column in zip(*[(p.time, p.rate) for p in parts], strict=True)] if parts else None
+    )
     if joined is None or fuser.health is None:
         raise DataError(f"{recording.name}: no samples to fuse")
     return Fused(
@@ -181,7 +186,8 @@ class Fuser:
         self.clock.nominal = self.options.rate
         elements: Elements | None = None
         stream: Any = None
-        head: Array | None = None  # the first samples, until the sampling rate is known
+        head: Array | None = None  # the first samples and their times, until the sampling rate is known
+        early = np.empty(0)
         for block in to_one_clock(blocks):
             self.name = block.name
             if elements is None:
@@ -191,18 +197,21 @@ class Fuser:
             settled = stream is not None and self.clock.settled
             before = self.clock.rate
             self.clock.watch(block)
-            readings = elements.readings(block)
+            readings, time = elements.readings(block), block.si("time")
             seen = 0
             if not settled:
+                early = np.concatenate([early, time])
                 seen = 0 if head is None else len(head)
                 head = readings if head is None else np.concatenate([head, readings])
                 if stream is None or self.clock.rate != before:
                     # The times behind the settings are a different number of samples: start again from the first one.
                     stream = self._open(block, elements, head)
-                    readings = head
+                    readings, time = head, early
                 else:
                     seen = 0
-            out = stream.process(np.ascontiguousarray(readings))
+            still = self.options.still
+            at_rest = None if still is None else (time >= still[0]) & (time < still[1])
+            out = stream.process(np.ascontiguousarray(readings), weights=self.weights, still=at_rest)
             if not settled and self.clock.settled:
                 head = None
             yield self._fused(block, out, seen, elements)
@@ -235,12 +244,10 @@ class Fuser:
             )
 
     def _open(self, block: Recording, elements: Elements, first: Array) -> Any:
-        return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE], weights=self.weights)
+        return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE])
 
 
-def open_stream(
-    options: FuseOptions, elements: Elements, rate: float, first: Array, *, weights: bool = False, flags: bool = True
-) -> Any:
+def open_stream(options: FuseOptions, elements: Elements, rate: float, first: Array) -> Any:
     """Return a `runtime.Stream` for these elements; `first` are readings to take the noise from where no record has it.
 
     Raises
@@ -256,11 +263,15 @@ def open_stream(
     if isinstance(initial, Calibration):
         start = _of(initial, elements).bias
         if bias is not None:
-            raise OptionError("--initial-bias RECORD together with --calibration: the calibration takes the biases off already")
+            raise OptionError(
+                "--initial-bias RECORD together with --calibration: the calibration takes the biases off already"
+            )
         if options.method == "feedback":
             initial = start
         else:  # what the others start from is taken off for good: their own estimates are relative to it
             initial, bias = "zero", start
+    if options.method == "kalman" and bias is not None:
+        initial = "zero"  # a first sample's noise would stay in the biases for as long as the gain takes
     settings: dict[str, Any] = {
         "elements": elements.count,
         "axes": len(elements.axes),

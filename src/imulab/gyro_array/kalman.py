@@ -13,7 +13,8 @@ import numpy as np
 from imulab.recording import Array
 
 RATE_WALK = math.radians(1.4)
-"""Default process noise, rad/s/sqrt(s): enough to follow 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible lag."""
+"""Default process noise, rad/s/sqrt(s): enough to follow 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible
+lag."""
 _BIAS_WALK = 0.004
 _LOWEST = 0.05
 
@@ -38,10 +39,7 @@ def steady_gain(white: Array, walk: Array, rate_walk: float, step: float) -> Arr
     from scipy.linalg import solve_discrete_are
 
     n = len(white)
-    if n == 1:
-        basis = np.zeros((1, 0))
-    else:
-        basis = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, : n - 1]]))[0][:, 1:]
+    basis = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, : n - 1]]))[0][:, 1:]
     size = float(np.mean(white**2))
     h = np.column_stack([np.ones(n), basis])
     q = np.zeros((n, n))

@@ -1,6 +1,7 @@
 """What a gyro array is: which columns of a recording are its elements, and what a record says of them.
 
-One axis: columns ``gyro_1 .. gyro_n``. Three axes: ``gyro_x_1 .. gyro_z_n``. ``z_i = A_i w + b_i``: reading z of element i,
+One axis: columns ``gyro_1 .. gyro_n``. Three axes: ``gyro_x_1 .. gyro_z_n``. ``z_i = A_i w + b_i``: reading z of
+element i,
 body rate w, bias b; the record holds ``M_i = A_i^-1`` so that ``w = M_i (z_i - b_i)``.
 """
 

@@ -15,7 +15,11 @@ from imulab.errors import OptionError
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit
 
-EXPERIMENTS: Mapping[str, tuple[float, float]] = {"static": (100.0, 2000.0), "dynamic": (50.0, 100.0), "moving": (100.0, 120.0)}
+EXPERIMENTS: Mapping[str, tuple[float, float]] = {
+    "static": (100.0, 2000.0),
+    "dynamic": (50.0, 100.0),
+    "moving": (100.0, 120.0),
+}
 """Sampling rate, Hz, and duration, s, of each."""
 FAULTS = ("dead", "stuck", "spikes", "jump", "nan", "saturation")
 _DEG = math.pi / 180
@@ -38,7 +42,7 @@ class NoiseModel:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of one gyro (counted from 1, on every axis): its kind, when it begins, s, how long it lasts, s, its size, rad/s."""
+    """A fault of gyro number `gyro` (from 1) on every axis: kind, begin, s, duration, s, and size, rad/s."""
 
     kind: str
     gyro: int
@@ -60,6 +64,7 @@ def simulate_array(
     mounting: str = "same",
     faults: tuple[Fault, ...] = (),
     unit: str = "deg/s",
+    session: int = 0,
     seed: int = 1,
 ) -> Recording:
     """Simulate an array's recording with columns time, gyro_1 .. (or gyro_x_1 ..) and truth_rate (or truth_rate_x ..).
@@ -79,9 +84,9 @@ def simulate_array(
         ``same``, or ``alternate``: even elements measure (-y, -x, -z), or -x on a single axis.
     faults
         Faults to put in.
-    seed
-        Of the random numbers. Biases and scale factors depend on it alone, not on the experiment: two experiments
-        with one seed are two recordings of one array.
+    session, seed
+        Of the random numbers. Biases and scale factors depend on `seed` alone: another experiment or session with one
+        seed is another recording of one array.
 
     Raises
     ------
@@ -100,7 +105,7 @@ def simulate_array(
     white = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
     turn_on = noise.turn_on * unit_rng.standard_normal((axes, elements))
     sensing = _sensing(elements, axes, scale_spread, misalignment, mounting, unit_rng)
-    rng = np.random.default_rng([seed, 2 + list(EXPERIMENTS).index(experiment)])
+    rng = np.random.default_rng([seed, 2 + list(EXPERIMENTS).index(experiment), session])
     truth = _motion(experiment, time, axes, rng)
     readings = np.einsum("iab,tb->tai", sensing, truth)
     readings += turn_on

@@ -5,15 +5,19 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers.layout import Layout, load_layout
+from imulab.readers.mimu import is_mimu, read_mimu
 from imulab.readers.text import TextFile
 from imulab.recording import Recording, Source
+
+_LIVE_BYTES = 1 << 16
 
 __all__ = ["Layout", "load_layout", "read", "read_blocks"]
 
@@ -39,6 +43,8 @@ def read(file: str | Path, layout: str | Path | Layout | None = None) -> Recordi
         The file cannot be read; the message names file, row and column.
     """
     with _open(file) as stream:
+        if layout is None and is_mimu(_start(stream)):
+            return read_mimu(stream, _name(file))
         text = TextFile(stream, _name(file), _layout(layout))
         blocks = list(text.blocks())
         source = Source(_name(file), text.sha256())
@@ -55,13 +61,36 @@ def read(file: str | Path, layout: str | Path | Layout | None = None) -> Recordi
     )
 
 
-def read_blocks(file: str | Path, layout: str | Path | Layout | None = None) -> Iterator[Recording]:
+def read_blocks(
+    file: str | Path, layout: str | Path | Layout | None = None, *, live: bool = False
+) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
-    Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
+    Parameters and errors are those of `read`; every block has the metadata, and knows its first row. With `live`, whole
+    lines of standard input are a block as soon as they are there.
     """
     with _open(file) as stream:
+        if layout is None and not live and is_mimu(_start(stream)):
+            yield read_mimu(stream, _name(file))
+            return
+        if live:
+            stream = cast(BinaryIO, _Live(stream))
         yield from TextFile(stream, _name(file), _layout(layout)).blocks()
+
+
+class _Live:
+    """A stream whose `read` returns what is there instead of waiting for all that was asked for."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+
+    def read(self, size: int) -> bytes:
+        return bytes(self._stream.read1(min(size, _LIVE_BYTES)))  # type: ignore[attr-defined]
+
+
+def _start(stream: BinaryIO) -> bytes:
+    """Return the first bytes of a stream without taking them."""
+    return bytes(stream.peek(_LIVE_BYTES)) if isinstance(stream, BufferedReader) else b""
 
 
 def _name(file: str | Path) -> str:

@@ -12,6 +12,7 @@ import hashlib
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.errors import ReadError
 from imulab.recording import Array, Recording, Source
@@ -46,8 +47,10 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
     frames, skipped = _frames(data)
     if not len(frames):
         raise ReadError(f"{name}: no whole MIMU4444 frame of {_FRAME.itemsize} bytes was found")
-    ticks = np.diff(frames["stamp"].astype(np.int64), prepend=np.int64(frames["stamp"][0])) % (1 << 32)
-    lost = (np.diff(frames["sequence"].astype(np.int64)) - 1) % (1 << 16)
+    stamp: NDArray[np.int64] = frames["stamp"].astype(np.int64)
+    sequence: NDArray[np.int64] = frames["sequence"].astype(np.int64)
+    ticks = np.mod(np.diff(stamp, prepend=stamp[0]), 1 << 32)
+    lost = np.mod(np.diff(sequence) - 1, 1 << 16)
     columns: dict[str, Array] = {"time": np.cumsum(ticks) / _CLOCK}
     units = {"time": "s"}
     for sensor, first, step, unit in (("gyro", 3, _GYRO_STEP, "deg/s"), ("accel", 0, _ACCEL_STEP, "m/s^2")):
