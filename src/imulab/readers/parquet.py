@@ -35,7 +35,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         with parquet.ParquetFile(path, memory_map=False) as file:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout)
-            metadata = {**_metadata(file.metadata.metadata), **((layout and layout.metadata) or {})}
+            metadata = {**_metadata(file.schema_arrow.metadata), **((layout and layout.metadata) or {})}
             for batch in file.iter_batches(batch_size=ROWS, columns=list(dict.fromkeys(columns.values()))):
                 if batch.num_rows == 0:
                     continue
