@@ -27,3 +27,18 @@ def powers_of_five() -> bytes:
             number >>= number.bit_length() - 128
         words += [number >> 64, number & (1 << 64) - 1]
     return struct.pack(f"={len(words)}Q", *words)
+
+
+@cache
+def powers_of_ten() -> bytes:
+    """Return 10^k for k = -292 .. 324, each scaled by a power of two to 128 bits, rounded up: high half, low half."""
+    words = []
+    for k in range(-292, 325):
+        power = 5 ** abs(k)
+        size = power.bit_length()
+        if k >= 0:
+            number = power << 128 - size if size <= 128 else -(-power >> size - 128)
+        else:
+            number = -(-(1 << size + 127) // power)
+        words += [number >> 64, number & (1 << 64) - 1]
+    return struct.pack(f"={len(words)}Q", *words)

@@ -150,6 +150,9 @@ class TextFile:
     # --- bytes -------------------------------------------------------------------------------------------------
 
     def _read_more(self) -> None:
+        self._rest += self._next_bytes()
+
+    def _next_bytes(self) -> bytes:
         try:
             data = self._read(_BLOCK_BYTES)
         except OSError as error:
@@ -157,7 +160,7 @@ class TextFile:
         self._ended = not data
         if self._hash:
             self._hash.update(data)
-        self._rest += data
+        return data
 
     def _next_lines(self) -> bytes | None:
         """Return whole lines of about a block's size, without blank lines at the end of the file."""
@@ -171,7 +174,16 @@ class TextFile:
                     self._rest = lines[len(kept) :].partition(b"\n")[2] + self._rest
                     return kept
                 self._rest = lines + self._rest
-            self._read_more()
+                self._read_more()
+                continue
+            data = self._next_bytes()
+            end = data.rfind(b"\n")
+            if data[max(end - 2, 0) : max(end, 0)].strip(self._blanks) and data[end - 1] not in b" \t\n":
+                # As almost always: the last whole line is none of blanks, and nothing need be moved but the lines.
+                lines = b"".join((self._rest, memoryview(data)[:end]))
+                self._rest = data[end + 1 :]
+                return lines
+            self._rest += data
         lines, self._rest = self._rest.rstrip(self._blanks), b""
         return lines or None
 
