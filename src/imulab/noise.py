@@ -157,7 +157,7 @@ def read_coefficients(curve: AllanCurve) -> NoiseCoefficients:
     found = []
     for value, spread in zip(values, np.sqrt(np.diag(covariance)), strict=True):
         size = math.sqrt(value)
-        found.append(Coefficient(size, min(spread / (2 * size) if size else math.inf, math.sqrt(spread))))
+        found.append(Coefficient(size, float(min(spread / (2 * size) if size else math.inf, math.sqrt(spread)))))
     return NoiseCoefficients(*found)
 
 

@@ -89,6 +89,30 @@ class LeastSquares:
         return sum(self.weights[i] * z[i] for i in range(self.n))
 
 
+class Support:
+    """Weights from the support of each pair, kernel of the distance over the rms distance so far."""
+
+    def __init__(self, elements, memory=None, kernel="gaussian"):
+        self.n, self.memory, self.kernel, self.k, self.h2 = elements, memory, kernel, 0, 0.0
+
+    def step(self, z):
+        n = self.n
+        self.k += 1
+        pairs = [(z[i] - z[j]) ** 2 for i in range(n) for j in range(i)]
+        g = 1 / self.k if self.memory is None else (1.0 if self.k == 1 else self.memory)
+        self.h2 = (1 - g) * self.h2 + g * mean_of(pairs)
+        support = []
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                if j != i:
+                    d2 = (z[i] - z[j]) ** 2 / self.h2 if self.h2 > 0 else 0.0
+                    total += math.exp(-d2 / 2) if self.kernel == "gaussian" else math.exp(-math.sqrt(d2))
+            support.append(total)
+        self.weights = [x / sum(support) for x in support]
+        return sum(self.weights[i] * z[i] for i in range(n))
+
+
 class Robust:
     """Grubbs weights, gate, stuck counter, jumps and re-admission; `rate` in Hz turns times into samples.
 

@@ -101,11 +101,11 @@ def _solve(moments: Array, sigma: Array, axes: int, n: int, *, known: bool) -> A
         inner = moments[size:, size:]
         if np.linalg.cond(inner) > 1e12:
             return np.full((n, axes, axes), np.nan)
-        regression: Array = np.linalg.solve(inner, moments[size:, :size]).T.reshape(n, axes, axes)
-        return regression
+        regression = np.linalg.solve(inner, moments[size:, :size]).T
+        return np.asarray(regression, dtype=np.float64).reshape(n, axes, axes)
     scaled = moments / np.outer(sigma, sigma)
     loading = np.linalg.eigh(scaled)[1][:, -axes:] * sigma[:, None]
-    parts = loading.reshape(n, axes, axes)
+    parts: Array = loading.reshape(n, axes, axes)
     if np.linalg.cond(parts[0]) > 1e6:
         return np.full((n, axes, axes), np.nan)
     relative = _product(parts, np.linalg.inv(parts[0]))

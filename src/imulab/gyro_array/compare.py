@@ -325,7 +325,8 @@ def _curve(error: Array, rate: float) -> dict[str, Any]:
 
 def _trace(values: Array) -> list[float]:
     step = max(1, -(-len(values) // _TRACE))
-    return np.round(values[::step], 9).tolist()
+    thinned: list[float] = np.round(values[::step], 9).tolist()
+    return thinned
 
 
 def _health(fused: Fused, recording: Recording) -> dict[str, Any]:

@@ -113,15 +113,16 @@ def _elements_table(record: Calibration) -> Table:
         title="Elements",
         caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth "
         "rate too) "
-        "included. Noise coefficients from the Allan curves below; 0 ± u means that the recording is too short or the "
+        "included. Angle random walk (ARW), bias instability and rate random walk (RRW) are read from the Allan curves "
+        "below; 0 ± u means that the recording is too short or the "
         "effect too small to be seen.",
         columns=[
             "gyro",
             "bias, deg/s",
             *(["scale factor"] if scaled else []),
-            "angle random walk, deg/√h",
+            "ARW, deg/√h",
             "bias instability, deg/h",
-            "rate random walk, deg/h/√h",
+            "RRW, deg/h/√h",
         ],
         rows=rows,
     )
@@ -234,7 +235,7 @@ def _comparison(record: Calibration) -> Exhibits:
         if data["health"]:
             items.append(_health(record, a))
     return Exhibits(
-        headline=f"Fusing {model['elements']} gyros by `{name}` makes the rate {plain_number(reduction, 3)} "
+        headline=f"Fusing {model['elements']} gyros by {name} makes the rate {plain_number(reduction, 3)} "
         f"times quieter than "
         "the mean single gyro; "
         + (
@@ -276,21 +277,23 @@ def _methods_table(record: Calibration, a: int) -> Table:
         )
     return Table(
         title=f"Methods{_of_axis(model['axes'][a])}",
-        caption="Rate error (standard deviation with the mean removed) and angle error against the truth; "
+        caption=f"Rates in {unit}, angles in {angle}. Rate error (standard deviation with the mean removed) and "
+        f"angle error "
+        "against the truth; "
         "reduction of noise "
         "against the mean single gyro; noise from sample to sample over the limit of any fixed weights; "
         "bandwidth at −3 dB. "
         "Lower noise with less bandwidth is low-pass filtering. Split half: difference of the two halves of the array.",
         columns=[
             "method",
-            f"rate std, {unit}",
-            f"rate max, {unit}",
-            f"angle std, {angle}",
-            f"angle max, {angle}",
+            "rate std",
+            "rate max",
+            "angle std",
+            "angle max",
             "reduction",
             "noise / limit",
             "bandwidth, Hz",
-            *([f"split half, {unit}"] if halves else []),
+            *(["split half"] if halves else []),
         ],
         rows=rows,
         highlight=highlight,

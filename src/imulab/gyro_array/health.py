@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET = 1, 2, 4, 8, 16, 32
+NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, ALONE = 1, 2, 4, 8, 16, 32, 128
 """Flags of a gyro in a sample, as the C core sets them."""
 _KINDS = ((NON_FINITE, "non-finite"), (STUCK, "stuck"), (JUMPED, "jumped"), (EXCLUDED, "excluded"))
 
@@ -27,6 +27,7 @@ class Health:
     names: Sequence[Sequence[str]]
     total: int = 0
     lost: int = 0
+    few: int = 0
     events: dict[tuple[int, int, str], Event] = field(default_factory=dict)
 
     def watch(self, time: np.ndarray, flags: np.ndarray | None, rate: np.ndarray) -> list[tuple[int, int, str]]:
@@ -36,6 +37,7 @@ class Health:
         new: list[tuple[int, int, str]] = []
         if flags is None or not flags.any():
             return new
+        self.few += int((flags & ALONE).any(axis=(1, 2)).sum()) - int(np.isnan(rate).any(axis=1).sum())
         any_flag = np.bitwise_or.reduce(flags, axis=0)
         for a, i in zip(*np.nonzero(any_flag), strict=True):
             for bit, kind in _KINDS:
@@ -62,6 +64,10 @@ class Health:
                 if (a, i, kind) in self.events
             ]
             found.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {self.total} samples)")
+        if self.few > 0:
+            found.append(
+                f"fewer than three gyros left in {self.few} samples: nothing to compare with, equal weights there"
+            )
         if self.lost:
             found.append(f"no gyro left in {self.lost} samples: the output is nan there")
         return found
