@@ -8,13 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from imulab.calibration import Calibration
+from imulab.centrifuge.apply import apply_centrifuge, beyond_levels, highest_force
 from imulab.errors import RecordError
 from imulab.recording import Recording
 from imulab.tumble.apply import apply_tumble, beyond_test
+from imulab.units import from_si
 
 _FAR_IN_TEMPERATURE = 20.0
 
-_APPLY = {"tumble": apply_tumble}
+_APPLY = {"tumble": apply_tumble, "centrifuge": apply_centrifuge}
+_BEYOND = {"tumble": beyond_test, "centrifuge": beyond_levels}
 
 
 def apply(record: Calibration, recording: Recording) -> Recording:
@@ -65,4 +68,16 @@ def warnings_of(record: Calibration, recording: Recording) -> list[str]:
 
 def beyond_test_of(record: Calibration, recording: Recording) -> tuple[int, float]:
     """Return how many samples lie far beyond what the record was made at, and the largest, m/s^2."""
-    return beyond_test(record, recording) if record.procedure == "tumble" else (0, 0.0)
+    beyond = _BEYOND.get(record.procedure)
+    return (0, 0.0) if beyond is None else beyond(record, recording)
+
+
+def beyond_message(record: Calibration, count: int, largest: float) -> str:
+    """Say that `count` samples, up to `largest`, m/s^2, lie beyond what the record was made at."""
+    most = f"{from_si(largest, 'g'):.1f} g"
+    if record.procedure == "centrifuge":
+        return (
+            f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {most}), the highest level of the "
+            "record's test: K(a) is extrapolated there"
+        )
+    return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"

@@ -6,11 +6,12 @@ from pathlib import Path
 
 from imulab import report
 from imulab.calibration import Calibration
+from imulab.centrifuge import figures as centrifuge
 from imulab.errors import RecordError
 from imulab.exhibit import Exhibits
 from imulab.tumble import figures as tumble
 
-_EXHIBITS = {"tumble": tumble.exhibits}
+_EXHIBITS = {"tumble": tumble.exhibits, "centrifuge": centrifuge.exhibits}
 
 
 def exhibits_of(record: Calibration) -> Exhibits:

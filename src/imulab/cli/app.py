@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import records, tumble
+from imulab.cli import centrifuge, records, tumble
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -22,6 +22,11 @@ def command() -> Any:
     app.callback()(_root)
     app.add_typer(
         tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
+    )
+    app.add_typer(
+        centrifuge.commands(_SETTINGS),
+        name="centrifuge",
+        help="Measure how a gyroscope's g-sensitive drift changes with g.",
     )
     records.add_commands(app)
     return typer.main.get_command(app)
