@@ -77,7 +77,8 @@ def beyond_message(record: Calibration, count: int, largest: float) -> str:
     most = f"{from_si(largest, 'g'):.1f} g"
     if record.procedure == "centrifuge":
         return (
-            f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {most}), the highest level of the "
+            f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {most}), the highest level "
+            f"of the "
             "record's test: K(a) is extrapolated there"
         )
     return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"

@@ -86,7 +86,8 @@ def axis_curve(record: Calibration, axis: str) -> AxisCurve:
         raise RecordError(f"the record has no curve for dtg_{axis} (no {axis}_K0)")
     if f"{axis}_direction" not in record.parameters:
         raise RecordError(
-            f"the record has no {axis}_direction: it was made without table_angle, so that the direction of the drift in the "
+            f"the record has no {axis}_direction: it was made without table_angle, so that the direction of the "
+            f"drift in the "
             "gyroscope is not known"
         )
     terms = [record.value(f"{axis}_{term}") if f"{axis}_{term}" in record.parameters else 0.0 for term in ("c1", "c2")]

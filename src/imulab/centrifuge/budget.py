@@ -1,7 +1,7 @@
 """Errors that survive the subtraction of the FOG: which of them the data bound, and by how much.
 
-Each entry gives a value with its uncertainty where the data determine it, and what it does to K at the highest level, as a
-fraction of K. What the data do not bound is given as the effect of a stated size.
+Each entry gives a value with its uncertainty where the data determine it, and what it does to K at the highest level,
+as a fraction of K. What the data do not bound is given as the effect of a stated size.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ class Entry:
     value, standard_uncertainty, unit
         As measured (an angle, a time, a fraction); where it is not bounded, the size that the effect is stated for.
     effect
-        On K at the highest level, as a fraction: of the measured value and its uncertainty, after what the reduction does
-        against it; where it is not bounded, of the size stated.
+        On K at the highest level, as a fraction: of the measured value and its uncertainty, after what the reduction
+        does against it; where it is not bounded, of the size stated.
     removed
         The same without the subtraction or combination that removes it, where there is one.
     basis
-        Where this comes from, a sentence.
+        Where this comes from, or what it would need.
     """
 
     error: str
@@ -98,7 +98,7 @@ def _pairs(values: Complex) -> Array:
 
 
 def _tilted(test: _Test) -> tuple[Array, Array, bool]:
-    """Fit the FOG's lines by ``-w_t (delta + kappa a) exp(-i w_s tau)``; parameters, covariance, and whether tau is among them."""
+    """Fit the FOG's lines by ``-w_t (delta + kappa a) exp(i w_s tau)``; parameters, covariance, and tau or not."""
     with_flexure, with_delay = test.levels >= 2, test.levels >= 3
     parameters = np.zeros(5)
     variance = np.concatenate([test.fog_variance / test.arm**2] * 2)
@@ -126,14 +126,14 @@ def _tilt(test: _Test) -> list[Entry]:
         variance = test.fog_variance / test.arm**2
         weight = 1 / np.maximum(variance, 1e-300)
         value, u = float((weight * size).sum() / weight.sum()), float(1 / np.sqrt(weight.sum()))
-        basis = "size of the FOG's line over the arm rate, flexure included; the FOG's line is subtracted"
+        basis = "FOG line / arm rate, flexure included"
         return [Entry("tilt", True, value, u, "rad", 0.0, test.fog_share, basis)]
     parameters, covariance, _ = _tilted(test)
     entries = []
     top = float(test.force.max())
     for error, index, factor, unit, basis in (
-        ("tilt", 0, 1.0, "rad", "FOG's line over the arm rate at a = 0; the FOG's line is subtracted"),
-        ("common flexure", 2, top, "rad/(m/s^2)", "growth of the same with a; the FOG's line is subtracted"),
+        ("tilt", 0, 1.0, "rad", "FOG line / arm rate, at a = 0"),
+        ("common flexure", 2, top, "rad/(m/s^2)", "FOG line / arm rate, growth with a"),
     ):
         if index == 2 and test.levels < 2:
             continue
@@ -151,7 +151,7 @@ def _flexure(test: _Test) -> Entry:
     if not test.encoder or len(np.unique(senses)) < 2:
         return Entry(
             "differential flexure", False, _FLEXURE, None, "rad/(m/s^2)", _FLEXURE * reach, None,
-            "not bounded: needs both senses with table_angle; the effect is that of 0.1 µrad/g",
+            "needs both senses with table_angle",
         )  # fmt: skip
     # Per unit of force: Z = D(level) + w_t kappa_d; the levels' own lines are free.
     labels = np.round(np.abs(test.arm), 6)
@@ -164,7 +164,7 @@ def _flexure(test: _Test) -> Entry:
     u = float(np.sqrt(found[0][1][-1, -1]))
     return Entry(
         "differential flexure", True, value, u, "rad/(m/s^2)", 0.0, value * reach,
-        "half the difference of the two senses (scale mismatch and azimuth times tilt included); it cancels in their half-sum",
+        "half the difference of the senses",
     )  # fmt: skip
 
 
@@ -175,7 +175,7 @@ def _scale_mismatch(test: _Test) -> list[Entry]:
     if not room:
         return [
             Entry("scale mismatch", False, _MISMATCH, None, "1", _MISMATCH * test.fog_share, None,
-                  "not bounded: no Earth-rate line; the effect is that of 0.5 %"),
+                  "needs a clear Earth-rate line"),
         ]  # fmt: skip
     ratio = np.array([line[0] / line[-1] - 1 for line, _, _ in room])
     variance = np.array([(C[0, 0] + C[-1, -1] - 2 * C[0, -1]).real / 2 / abs(line[-1]) ** 2 for line, C, _ in room])
@@ -191,8 +191,7 @@ def _scale_mismatch(test: _Test) -> list[Entry]:
         effect = float(np.hypot(value, u)) * test.fog_share
         entries.append(
             Entry(error, True, value, u, unit, 0.0 if both else effect, effect if both else None,
-                  "X against FOG on the Earth-rate line (gravity terms at the net rate included)"
-                  + ("; cancels in the half-sum of the senses" if both else "; not corrected")),
+                  "Earth-rate line, X against FOG"),
         )  # fmt: skip
     return entries
 
@@ -203,7 +202,7 @@ def _delay(test: _Test) -> Entry:
     if not test.encoder or test.levels < 3:
         return Entry(
             "delay between channels", False, _DELAY, None, "s", _DELAY * per_second, None,
-            "not bounded: needs table_angle and three levels; the effect is that of 1 ms",
+            "needs table_angle, three levels",
         )  # fmt: skip
     parameters, covariance, _ = _tilted(test)
     pooled = (test.line / np.maximum(test.line_variance, 1e-300)).sum()
@@ -214,7 +213,7 @@ def _delay(test: _Test) -> Entry:
     u = float(np.sqrt(covariance[4, 4] + matrix[1, 1]))
     return Entry(
         "delay between channels", True, value, u, "s", float(np.hypot(value, u)) * per_second, None,
-        "turning of the FOG's line with the table rate less that of the drift (which must not turn with g); not corrected",
+        "phase over table rate, FOG less X",
     )  # fmt: skip
 
 
@@ -223,18 +222,19 @@ def _table_rate(test: _Test) -> Entry:
     if "manifest" in origins:
         return Entry(
             "table rate", False, None, None, "rad/s", 0.0, None,
-            "not bounded in runs without FOG line and encoder: a rate error r costs (r T)^2 / 24 of K",
+            "needs a FOG line or table_angle",
         )  # fmt: skip
     if origins == {"encoder"}:
-        return Entry("table rate", True, 0.0, 0.0, "rad/s", 0.0, None, "the phase was measured by the encoder")
+        return Entry("table rate", True, 0.0, 0.0, "rad/s", 0.0, None, "phase measured by the encoder")
     u = np.array([run.rates.table_uncertainty or 0.0 for run in test.runs])
     lost = (u * [run.duration for run in test.runs]) ** 2 / 24
     off = np.array([abs(run.rates.table_rate) - run.run.table_rate for run in test.runs])
     removed = (off * [run.duration for run in test.runs]) ** 2 / 24
     worst = int(np.argmax(np.abs(off)))
     return Entry(
-        "table rate", True, float(off[worst]), float(u[worst]), "rad/s", float(lost.max()), float(min(removed.max(), 1.0)),
-        "largest difference of the rate refined on the FOG's line from the manifest's",
+        "table rate", True, float(off[worst]), float(u[worst]), "rad/s", float(lost.max()),
+        float(min(removed.max(), 1.0)),
+        "refined on the FOG line, against manifest",
     )  # fmt: skip
 
 
@@ -244,7 +244,7 @@ def _arm_rate(test: _Test, manifest: Manifest) -> Entry:
     stated = manifest.rate_uncertainty / float(np.abs(test.arm).max())
     if not runs:
         return Entry(
-            "arm rate", False, None, manifest.rate_uncertainty, "rad/s", 2 * stated, None, "as the manifest states it"
+            "arm rate", False, None, manifest.rate_uncertainty, "rad/s", 2 * stated, None, "stated by the manifest"
         )
     off = np.array([r.run.sense * (r.rates.table_rate + (r.rates.net_rate or 0.0)) - r.run.arm_rate for r in runs])
     u = np.array([np.hypot(r.rates.net_uncertainty or 0.0, r.rates.table_uncertainty or 0.0) for r in runs])
@@ -253,7 +253,7 @@ def _arm_rate(test: _Test, manifest: Manifest) -> Entry:
     effect = 2 * float((np.hypot(off, u) / arm).max())
     return Entry(
         "arm rate", True, float(off[worst]), float(u[worst]), "rad/s", effect, None,
-        "largest difference of table rate plus net rate, as measured, from the manifest's arm rate; not corrected",
+        "table + net rate, against manifest",
     )  # fmt: skip
 
 
@@ -267,5 +267,5 @@ def _radius(test: _Test, manifest: Manifest) -> Entry:
         "m",
         relative,
         None,
-        "as the manifest states it; common to all K, not in zeta",
+        "stated by the manifest; not in zeta",
     )

@@ -1,10 +1,10 @@
 """A run compressed as it streams by: sums over cells of about one table period, from which all else is computed.
 
-Over a cell the model is linear in the columns of `COLUMNS`: constant, time, cosine and sine of chi, 2 chi, 3 chi and of the
-net angle, and time times those of chi and of the net angle. A rate that differs from the assumed one by d turns a line
-by ``d (t - t0)``; within a cell that is its value at the centre plus a small linear part, which the last four columns take
-up to second order, ``(d tau)^2 / 6``. So one pass gives the normal equations at any nearby rates, for any stretch of the run,
-and the scatter between stretches.
+Over a cell the model is linear in the columns of `COLUMNS`: constant, time, cosine and sine of chi, 2 chi, 3 chi and
+of the net angle, and time times those of chi and of the net angle. A rate that differs from the assumed one by d
+turns a line by ``d (t - t0)``; within a cell that is its value at the centre plus a small linear part, which the last
+four columns take up to second order, ``(d tau)^2 / 6``. So one pass gives the normal equations at any nearby rates,
+for any stretch of the run, and the scatter between stretches.
 """
 
 from __future__ import annotations
@@ -95,7 +95,8 @@ class Cells:
         return Cells(
             self.centre[first:last], moments, self.offset, self.start, self.step,
             round(float(moments[:, CONSTANT, CONSTANT].sum())), self.cell, self.table_rate, self.net_rate,
-            self.series_time[bins], self.series[:, bins], None if self.series_angle is None else self.series_angle[bins],
+            self.series_time[bins], self.series[:, bins],
+                None if self.series_angle is None else self.series_angle[bins],
         )  # fmt: skip
 
 
@@ -160,7 +161,10 @@ def compress(blocks: Iterable[Samples], table_rate: float, net_rate: float) -> C
         None if parts[0] is None else np.concatenate(parts, axis=-1 if parts[0].ndim == 2 else 0)
         for parts in zip(*results, strict=True)
     )
-    assert centre is not None and moments is not None and series_time is not None and series is not None
+    assert centre is not None
+    assert moments is not None
+    assert series_time is not None
+    assert series is not None
     left = len(rest.time)
     if left:
         # What remains is less than a cell: it joins the last one, whose columns are about its own centre.

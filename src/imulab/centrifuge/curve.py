@@ -48,8 +48,9 @@ class CurveFit:
 def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") -> CurveFit:
     """Fit K(a) by generalised least squares.
 
-    A term is taken where it lowers chi-square by more than the 5 % point of chi-square with one degree of freedom; where even
-    the largest model leaves more scatter than the covariance explains, chi-square counts in units of that scatter (F-test).
+    A term is taken where it lowers chi-square by more than the 5 % point of chi-square with one degree of freedom;
+    where even the largest model leaves more scatter than the covariance explains, chi-square counts in units of that
+    scatter (F-test).
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
     if model != "auto" and len(MODELS[model]) + 1 > len(K):
         raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(MODELS[model]) + 1}")
     names = [name for name, terms in MODELS.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]
-    whitened = np.linalg.cholesky(_regular(covariance))
+    whitened = np.asarray(np.linalg.cholesky(_regular(covariance)), dtype=np.float64)
     found = {name: _solve(force, K, whitened, MODELS[name]) for name in names}
     chosen = model
     if model == "auto":

@@ -16,6 +16,8 @@ from imulab.units import STANDARD_GRAVITY, from_si
 
 _POINTS = 121
 _SHOWN_SPECTRA = 3
+_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "x", "triangle-down")
+_CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
 
 
 def exhibits(record: Calibration) -> Exhibits:
@@ -67,7 +69,8 @@ def _headline(record: Calibration, prefix: str) -> str:
             100 * (float(top[0]) / start - 1), 100 * _curve_change(record, prefix, _force(record, last))
         )
         text += (
-            f"; at {_g(_force(record, last))} the factor is {change} ± {spread} % larger measured against K_1, and {fitted} ± {width} % "
+            f"; at {_g(_force(record, last))} the factor is {change} ± {spread} % larger measured against K_1, and "
+            f"{fitted} ± {width} % "
             "by the fitted curve"
         )
     return text + "."
@@ -103,7 +106,8 @@ def _facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
     for prefix in sets[:2]:
         K0 = record.parameters[f"{prefix}K0"]
         value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G)
-        facts.append((f"K0 {_label(prefix)}, deg/h/g", f"{value} ± {u}"))
+        digits = u.replace(".", "").lstrip("0")
+        facts.append((f"K0 {_label(prefix)}, deg/h/g", f"{value}({digits})"))
     loaded = [row for row in record.sections["runs"] if row["role"] == "loaded"]
     facts += [
         ("curve", ", ".join(dict.fromkeys(str(m) for m in record.model["curve"].values()))),
@@ -131,7 +135,7 @@ def _plain(values: Any) -> list[float | None]:
 
 
 def _zeta(record: Calibration, sets: list[str]) -> Figure:
-    """Change of K over g: the source's zeta and the fitted curve, each with its 95 % interval, relative to the curve's K0."""
+    """Change of K over g: the source's zeta and the fitted curve, each with its 95 % interval."""
     traces: list[dict[str, Any]] = []
     shown = [p for p in sets if "down" not in p] or sets
     for number, prefix in enumerate(shown):
@@ -146,9 +150,12 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
         change = 100 * (K / K0 - 1)
         where = {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
         traces += [
-            _scatter([*x, *x[::-1]], [*(change + 100 * half), *(change - 100 * half)[::-1]], "curve, 95 %", fill="toself",
-                     fillcolor="rgba(31,111,139,0.18)", line={"width": 0}, hoverinfo="skip", showlegend=number == 0, **where),
-            _scatter(x, change, "fitted curve", mode="lines", line={"color": GOOD, "width": 2}, showlegend=number == 0, **where),
+            _scatter([*x, *x[::-1]], [*(change + 100 * half), *(change - 100 * half)[::-1]], "curve, 95 %",
+                fill="toself",
+                     fillcolor="rgba(31,111,139,0.18)", line={"width": 0}, hoverinfo="skip", showlegend=number == 0,
+                         **where),
+            _scatter(x, change, "fitted curve", mode="lines", line={"color": GOOD, "width": 2},
+                showlegend=number == 0, **where),
         ]  # fmt: skip
         measured = np.array([record.value(f"{prefix}K_{level}") for level in levels])
         factors = record.fit["coverage_factor_95"]
@@ -161,7 +168,8 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
         traces.append(
             _scatter(force / STANDARD_GRAVITY, 100 * (measured / K0 - 1), "K_i against K0, 95 %", mode="markers",
                      marker={"color": INK, "size": 7}, showlegend=number == 0,
-                     error_y={"type": "data", "array": _plain(100 * u / K0), "color": INK, "thickness": 1.2, "width": 4}, **where)
+                     error_y={"type": "data", "array": _plain(100 * u / K0), "color": INK, "thickness": 1.2,
+                         "width": 4}, **where)
         )  # fmt: skip
         later = levels[1:]
         if later:
@@ -176,12 +184,15 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
             traces.append(
                 _scatter(force[1:] / STANDARD_GRAVITY + spread, zeta, "zeta_i against K_1, 95 %", mode="markers",
                          marker={"color": BAD, "size": 7, "symbol": "diamond-open"}, showlegend=number == 0,
-                         error_y={"type": "data", "array": _plain(bars), "color": BAD, "thickness": 1.2, "width": 4}, **where)
+                         error_y={"type": "data", "array": _plain(bars), "color": BAD, "thickness": 1.2,
+                             "width": 4}, **where)
             )  # fmt: skip
     return Figure(
         title="Change of the drift factor with specific force",
-        caption="zeta rests on K_1, the weakest run, so that all its points share one error; the fitted curve uses every level and "
-        "is what apply subtracts. Black points are the same K_i against the curve's K0. Points off the band by more than their bars "
+        caption="zeta rests on K_1, the weakest run, so that all its points share one error; the fitted curve uses "
+        "every level and "
+        "is what apply subtracts. Black points are the same K_i against the curve's K0. Points off the band by more "
+        "than their bars "
         "are what the curve does not describe.",
         traces=traces,
         layout=_panels([f"{_label(p)}: change of K, %" for p in shown], "specific force, g"),
@@ -227,20 +238,25 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
             )
             ring *= 2.448  # 95 % of a two-dimensional normal distribution
             traces.append(
-                _scatter(z[index].real + ring[0], z[index].imag + ring[1], "95 % region", mode="lines", line={"color": QUIET, "width": 1},
+                _scatter(z[index].real + ring[0], z[index].imag + ring[1], "95 % region", mode="lines",
+                    line={"color": QUIET, "width": 1},
                          hoverinfo="skip", showlegend=index == 0 and number == 0, **where)
             )  # fmt: skip
         traces.append(
-            _scatter(z.real, z.imag, "level, coloured by g", mode="lines+markers", line={"color": QUIET, "width": 1, "dash": "dot"},
-                     marker={"color": _plain(force), "colorscale": "Viridis", "size": 9, "line": {"color": "#ffffff", "width": 1},
-                             "showscale": number == len(shown) - 1, "colorbar": {"title": {"text": "g"}, "thickness": 12}},
-                     text=[f"{f:.3g} g" for f in force], hovertemplate="%{text}<extra></extra>", showlegend=number == 0, **where)
+            _scatter(z.real, z.imag, "level, coloured by g", mode="lines+markers", line={"color": QUIET, "width": 1,
+                "dash": "dot"},
+                     marker={"color": _plain(force), "colorscale": "Viridis", "size": 9,
+                         "line": {"color": "#ffffff", "width": 1},
+                             "showscale": number == len(shown) - 1,
+                             "colorbar": {"title": {"text": "g"}, "thickness": 12}},
+                     text=[f"{f:.3g} g" for f in force], hovertemplate="%{text}<extra></extra>",
+                     showlegend=number == 0, **where)
         )  # fmt: skip
-        for index in (0, len(rows) - 1):
-            annotations.append(
-                {"x": z[index].real, "y": z[index].imag, "xref": f"x{mark}", "yref": f"y{mark}", "text": f"{force[index]:.3g} g",
-                 "showarrow": True, "arrowcolor": QUIET, "ax": 26, "ay": -24 if index else 24}
-            )  # fmt: skip
+        annotations += [
+            {"x": z[index].real, "y": z[index].imag, "xref": f"x{mark}", "yref": f"y{mark}", "showarrow": True,
+             "text": f"{force[index]:.3g} g", "arrowcolor": QUIET, "ax": 26, "ay": -24 if index else 24}
+            for index in (0, len(rows) - 1)
+        ]  # fmt: skip
     layout = _panels([f"{_label(p)}: along Y, deg/h/g" for p in shown], "along X, deg/h/g", gap=0.13)
     layout["annotations"] = annotations
     for number in range(len(shown)):
@@ -248,8 +264,10 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
         layout[f"yaxis{mark}"] |= {"scaleanchor": f"x{mark}", "scaleratio": 1}
         layout[f"xaxis{mark}"] |= {"constrain": "domain"}
     caption = (
-        "Where in the gyroscope's frame the drift per g is largest, and how large: a line of points outward is nonlinearity in size, a line "
-        "across is a turning of the drift, which the magnitude does not show. The ring of the lowest level is the largest."
+        "Where in the gyroscope's frame the drift per g is largest, and how large: points in a line outward are "
+        "nonlinearity in size, across it a turning of the drift, which the magnitude does not show. The largest ring "
+        "is "
+        "that of the lowest level."
     )
     if not directed:
         caption = "Without table_angle the direction of the drift is not known: magnitudes are drawn along X."
@@ -261,7 +279,6 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
     traces: list[dict[str, Any]] = []
     axes = list(dict.fromkeys(p[0] for p in sets))
     cycles = sorted({row["power_cycle"] for row in record.sections["runs"] if row["role"] == "loaded"})
-    marks = ["circle", "square", "diamond", "triangle-up", "cross", "star", "x", "triangle-down"]
     level_of = {run: row for row in record.sections["levels"] for run in row["runs"]}
     for number, axis in enumerate(axes):
         mark = "" if number == 0 else str(number + 1)
@@ -276,10 +293,12 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
                 x.append(level["level"] + 0.5 * ((cycle_number + 0.5) / len(cycles) - 0.5) + 0.06 * (run["sense"] < 0))
                 y.append(100 * (run[axis]["K"]["value"] / K - 1))
                 bars.append(100 * run[axis]["K"]["standard_uncertainty"] / K)
+            colour = _CYCLES[cycle_number % len(_CYCLES)]
             traces.append(
-                _scatter(x, y, f"power cycle {cycle}", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0,
-                         marker={"symbol": marks[cycle_number % len(marks)], "size": 7, "color": [GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a"][cycle_number % 6]},
-                         error_y={"type": "data", "array": bars, "thickness": 1, "width": 3, "color": QUIET})
+                _scatter(x, y, f"power cycle {cycle}", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
+                         marker={"symbol": _MARKS[cycle_number % len(_MARKS)], "size": 7, "color": colour},
+                         error_y={"type": "data", "array": bars, "thickness": 1, "width": 3, "color": QUIET},
+                         showlegend=number == 0)
             )  # fmt: skip
     layout = _panels([f"{axis.upper()}: K of the run / K of the level − 1, %" for axis in axes], "level (number)")
     ticks = [row["level"] for row in record.sections["levels"]]
@@ -292,7 +311,8 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
         layout[f"yaxis{mark}"] |= {"zeroline": True, "zerolinecolor": QUIET}
     found = record.fit["repeatability"]
     words = (
-        f"they scatter by {100 * found['relative_standard_deviation']:.2g} % more than their noise, which was added to the uncertainties"
+        f"they scatter by {100 * found['relative_standard_deviation']:.2g} % beyond their noise, added to the "
+        f"uncertainties"
         if found["relative_standard_deviation"]
         else "their scatter is explained by their noise"
     )
@@ -319,8 +339,9 @@ def _spectra(record: Calibration) -> list[Figure]:
         names = (("dtg_x", "X", QUIET), ("fog", "FOG", "#b8860b"), ("residual_x", "X − FOG", GOOD))
         for name, label, colour in names:
             height = np.maximum(from_si(np.array(spectrum["height"][name]), "deg/h"), 1e-6)
+            width = 2.4 if name == "residual_x" else 1.6
             traces.append(
-                _scatter(rate, height, label, mode="lines", line={"color": colour, "width": 2.4 if name == "residual_x" else 1.6},
+                _scatter(rate, height, label, mode="lines", line={"color": colour, "width": width},
                          xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0)
             )  # fmt: skip
         row = by_level[spectrum["level"]]
@@ -329,13 +350,15 @@ def _spectra(record: Calibration) -> list[Figure]:
         line = from_si(K * a, "deg/h")
         centre = float(np.median(rate))
         traces.append(
-            _scatter([centre], [line], "fitted K a", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0,
-                     marker={"color": BAD, "size": 10, "symbol": "circle-open", "line": {"width": 2}})
+            _scatter([centre], [line], "fitted K a", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
+                     showlegend=number == 0, marker={"color": BAD, "size": 10, "symbol": "circle-open",
+                         "line": {"width": 2}})
         )  # fmt: skip
         titles.append("height, deg/h" if number == 0 else "")
         annotations.append(
-            {"xref": f"x{mark} domain", "yref": f"y{mark} domain", "x": 0.03, "y": 0.99, "showarrow": False, "xanchor": "left", "yanchor": "top",
-             "align": "left", "text": f"<b>{from_si(a, 'g'):.3g} g</b><br>K a = {line:.3g} deg/h"}
+            {"xref": f"x{mark} domain", "yref": f"y{mark} domain", "x": 0.03, "y": 0.99, "showarrow": False,
+             "xanchor": "left", "yanchor": "top", "align": "left",
+             "text": f"<b>{from_si(a, 'g'):.3g} g</b><br>K a = {line:.3g} deg/h"}
         )  # fmt: skip
     layout = _panels(titles, "rate, deg/s", gap=0.07)
     layout["annotations"] = annotations
@@ -346,8 +369,9 @@ def _spectra(record: Calibration) -> list[Figure]:
     figures.append(
         Figure(
             "Spectrum around the table rate",
-            "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left of X without it "
-            "is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further lines are vibration.",
+            "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left "
+            "of X without it is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further "
+            "lines are vibration.",
             traces, layout, height=400,
         )
     )  # fmt: skip

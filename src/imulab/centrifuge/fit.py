@@ -41,9 +41,9 @@ def fit_centrifuge(
 ) -> CentrifugeFit:
     """Reduce a centrifuge test to K and zeta at every level and the curve K(a), run by run, block by block.
 
-    ``least-squares``: X, Y and FOG regressed on constant, trend, and lines at chi, 2 chi, 3 chi and the net rate, with the
-    phase measured by the encoder or the frequency refined on the FOG; ``fourier``: whole-period sums at the manifest's rate,
-    as published. ``K_i = |X - FOG| / a_i``, ``zeta_i = K_i / K_1 - 1``.
+    ``least-squares``: X, Y and FOG regressed on constant, trend, and lines at chi, 2 chi, 3 chi and the net rate,
+    with the phase measured by the encoder or the frequency refined on the FOG; ``fourier``: whole-period sums at the
+    manifest's rate, as published. ``K_i = |X - FOG| / a_i``, ``zeta_i = K_i / K_1 - 1``.
 
     Parameters
     ----------
@@ -132,6 +132,7 @@ def _rest(statics: list[StaticRun], run: Run, manifest: Manifest, index: int) ->
 
 
 def _same_channels(statics: list[StaticRun], runs: list[LoadedRun], manifest: Manifest) -> None:
-    for each in (*statics, *runs):
+    reduced: list[StaticRun | LoadedRun] = [*statics, *runs]
+    for each in reduced:
         if "dtg_y" not in each.channels and any("dtg_y" in run.channels for run in runs):
             raise DataError(f"{manifest.place(each.index)}: no column dtg_y, which other runs have")

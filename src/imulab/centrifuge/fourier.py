@@ -1,7 +1,7 @@
 """The source's reduction: sums over whole periods at the manifest's rate, as the run streams by.
 
-``A = (2/N) sum D cos(j w_s t)``, ``B`` likewise with the sine, ``N = m T / t`` rounded to the nearest sample; j counts samples
-from 0, t is the sampling period, T the table period, m the number of whole periods.
+``A = (2/N) sum D cos(j w_s t)``, ``B`` likewise with the sine, ``N = m T / t`` rounded to the nearest sample; j
+counts samples from 0, t is the sampling period, T the table period, m the number of whole periods.
 
 Source: CN102636185A, steps (a) to (e).
 """

@@ -1,7 +1,8 @@
 """Runs to levels: the lines of all power cycles and both senses at one specific force, pooled with their covariance.
 
-A level's line is per unit of specific force: ``Z = (A + i B) / a``, rad/s/(m/s^2), one complex number for each axis. Without
-encoder its phase means nothing; then magnitudes are pooled, each corrected for noise (Rice: ``-sigma^2 / 2 |Z|``).
+A level's line is per unit of specific force: ``Z = (A + i B) / a``, rad/s/(m/s^2), one complex number for each axis.
+Without encoder its phase means nothing; then magnitudes are pooled, each corrected for noise (Rice: ``-sigma^2 / 2
+|Z|``).
 """
 
 from __future__ import annotations
@@ -83,10 +84,16 @@ class Level:
 
 @dataclass(frozen=True)
 class Levels:
-    """All levels, spin axis up first, by rising force; relative scatter between power cycles beyond the noise, and its weight.
+    """All levels, spin axis up first, by rising force.
 
-    ``repeatability`` is the standard deviation that was added to each run (0 where noise explains the scatter), `observed` the
-    scatter over that expected of noise, as chi-square and degrees of freedom.
+    Attributes
+    ----------
+    items, lines
+        The levels, and the lines of each run by its number.
+    repeatability
+        Relative standard deviation between power cycles that was added to each run; 0 where noise explains the scatter.
+    chi_square, freedom
+        Of that scatter over the noise.
     """
 
     items: tuple[Level, ...]
@@ -159,7 +166,8 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
             lines[run.index] = _run_line(run, manifest, method, directed)
     if undirected:
         warnings.append(
-            f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes of the two "
+            f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes of "
+            f"the two "
             "senses were averaged, so that flexure and tilt do not cancel"
         )
     members = [[lines[run.index] for run in groups[key]] for key in keys]
@@ -170,7 +178,8 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
     ]
     if excess:
         warnings.append(
-            f"K differs between power cycles by {100 * np.sqrt(excess):.2g} % (one standard deviation) beyond the noise; "
+            f"K differs between power cycles by {100 * np.sqrt(excess):.2g} % (one standard deviation) beyond the "
+            f"noise; "
             "this was added to each run's uncertainty"
         )
     return Levels(tuple(items), lines, float(np.sqrt(excess)), chi_square, freedom, tuple(warnings))
@@ -188,7 +197,8 @@ def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -
         line = size.astype(np.complex128)
     vector = as_vector(line)
     relative = 2 * manifest.rate_uncertainty / run.run.arm_rate
-    # Amplitude lost to an uncertain table rate, (u T)^2 / 24: of second order, and small wherever the FOG's line is clear.
+    # Amplitude lost to an uncertain table rate, (u T)^2 / 24: of second order, and small wherever the FOG's line is
+    # clear.
     lost = 0.0 if run.rates.table_uncertainty is None else (run.rates.table_uncertainty * run.duration) ** 2 / 24
     rate = (relative**2 + lost**2) * np.outer(vector, vector)
     return RunLine(run, line, real_covariance(covariance), rate, run.freedom)
@@ -197,7 +207,7 @@ def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -
 def _weights(group: list[RunLine], axis: int, excess: float) -> Array:
     """Inverse-variance weights of a level's runs for one axis; half for each sense where there are both."""
     variance = np.array([_radial(line, axis, excess) for line in group])
-    weights = 1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300)
+    weights: Array = 1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300)
     senses = np.array([line.source.run.sense for line in group])
     for sense in np.unique(senses):
         weights[senses == sense] /= weights[senses == sense].sum() * len(np.unique(senses))
@@ -208,7 +218,7 @@ def _radial(line: RunLine, axis: int, excess: float) -> float:
     """Variance along the line of one axis."""
     pair = slice(2 * axis, 2 * axis + 2)
     noise = float(np.trace(line.noise[pair, pair])) / 2
-    return noise + float(np.trace(line.rate[pair, pair])) + excess * abs(line.line[axis]) ** 2
+    return noise + float(np.trace(line.rate[pair, pair])) + excess * float(abs(line.line[axis])) ** 2
 
 
 def _pooled(number: int, spin_axis: str, group: list[RunLine], excess: float, freedom: int, directed: bool) -> Level:
@@ -237,7 +247,7 @@ def _pooled(number: int, spin_axis: str, group: list[RunLine], excess: float, fr
 
 
 def _repeatability(members: list[list[RunLine]]) -> tuple[float, float, int]:
-    """Relative variance between power cycles beyond the noise, with chi-square of the scatter and its degrees of freedom."""
+    """Relative variance between power cycles beyond the noise; chi-square of the scatter, degrees of freedom."""
     residuals, variances, freedom = [], [], 0
     for group in members:
         for sense in (1, -1):

@@ -181,7 +181,8 @@ def _check_lines(run: Run, place: str) -> None:
     for times, words in ((1, "equals the net rate"), (2, "is half the net rate")):
         if abs(times * run.table_rate - net) <= _SAME_RATE * net:
             raise ReadError(
-                f"{place}: table_rate {_degrees(run.table_rate)} {words} of {_degrees(net)} (arm_rate less table_rate): "
+                f"{place}: table_rate {_degrees(run.table_rate)} {words} of {_degrees(net)} (arm_rate less "
+                f"table_rate): "
                 "the lines of Earth rate and of specific force coincide; expected another net rate or level"
             )
 
@@ -227,7 +228,8 @@ def _run(entry: Mapping[str, Any], place: str, rate_unit: str) -> Run:
         value = _number(entry[key], f"{place}: {key}")
         if not value > 0:
             raise ReadError(
-                f"{place}: {key} = {entry[key]!r}: expected more than 0 (a reversed run has positive rates and sense = -1)"
+                f"{place}: {key} = {entry[key]!r}: expected more than 0 (a reversed run has positive rates and sense "
+                f"= -1)"
             )
         rates.append(to_si(value, rate_unit))
     return Run(file, cycle, str(role), rates[0], rates[1], sense, str(spin_axis))

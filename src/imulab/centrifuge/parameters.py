@@ -1,7 +1,7 @@
 """Levels to parameters: K, zeta, the curve, its direction and the cross terms, with one covariance over all of them.
 
-Every parameter is a function of the levels' lines; its derivative carries their covariance. The radius is common: with a
-relative error rho of R every K is off by -rho, c1 by -rho, c2 by -2 rho, zeta not at all.
+Every parameter is a function of the levels' lines; its derivative carries their covariance. The radius is common:
+with a relative error rho of R every K is off by -rho, c1 by -rho, c2 by -2 rho, zeta not at all.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def _cross(
     rows: list[_Row],
     warnings: list[str],
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Add the spin-axis cross terms where a level has the spin axis both ways: half the difference of its lines over g."""
+    """Add the cross terms where a level has the spin axis both ways: half the difference of its lines over g."""
     where = {(level.spin_axis, level.number): index for index, level in enumerate(items)}
     found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for (spin_axis, number), up in where.items():

@@ -1,7 +1,7 @@
 """Which runs a centrifuge test needs: rates for the wanted levels, what they will give, and what is wrong with them.
 
-A run of duration T gives its line with ``sigma = N sqrt(2 / T)`` for noise of density N (angle random walk, rad/sqrt(s)) of
-DTG and FOG together; ``u(K)/K = sigma / (K a)``, over sqrt(n) for n runs.
+A run of duration T gives its line with ``sigma = N sqrt(2 / T)`` for noise of density N (angle random walk,
+rad/sqrt(s)) of DTG and FOG together; ``u(K)/K = sigma / (K a)``, over sqrt(n) for n runs.
 """
 
 from __future__ import annotations
@@ -22,8 +22,18 @@ _HIGHEST_RATE = 50.0  # rad/s
 
 @dataclass(frozen=True)
 class PlannedLevel:
-    """One level: force, m/s^2; rates, rad/s; table periods in a run; relative uncertainty of K with all runs; what zeta and
-    the duration for the wanted uncertainty will be, 1 and s.
+    """One level.
+
+    Attributes
+    ----------
+    force, arm_rate, table_rate
+        m/s^2 and rad/s.
+    periods
+        Table periods in a run.
+    relative, zeta
+        Predicted standard uncertainty of K, as a part of it, with all runs; and of zeta.
+    needed
+        Duration of a run for the wanted uncertainty, s.
     """
 
     force: float
@@ -155,7 +165,8 @@ def _warnings(
             better = net_rate * (1 + 3 * _NEAR)
             refused = " (reduce refuses it where they coincide)" if times <= 1 else ""
             found.append(
-                f"{name}: table rate {_deg(level.table_rate)} is near {words}: Earth rate and the drift fall on one line or its "
+                f"{name}: table rate {_deg(level.table_rate)} is near {words}: Earth rate and the drift fall on one "
+                f"line or its "
                 f"harmonic{refused}; take a net rate of {_deg(better)} or move the level by some percent"
             )
         if level.relative > uncertainty:
@@ -165,12 +176,14 @@ def _warnings(
         longest = max(PERIODS_ASKED * 2 * math.pi / level.table_rate for level in few)
         names = ", ".join(f"{from_si(level.force, 'g'):.4g} g ({level.periods:.0f})" for level in few)
         found.append(
-            f"{names}: fewer than the {PERIODS_ASKED} table periods that method fourier asks for ({longest / 60:.0f} min would give "
+            f"{names}: fewer than the {PERIODS_ASKED} table periods that method fourier asks for ({longest / 60:.0f} "
+            f"min would give "
             "them at every level); method least-squares does not need them"
         )
     if not both_senses:
         found.append(
-            "one sense of rotation only: differential flexure (0.1 µrad/g is up to 7.5 % of K at 40 g), scale mismatch and "
+            "one sense of rotation only: differential flexure (0.1 µrad/g is up to 7.5 % of K at 40 g), scale "
+            "mismatch and "
             "azimuth are not separated; run both senses (--both-senses, with table_angle recorded)"
         )
     return found
@@ -185,7 +198,8 @@ def _too_short(name: str, level: PlannedLevel, duration: float, runs: int, uncer
         return text + f"run {level.needed / 60:.0f} min instead of {duration / 60:.0f}"
     more = math.ceil(runs * level.needed / duration)
     return text + (
-        f"too noisy: it takes {level.needed / 3600:.1f} h a run, or {more} runs of {duration / 60:.0f} min; a quieter gyroscope or FOG, "
+        f"too noisy: it takes {level.needed / 3600:.1f} h a run, or {more} runs of {duration / 60:.0f} min; a "
+        f"quieter gyroscope or FOG, "
         "a higher reference level, or the fitted curve, which does not rest on this level"
     )
 

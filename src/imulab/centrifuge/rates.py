@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.centrifuge.cells import Cells
 from imulab.centrifuge.model import EARTH_RATE
@@ -160,7 +161,7 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
     size = np.abs(solution.line(LINE))
     deviation = np.abs(found.deviation)
     sigma = np.median(deviation, axis=0) / 1.1774
-    bad = (deviation > _STANDS_OUT * sigma + _UNSTEADY * size).any(axis=1)
+    bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size, axis=1)
     count = len(bad)
     low = int(np.argmin(bad))
     high = count - int(np.argmin(bad[::-1]))
@@ -263,7 +264,8 @@ def find_rates(cells: Cells, place: str) -> Rates:
     solution = solve(cells, *shifts)
     rate = _encoder_rate(cells) if encoder else cells.table_rate + shifts[0]
     return Rates(
-        solution, rate, table_uncertainty, origin, net_rate, net_uncertainty, _noise(cells, solution, ROOM), tuple(warnings)
+        solution, rate, table_uncertainty, origin, net_rate, net_uncertainty, _noise(cells, solution, ROOM),
+            tuple(warnings)
     )  # fmt: skip
 
 
@@ -291,7 +293,8 @@ def _check_units(solution: Solution, noise: Complex, place: str) -> None:
     size = np.abs(solution.line(ROOM))
     if not _POLAR < size[-1] < 1.2 * EARTH_RATE:
         raise DataError(
-            f"{place}: column fog shows Earth rate as {from_si(float(size[-1]), 'deg/h'):.4g} deg/h, expected up to 15.04 deg/h: "
+            f"{place}: column fog shows Earth rate as {from_si(float(size[-1]), 'deg/h'):.4g} deg/h, expected up to "
+            f"15.04 deg/h: "
             "is its unit or scale factor wrong?"
         )
     sigma = np.sqrt(solution.gain(ROOM) * np.diagonal(noise).real)
@@ -304,7 +307,7 @@ def _check_units(solution: Solution, noise: Complex, place: str) -> None:
 
 
 def _noise(cells: Cells, solution: Solution, row: int) -> Complex:
-    """Noise of a line by its scatter over blocks, or by the residuals of the whole where the run is too short for that."""
+    """Noise of a line by its scatter over blocks, or by the residuals where the run is too short for that."""
     least = 2 * np.pi / max(abs(cells.net_rate), 1e-9) if row == ROOM else 0.0
     found = scatter(cells, solution, row, least=min(least, cells.duration / 3))
     return residual_noise(cells, solution) if found is None else found.noise
@@ -318,12 +321,14 @@ def residual_noise(cells: Cells, solution: Solution) -> Complex:
     square = cells.moments[:, columns:, columns:].sum(axis=0)
     fitted = np.tensordot(P, cells.moments[:, :columns, :columns] @ P, axes=((0, 1), (0, 1)))
     left = square - cross - cross.T + fitted
-    return (left / max(cells.samples - int(solution.kept.sum()), 1)).astype(np.complex128)
+    noise: Complex = (left / max(cells.samples - int(solution.kept.sum()), 1)).astype(np.complex128)
+    return noise
 
 
 def _significant(solution: Solution, row: int, channel: int, noise: Complex) -> bool:
     size = abs(solution.line(row)[channel])
-    return size > _FAINT and size**2 > _SIGNIFICANT * 2 * solution.gain(row) * noise[channel, channel].real
+    power = 2 * solution.gain(row) * float(noise[channel, channel].real)
+    return bool(size > _FAINT and size**2 > _SIGNIFICANT * power)
 
 
 def _encoder_rate(cells: Cells) -> float:
@@ -337,10 +342,16 @@ def _encoder_rate(cells: Cells) -> float:
 
 
 def hann_spectrum(time: Array, values: Array, frequencies: Array) -> Complex:
-    """Return the Hann-windowed spectrum at angular frequencies, scaled so that a line shows its ``A - i B``, shape (f,)."""
+    """Return the Hann-windowed spectrum at angular frequencies, a line showing as its ``A - i B``, shape (f,)."""
     window = 1 - np.cos(2 * np.pi * (np.arange(len(time)) + 0.5) / len(time))
     weighted = window * values / window.sum() * 2
-    spectrum: Complex = np.exp(-1j * np.outer(frequencies, time - time[0])) @ weighted
+    # Times as start of a stretch plus a multiple of the step: few exponentials, and the rest is a matrix product.
+    stretch = max(1, int(np.sqrt(len(time))))
+    padded = np.append(weighted, np.zeros(-len(time) % stretch)).reshape(-1, stretch)
+    step = (time[-1] - time[0]) / max(len(time) - 1, 1)
+    inner = padded @ np.exp(-1j * np.outer(np.arange(stretch) * step, frequencies))
+    outer = np.exp(-1j * np.outer(time[::stretch] - time[0], frequencies))
+    spectrum: Complex = (inner * outer).sum(axis=0)
     return spectrum
 
 
@@ -397,8 +408,8 @@ def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float 
     time, values = cells.series_time, _without_table_lines(cells, table_shift, fog)
     count = len(time)
     window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
-    height = 2 * np.abs(np.fft.rfft(window * values)) / window.sum()
-    rates = 2 * np.pi * np.fft.rfftfreq(count, cells.series_step)
+    height: Array = np.asarray(2 * np.abs(np.fft.rfft(window * values)) / window.sum(), dtype=np.float64)
+    rates: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(count, cells.series_step), dtype=np.float64)
     floor = float(np.median(height))
     peak = np.zeros(len(height), dtype=np.bool_)
     peak[1:-1] = (

@@ -93,7 +93,9 @@ def _value(number: float, unit: str) -> dict[str, Any]:
 def _noise_text(runs: Sequence[LoadedRun]) -> str:
     fewest = min(run.blocks for run in runs)
     if fewest == 0:
-        return "white noise from the residuals in runs too short for blocks; else scatter of the line over blocks of the run"
+        return (
+            "white noise from the residuals where a run is too short for blocks, else scatter of the line over blocks"
+        )
     return f"scatter of the line over {fewest} blocks of a run or more (coloured noise included)"
 
 
@@ -236,13 +238,15 @@ def _warnings(
             worst = min(few, key=lambda run: run.whole_periods.periods if run.whole_periods else 0)
             periods = worst.whole_periods.periods if worst.whole_periods else 0
             found.append(
-                f"{len(few)} runs have 500 table periods or fewer (least: {worst.run.file}, {periods}): drift leaks into "
+                f"{len(few)} runs have 500 table periods or fewer (least: {worst.run.file}, {periods}): drift leaks "
+                f"into "
                 "whole-period sums; method least-squares has no such limit"
             )
     for prefix, fitted in estimates.curves.items():
         if fitted.probability is not None and fitted.probability < _UNLIKELY:
             found.append(
-                f"{prefix.rstrip('_')}: K(a) is not described by the curve {fitted.model} within its uncertainty (chi-square "
+                f"{prefix.rstrip('_')}: K(a) is not described by the curve {fitted.model} within its uncertainty "
+                f"(chi-square "
                 f"{fitted.chi_square:.1f} with {fitted.freedom} degrees of freedom)"
             )
     for prefix, probability in estimates.turning.items():
@@ -254,7 +258,8 @@ def _warnings(
             ]
             span = float(np.ptp(np.unwrap(np.radians(angles))))
             found.append(
-                f"{prefix.rstrip('_')}: the direction of the drift turns by {np.degrees(span):.2g} deg between the levels: "
+                f"{prefix.rstrip('_')}: the direction of the drift turns by {np.degrees(span):.2g} deg between the "
+                f"levels: "
                 "nonlinearity that the magnitude does not show"
             )
     senses = {run.run.sense for run in runs}

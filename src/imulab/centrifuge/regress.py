@@ -1,8 +1,8 @@
 """Regression of a run's channels on its lines, from cells: at given rates, with rates refined, and its noise.
 
-Model of each channel: constant, trend, and cosine and sine of chi, 2 chi, 3 chi and of the net angle. Noise of a line is
-taken from the scatter of the line over blocks of the run (batch means): it holds for coloured noise as long as that is
-no longer correlated than a block.
+Model of each channel: constant, trend, and cosine and sine of chi, 2 chi, 3 chi and of the net angle. Noise of a line
+is taken from the scatter of the line over blocks of the run (batch means): it holds for coloured noise as long as
+that is no longer correlated than a block.
 
 Sources: IEEE Std 1057 (four-parameter sine fit); Fishman, Management Science 24 (1978) 510 (batch means).
 """
@@ -191,7 +191,7 @@ def refine(cells: Cells, channel: int, table_shift: float | None, net_shift: flo
 def _rate_column(cells: Cells, P: Array, beta: Array, row: int, linear: int, middle: float, half: float) -> Array:
     """Derivative of a line with respect to its rate times `half`, in the columns of the cells, shape (c, 14)."""
     turned = beta[row + 1] * P[:, :, row] - beta[row] * P[:, :, row + 1]
-    column = turned * ((cells.centre - middle) / half)[:, None]
+    column: Array = turned * ((cells.centre - middle) / half)[:, None]
     own = {TIME_CHI: CHI, TIME_NET: NET}[linear]
     column[:, linear : linear + 2] += turned[:, own : own + 2] / half
     return column

@@ -139,7 +139,8 @@ def _rate(block: Recording, name: str, manifest: Manifest, place: str) -> Array:
     known = manifest.scale_factors.get(name)
     if known is None:
         raise UnitError(
-            f"{place}: column {name} is in {unit.symbol}: expected a unit of rate, or {name} under [scale_factor] in the manifest"
+            f"{place}: column {name} is in {unit.symbol}: expected a unit of rate, or {name} under [scale_factor] in "
+            f"the manifest"
         )
     if known[1] != unit.symbol:
         raise UnitError(f"{place}: column {name} is in {unit.symbol}, but its scale factor is in {known[1]} per rate")
@@ -202,7 +203,8 @@ def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -
                 "expected a record at rest"
             )
     return StaticRun(
-        manifest.runs[index], index, named.channels, sums.sum(axis=0) / count.sum() + cells.offset, cells.samples, cells.duration
+        manifest.runs[index], index, named.channels, sums.sum(axis=0) / count.sum() + cells.offset, cells.samples,
+            cells.duration
     )  # fmt: skip
 
 
@@ -291,7 +293,8 @@ def _check_resolution(cells: Cells, run: Run, place: str) -> None:
         beat = abs(times * run.table_rate - net)
         if beat * cells.duration < 2 * np.pi:
             raise DataError(
-                f"{place}: {cells.duration:.4g} s are too short to tell the line at {times} x table_rate from the net rate; "
+                f"{place}: {cells.duration:.4g} s are too short to tell the line at {times} x table_rate from the "
+                f"net rate; "
                 f"expected {2 * np.pi / beat:.4g} s or more, or another net rate"
             )
 
@@ -309,16 +312,14 @@ def _whole_periods(sums: PeriodSums, static: Array, cells: Cells, used: Cells, p
 
 
 def _spectrum(cells: Cells, rates: Rates, turn: complex) -> tuple[Array, Array]:
-    """Hann spectra around the table line: every channel, then what is left of each after the FOG's line is taken off."""
+    """Hann spectra around the table line: every channel, then what is left of each without the FOG."""
     width = 2 * np.pi / cells.duration
     points = _SPECTRUM_HALF_WIDTH * _SPECTRUM_POINTS
     shifts = np.arange(-points, points + 1) * width / _SPECTRUM_POINTS
     time = cells.series_time
     heights = []
     rate = abs(rates.table_rate)
-    spectra = []
-    for values in cells.series:
-        spectra.append(hann_spectrum(time, values - values.mean(), rate + shifts))
+    spectra = [hann_spectrum(time, values - values.mean(), rate + shifts) for values in cells.series]
     heights = [np.abs(spectrum) for spectrum in spectra]
     # Y sees what is fixed in the arm a quarter turn after X, which in a spectrum at positive rates is a factor -i.
     quarter = -1j if rates.table_rate > 0 else 1j

@@ -2,8 +2,8 @@
 
 Written from the equations of motion in the time domain, apart from the reduction, which knows lines only. An arm-fixed
 vector stands in the gyroscope's frame at the angle chi (from X, turning to Y), which grows at the table rate; what is
-fixed in the room stands there at minus the angle by which the gyroscope has turned. An input axis at the angle psi (X: 0,
-Y: a quarter turn, FOG: its azimuth error) senses the cosine of the angle between.
+fixed in the room stands there at minus the angle by which the gyroscope has turned. An input axis at the angle psi
+(X: 0, Y: a quarter turn, FOG: its azimuth error) senses the cosine of the angle between.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class AxisTruth:
 
 @dataclass(frozen=True)
 class FogTruth:
-    """The fibre-optic gyroscope: bias, rad/s; azimuth error eta against X and mu, rad; delay, s; the rest as for an axis."""
+    """The fibre-optic gyroscope: azimuth error eta against X, rad; delay, s; the rest as for an axis."""
 
     bias: float = 0.0
     scale_error: float = 0.0
@@ -345,9 +345,9 @@ def simulate_centrifuge(
 ) -> Simulation:
     """Simulate a centrifuge test.
 
-    ``X = (1 + k_x) common + D_F + (D_X + g D_XZ) a cos chi + (D_Y + g D_YZ) a sin chi + D_XX a^2 cos^2 chi + D_XXX a^3 cos^3
-    chi`` + gravity terms + differential flexure + noise, ``common = w_n mu + W_N cos(w_n t) - w_t (delta + kappa a) cos(chi +
-    ..)``; the FOG senses the common rate alone.
+    ``X = (1 + k_x) common + D_F + (D_X + g D_XZ) a cos chi + (D_Y + g D_YZ) a sin chi + D_XX a^2 cos^2 chi + D_XXX
+    a^3 cos^3 chi`` + gravity terms + differential flexure + noise, ``common = w_n mu + W_N cos(w_n t) - w_t (delta +
+    kappa a) cos(chi + ..)``; the FOG senses the common rate alone.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ def parameters_table(record: Calibration) -> Table:
     factors = record.fit["coverage_factor_95"]
     freedom = record.fit["degrees_of_freedom"]
     for name, parameter in record.parameters.items():
-        stem = [part for part in name.split("_")[1:] if part != "down"][0]
+        stem = next(part for part in name.split("_")[1:] if part != "down")
         factor, unit = _ENGINEERING[stem]
         value, u = parameter.value * factor, (parameter.standard_uncertainty or 0.0) * factor
         ends = " to ".join(format_uncertain(value + sign * factors[name] * u, u)[0] for sign in (-1, 1))
@@ -46,7 +46,8 @@ def parameters_table(record: Calibration) -> Table:
         rows.append([name, *format_uncertain(value, u), ends, unit, "many" if nu > 999 else f"{nu:.0f}"])
     return Table(
         title="Parameters",
-        caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a term that is absent is 0; "
+        caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a "
+        "term that is absent is 0; "
         f"direction: from X toward Y. Noise: {record.fit['noise']}; 95 % intervals by Student's t.",
         columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit", "degrees of freedom"],
         rows=rows,
@@ -83,11 +84,11 @@ def curve_table(record: Calibration, sets: list[str]) -> Table:
     rows = []
     for prefix in sets:
         found = record.fit["curves"][prefix.rstrip("_")]
-        for tried in found["tried"]:
-            rows.append(
-                [prefix.rstrip("_").replace("_", " "), tried["model"], str(tried["coefficients"]), f"{tried['chi_square']:.2f}",
-                 "chosen" if tried["chosen"] else ""]
-            )  # fmt: skip
+        axis = prefix.rstrip("_").replace("_", " ")
+        rows += [
+            [axis, each["model"], str(each["coefficients"]), f"{each['chi_square']:.2f}", "chosen" * each["chosen"]]
+            for each in found["tried"]
+        ]
     return Table(
         "Terms of the curve",
         "Weighted fits to the K_i. A term is taken where it lowers chi-square by more than its 5 % point.",
@@ -107,7 +108,8 @@ def budget_table(record: Calibration) -> Table:
         )  # fmt: skip
     return Table(
         "Error budget (X axis)",
-        "What survives the subtraction of the FOG, or would without it: effect on K at the highest level. Bounded: by these data. Where "
+        "What survives the subtraction of the FOG, or would without it: effect on K at the highest level. Bounded: "
+        "by these data. Where "
         "not, value and effect are those of the size named.",
         ["error", "bounded", "value", "u", "unit", "effect on K", "removed", "from"],
         rows,

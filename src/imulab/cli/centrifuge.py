@@ -64,7 +64,7 @@ def plan(
         typer.Option("-o", "--output", metavar="PLAN.toml", help="Manifest, or .csv list of runs, to write."),
     ] = None,
 ) -> None:
-    """List the runs for wanted g levels, predict their uncertainty, and say which are too short, too close or too noisy."""
+    """List the runs for wanted levels, predict uncertainties, and say which are too short, too close or too noisy."""
     from imulab.centrifuge.plan import plan_centrifuge
 
     check_outputs([output], [])
@@ -112,7 +112,7 @@ def simulate(
     unit: Annotated[str, typer.Option(help="Of the rates: deg/h deg/s rad/s.")] = "deg/h",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
-    """Simulate a centrifuge test of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth."""
+    """Simulate the test of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth."""
     from dataclasses import replace
 
     from imulab.centrifuge.manifest import load_manifest, make_manifest
@@ -266,7 +266,8 @@ def _plan_text(result: Plan) -> str:
     ]
     titles = ["level, g", "arm, deg/s", "table, deg/s", "periods", "u(K), %", "u(zeta), %", "needed, min"]
     head = (
-        f"{len(result.manifest.runs)} runs, {result.total / 3600:.1f} h of recording ({result.duration / 60:.0f} min each, static "
+        f"{len(result.manifest.runs)} runs, {result.total / 3600:.1f} h of recording ({result.duration / 60:.0f} min "
+        f"each, static "
         f"{result.static_duration / 60:.0f} min); needed: duration of a run for the wanted uncertainty"
     )
     return "\n".join([head, *aligned(titles, rows)])
@@ -280,7 +281,8 @@ def _write_plan(result: Plan, output: str) -> None:
     test = result.manifest
     if output.lower().endswith(".toml"):
         comments = [
-            f"{len(test.runs)} runs; warm up 10 min after each power-on, then the static record of {result.static_duration / 60:.0f} min,",
+            f"{len(test.runs)} runs; warm up 10 min after each power-on, then the static record of "
+            f"{result.static_duration / 60:.0f} min,",
             f"then the loaded runs of {result.duration / 60:.0f} min. Columns: time, dtg_x, dtg_y, fog, table_angle.",
         ]
         write_text(output, manifest_text(test, comments))
