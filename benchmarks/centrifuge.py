@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,6 @@ import numpy as np
 
 from imulab.centrifuge.fit import fit_centrifuge
 from imulab.centrifuge.manifest import Run, make_manifest
-from imulab.centrifuge.parameters import estimate
 from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from imulab.recording import Recording
 
@@ -52,8 +51,8 @@ def forty_three_million() -> list[tuple[str, str, str]]:
         what = "with table_angle" if encoder else "without table_angle"
         rows.append(
             (
-                f"six power cycles x 8 runs x 15 min at 1 kHz ({source.samples / 1e6:.1f} million samples x 3), {what}, "
-                "reading excluded",
+                f"six power cycles x 8 runs x 15 min at 1 kHz ({source.samples / 1e6:.1f} million samples x 3), "
+                f"{what}, reading excluded",
                 f"{spent:.1f} s",
                 "<= 20 s on 2 cores",
             )
@@ -105,20 +104,18 @@ def accuracy() -> list[tuple[str, str, str]]:
 
 
 def coverage(trials: int = 2000) -> list[tuple[str, str, str]]:
-    """Coverage of the 95 % intervals on a shortened test: 40 s runs at 10 Hz, two power cycles."""
+    """Coverage of the 95 % intervals on a shortened test (see tests/centrifuge_trials.py)."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-    from reference.centrifuge import shortened_test
+    from centrifuge_trials import coverage_of
 
-    rows = []
+    found = []
     for encoder in (True, False):
-        covered, rms = shortened_test(fit_centrifuge, estimate, trials, encoder=encoder)
+        shares = coverage_of(trials, encoder=encoder)
         what = "with table_angle" if encoder else "without table_angle"
-        for name, share in covered.items():
-            rows.append(
-                (f"95 % intervals of {name}, {trials} shortened tests, {what}", f"{100 * share:.1f} %", "93 to 97 %")
-            )
-        del rms
-    return rows
+        for name, share in shares.items():
+            label = f"95 % intervals of {name}, {trials} shortened tests, {what}"
+            found.append((label, f"{100 * share:.1f} %", "93 to 97 %"))
+    return found
 
 
 def rows() -> list[tuple[str, str, str]]:

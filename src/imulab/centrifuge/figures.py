@@ -16,6 +16,11 @@ from imulab.units import STANDARD_GRAVITY, from_si
 
 _POINTS = 121
 _SHOWN_SPECTRA = 3
+_SPECTRUM_CAPTION = (
+    "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left of "
+    "X without it is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further lines "
+    "are vibration."
+)
 _MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "x", "triangle-down")
 _CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
 
@@ -369,9 +374,7 @@ def _spectra(record: Calibration) -> list[Figure]:
     figures.append(
         Figure(
             "Spectrum around the table rate",
-            "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left "
-            "of X without it is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further "
-            "lines are vibration.",
+            _SPECTRUM_CAPTION,
             traces, layout, height=400,
         )
     )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.calibration import Calibration
 from imulab.centrifuge.curve import MODELS
-from imulab.centrifuge.levels import Levels, pool_levels
+from imulab.centrifuge.levels import Levels, level_numbers, pool_levels
 from imulab.centrifuge.manifest import Manifest, Run
 from imulab.centrifuge.parameters import Estimates, estimate
 from imulab.centrifuge.record import make_record
@@ -82,6 +82,7 @@ def fit_centrifuge(
     seen = _Seen(recording_of)
     statics: list[StaticRun] = []
     runs: list[LoadedRun] = []
+    numbers, drawn = level_numbers(manifest), set[tuple[str, int]]()
     order = sorted(range(len(manifest.runs)), key=lambda i: manifest.runs[i].role != "static")
     for done, index in enumerate(order, start=1):
         run = manifest.runs[index]
@@ -89,7 +90,9 @@ def fit_centrifuge(
             statics.append(reduce_static(seen(run), manifest, index))
         else:
             rest = _rest(statics, run, manifest, index) if method == "fourier" else None
-            runs.append(reduce_run(seen(run), manifest, index, rest))
+            place = run.spin_axis, numbers[index]
+            runs.append(reduce_run(seen(run), manifest, index, rest, spectrum=place not in drawn))
+            drawn.add(place)
         if progress is not None:
             progress(done)
     _same_channels(statics, runs, manifest)

@@ -205,7 +205,9 @@ def _spectra(runs: Sequence[LoadedRun], levels: Levels) -> list[dict[str, Any]]:
     shown = []
     by_index = {run.index: run for run in runs}
     for level in levels.items:
-        run = by_index[level.runs[0]]
+        run = next((by_index[index] for index in level.runs if by_index[index].spectrum is not None), None)
+        if run is None or run.spectrum is None:
+            continue
         rates, heights = run.spectrum
         names = [*run.channels, *(f"residual_{name[-1]}" for name in run.channels[:-1])]
         shown.append(

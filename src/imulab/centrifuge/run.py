@@ -66,7 +66,7 @@ class LoadedRun:
     whole_periods
         What the source's sums give, where they were asked for.
     spectrum
-        Rates about the line, rad/s, (f,), and height of each channel, residuals included, rad/s, (2k - 1, f).
+        Rates about the line, rad/s, (f,), and height of each channel and residual, rad/s, (2k - 1, f); or None.
     """
 
     run: Run
@@ -88,7 +88,7 @@ class LoadedRun:
     periods: float
     samples: int
     whole_periods: PeriodResult | None
-    spectrum: tuple[Array, Array]
+    spectrum: tuple[Array, Array] | None
     warnings: tuple[str, ...]
 
 
@@ -208,7 +208,14 @@ def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -
     )  # fmt: skip
 
 
-def reduce_run(blocks: Iterable[Recording], manifest: Manifest, index: int, static: Array | None = None) -> LoadedRun:
+def reduce_run(
+    blocks: Iterable[Recording],
+    manifest: Manifest,
+    index: int,
+    static: Array | None = None,
+    *,
+    spectrum: bool = True,
+) -> LoadedRun:
     """Return the lines of a loaded run in one pass over its blocks.
 
     Parameters
@@ -219,6 +226,8 @@ def reduce_run(blocks: Iterable[Recording], manifest: Manifest, index: int, stat
         The test, and which of its runs this is, counted from 0.
     static
         Means of the static records of its power cycle, rad/s, shape (k,); given, the source's sums are formed too.
+    spectrum
+        Whether to keep the spectrum around the table line.
 
     Raises
     ------
@@ -281,7 +290,7 @@ def reduce_run(blocks: Iterable[Recording], manifest: Manifest, index: int, stat
         periods=used.duration * abs(rates.table_rate) / (2 * np.pi),
         samples=used.samples,
         whole_periods=whole,
-        spectrum=_spectrum(used, rates, turn),
+        spectrum=_spectrum(used, rates) if spectrum else None,
         warnings=(*warnings, *rates.warnings),
     )
 
@@ -311,7 +320,7 @@ def _whole_periods(sums: PeriodSums, static: Array, cells: Cells, used: Cells, p
     return PeriodResult(result.line * np.exp(1j * cells.series_angle[0]), result.periods, result.samples)
 
 
-def _spectrum(cells: Cells, rates: Rates, turn: complex) -> tuple[Array, Array]:
+def _spectrum(cells: Cells, rates: Rates) -> tuple[Array, Array]:
     """Hann spectra around the table line: every channel, then what is left of each without the FOG."""
     width = 2 * np.pi / cells.duration
     points = _SPECTRUM_HALF_WIDTH * _SPECTRUM_POINTS
