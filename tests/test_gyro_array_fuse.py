@@ -5,7 +5,7 @@ import pytest
 
 import imulab as il
 from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import Fuser, FuseOptions, fuse, parse_memory
+from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, parse_memory
 from imulab.gyro_array.model import METHODS
 from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording

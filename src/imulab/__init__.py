@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from imulab.attitudes import Attitudes as Attitudes
     from imulab.calibration import Calibration as Calibration
     from imulab.calibration import load as load
+    from imulab.centrifuge.fit import CentrifugeFit as CentrifugeFit
+    from imulab.centrifuge.fit import fit_centrifuge as fit_centrifuge
+    from imulab.centrifuge.manifest import load_manifest as load_manifest
+    from imulab.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.errors import ImulabError as ImulabError
     from imulab.gravity import normal_gravity as normal_gravity
     from imulab.present import write_report as write_report
@@ -48,16 +52,20 @@ if TYPE_CHECKING:
 _HOME = {
     "Attitudes": "attitudes",
     "Calibration": "calibration",
+    "CentrifugeFit": "centrifuge.fit",
     "ImulabError": "errors",
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
     "apply": "applying",
     "find_attitudes": "segment",
+    "fit_centrifuge": "centrifuge.fit",
     "fit_tumble": "tumble.fit",
     "load": "calibration",
+    "load_manifest": "centrifuge.manifest",
     "normal_gravity": "gravity",
     "read": "readers",
     "read_blocks": "readers",
+    "simulate_centrifuge": "centrifuge.simulate",
     "simulate_tumble": "tumble.simulate",
     "write": "writers",
     "write_csv": "writers",

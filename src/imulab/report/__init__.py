@@ -13,7 +13,7 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure
 from imulab.files import write_text
 
-_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array"}
+_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array", "centrifuge": "Centrifuge test"}
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
