@@ -192,10 +192,10 @@ def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -
     left = np.abs(flat - np.median(flat, axis=0))
     steps = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(flat, axis=0)), axis=0) if len(flat) > 3 else 0.0
     limit = np.maximum(np.maximum(_STILL_SIGMA * within, _STILL_STEPS * steps), _STILL)
-    for channel, height in enumerate(_turning(flat)):
+    for number, height in enumerate(_turning(flat)):
         if height > _STILL_LINE:
             raise DataError(
-                f"{place}: a static run that moves: column {named.channels[channel]} shows a sine of "
+                f"{place}: a static run that moves: column {named.channels[number]} shows a sine of "
                 f"{from_si(height, 'deg/h'):.3g} deg/h, as if the gyroscope turned; expected a record at rest"
             )
     if (left > limit).any():
