@@ -62,7 +62,7 @@ def error_budget(runs: Sequence[LoadedRun], lines: dict[int, RunLine], manifest:
     test = _Test(used, lines)
     mismatch = _scale_mismatch(test)
     entries = [
-        *_tilt(test), _flexure(test), *mismatch, _delay(test), _table_rate(test), _arm_rate(test, manifest),
+        *_tilt(test), _flexure(test), *mismatch, *_delays(test), _table_rate(test), _arm_rate(test, manifest),
         _radius(test, manifest),
     ]  # fmt: skip
     return [asdict(entry) for entry in entries]
@@ -76,6 +76,7 @@ class _Test:
         self.arm = np.array([run.run.sense * run.run.arm_rate for run in runs])
         self.table = np.array([run.rates.table_rate for run in runs])
         self.force = np.array([run.force for run in runs])
+        self.x = np.array([run.line[0] for run in runs])
         self.fog = np.array([run.line[-1] for run in runs])
         self.fog_variance = np.array([run.covariance[-1, -1].real / 2 for run in runs])
         self.line = np.array([lines[run.index].line[0] for run in runs])
@@ -196,25 +197,24 @@ def _scale_mismatch(test: _Test) -> list[Entry]:
     return entries
 
 
-def _delay(test: _Test) -> Entry:
-    """Delay of X against the FOG: by the turning of both lines with the table rate, seen from the encoder."""
+def _delays(test: _Test) -> list[Entry]:
+    """Delays of FOG and X against the encoder: by the turning of their lines with the table rate."""
     per_second = float(np.abs(test.table).max()) * test.fog_share
     if not test.encoder or test.levels < 3:
-        return Entry(
-            "delay between channels", False, _DELAY, None, "s", _DELAY * per_second, None,
-            "needs table_angle, three levels",
-        )  # fmt: skip
+        basis = "needs table_angle, three levels"
+        return [Entry("delay, FOG to X", False, _DELAY, None, "s", _DELAY * per_second, None, basis)]
     parameters, covariance, _ = _tilted(test)
-    pooled = (test.line / np.maximum(test.line_variance, 1e-300)).sum()
-    angle = np.angle(test.line / pooled)
-    variance = test.line_variance / np.abs(test.line) ** 2
+    tau, u_tau = float(parameters[4]), float(np.sqrt(covariance[4, 4]))
+    drift = (test.x - test.fog * np.exp(-1j * test.table * tau)) / test.force
+    angle = np.angle(drift / (drift / np.maximum(test.line_variance, 1e-300)).sum())
+    variance = test.line_variance / np.abs(drift) ** 2
     slope, matrix = _weighted(np.stack([np.ones(len(angle)), test.table], axis=1), angle, variance)
-    value = float(parameters[4] - slope[1])
-    u = float(np.sqrt(covariance[4, 4] + matrix[1, 1]))
-    return Entry(
-        "delay between channels", True, value, u, "s", float(np.hypot(value, u)) * per_second, None,
-        "phase over table rate, FOG less X",
-    )  # fmt: skip
+    own, u_own = float(slope[1]), float(np.sqrt(matrix[1, 1]))
+    effect = float(np.hypot(tau - own, np.hypot(u_tau, u_own))) * per_second
+    return [
+        Entry("delay of the FOG", True, tau, u_tau, "s", effect, None, "phase of the FOG line over table rate"),
+        Entry("delay of X", True, own, u_own, "s", effect, None, "phase of the drift over table rate (or flexure)"),
+    ]
 
 
 def _table_rate(test: _Test) -> Entry:

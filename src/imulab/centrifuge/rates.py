@@ -30,6 +30,7 @@ _UNSTEADY = 0.05
 _SLOW, _SLOW_WARNING = 0.1, 0.02
 _RATE_CHANGE = 1e-3
 _ROUNDS = 8
+_SEGMENTS, _STEADILY = 8, 0.9
 
 
 @dataclass(frozen=True)
@@ -153,13 +154,16 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
     """Cells to keep and warnings, where blocks of the run show other lines than the rest; None where all agree."""
     shift = 0.0 if cells.series_angle is not None else _strongest_shift(cells)
     if shift is None:
+        _check_wandering(cells, place)
         return None
     solution = solve(cells, shift, _peak_shift(cells, cells.net_rate))
     found = scatter(cells, solution)
     if found is None or len(found.centre) < 6:
         return None
     size = np.abs(solution.line(LINE))
-    deviation = np.abs(found.deviation)
+    # Against the median of the blocks: the line of the whole run has the disturbance in it.
+    middle = np.median(found.deviation.real, axis=0) + 1j * np.median(found.deviation.imag, axis=0)
+    deviation = np.abs(found.deviation - middle)
     sigma = np.median(deviation, axis=0) / 1.1774
     bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size, axis=1)
     count = len(bad)
@@ -174,6 +178,28 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
     if low > 0 or high < count:
         return int(found.edges[low]), int(found.edges[high]), []
     return 0, len(cells.centre), _slow_change(found.deviation, size, place)
+
+
+def _check_wandering(cells: Cells, place: str) -> None:
+    """Refuse a run without a line at the table rate in which a clear line moves steadily: a ramp all along."""
+    count = len(cells.series_time) // _SEGMENTS
+    if count < 4 * _SEGMENTS:
+        return
+    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
+    rates = 2 * np.pi * np.fft.rfftfreq(count, cells.series_step)
+    above = rates > max(1.5 * abs(cells.net_rate), 2.5 * rates[1])
+    for values in cells.series:
+        segments = values[: count * _SEGMENTS].reshape(_SEGMENTS, count)
+        height = np.abs(np.fft.rfft(window * (segments - segments.mean(axis=1, keepdims=True)), axis=1))[:, above]
+        clear = height.max(axis=1) > _PEAK * np.median(height, axis=1)
+        peak = rates[above][np.argmax(height, axis=1)]
+        if clear.sum() < 0.6 * _SEGMENTS or np.ptp(peak[clear]) < 3 * rates[1]:
+            continue
+        if abs(np.corrcoef(np.flatnonzero(clear), peak[clear])[0, 1]) > _STEADILY:
+            raise DataError(
+                f"{place}: a line moves from {_deg(float(peak[clear][0]))} to {_deg(float(peak[clear][-1]))} over the run; "
+                f"expected steady rates, table_rate {_deg(abs(cells.table_rate))} (a rate ramp?)"
+            )
 
 
 def _slow_change(deviation: Complex, size: Array, place: str) -> list[str]:

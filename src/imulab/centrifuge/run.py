@@ -17,7 +17,9 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import from_si, parse_unit, to_si
 
 _STILL = to_si(5.0, "deg/h")
-_STILL_SIGMA = 10.0
+_STILL_SIGMA, _STILL_STEPS = 10.0, 8.0
+_STILL_LINE = to_si(1.0, "deg/h")
+_SINE_SAMPLES, _SINE_SHARE = 20, 0.8
 _STILL_ANGLE = np.radians(0.05)
 _SPECTRUM_HALF_WIDTH = 24
 _SPECTRUM_POINTS = 4
@@ -186,8 +188,16 @@ def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -
     within = np.sqrt(np.median(np.maximum(squares / count[:, None] - means**2, 0.0), axis=0) / count[0])
     time = cells.centre - cells.centre.mean()
     slope = time @ means / max(float(time @ time), 1e-300)
-    left = np.abs(means - np.median(means - time[:, None] * slope, axis=0) - time[:, None] * slope)
-    limit = np.maximum(_STILL_SIGMA * within, _STILL)
+    flat = means - time[:, None] * slope
+    left = np.abs(flat - np.median(flat, axis=0))
+    steps = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(flat, axis=0)), axis=0) if len(flat) > 3 else 0.0
+    limit = np.maximum(np.maximum(_STILL_SIGMA * within, _STILL_STEPS * steps), _STILL)
+    for number, height in enumerate(_turning(flat)):
+        if height > _STILL_LINE:
+            raise DataError(
+                f"{place}: a static run that moves: column {named.channels[number]} shows a sine of "
+                f"{from_si(height, 'deg/h'):.3g} deg/h, as if the gyroscope turned; expected a record at rest"
+            )
     if (left > limit).any():
         cell, channel = np.unravel_index(int(np.argmax(left / limit)), left.shape)
         raise DataError(
@@ -206,6 +216,22 @@ def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -
         manifest.runs[index], index, named.channels, sums.sum(axis=0) / count.sum() + cells.offset, cells.samples,
             cells.duration
     )  # fmt: skip
+
+
+def _turning(flat: Array) -> list[float]:
+    """Height of the sine that holds most of each channel's means over seconds; 0 where none does."""
+    count = len(flat)
+    if count < _SINE_SAMPLES:
+        return [0.0] * flat.shape[1]
+    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
+    power = np.abs(np.fft.rfft(window[:, None] * (flat - flat.mean(axis=0)), axis=0)) ** 2
+    # A sine under this window keeps all its power within two bins of its own.
+    top = np.argmax(power[2:], axis=0) + 2
+    held = np.array([power[max(k - 2, 0) : k + 3, c].sum() for c, k in enumerate(top)]) / np.maximum(
+        power.sum(axis=0), 1e-300
+    )
+    height = 2 * np.sqrt(power[top, range(len(top))]) / window.sum()
+    return [float(h) if share > _SINE_SHARE else 0.0 for h, share in zip(height, held, strict=True)]
 
 
 def reduce_run(
