@@ -1,5 +1,7 @@
 """Fusion on the C core against the plain-Python transcription, the closed forms, and itself in pieces."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -220,7 +222,7 @@ def pieces(recording: Recording, cuts: list[int]) -> list[Recording]:
     ends = [0, *cuts, len(recording)]
     return [
         Recording({n: c[a:b] for n, c in recording.columns.items()}, recording.units, name="a.csv", first_row=a + 1)
-        for a, b in zip(ends, ends[1:], strict=False)
+        for a, b in pairwise(ends)
     ]
 
 
