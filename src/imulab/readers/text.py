@@ -14,9 +14,7 @@ from codecs import BOM_UTF8
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import BinaryIO
 
 import numpy as np
@@ -27,24 +25,12 @@ from imulab.readers.layout import Layout
 from imulab.recording import Recording, parse_column_title
 from imulab.tens import powers_of_five
 
-_BLOCK_BYTES = 1 << 22
+_BLOCK_BYTES = 1 << 21
 _WORTH_SHARING = 1 << 19
-_AHEAD = 2
 _MOST_THREADS = 8
 
 _text.prepare(powers_of_five())
 _LONGEST_LINE = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """A block that is being parsed: its bytes, first row, rows, numbers, and each part's first line and answer."""
-
-    block: bytes
-    row: int
-    rows: int
-    out: np.ndarray
-    answers: list[tuple[int, Callable[[], tuple[int, int, int]]]]
 
 
 class _Crew:
@@ -132,16 +118,17 @@ class TextFile:
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
         row = 1
-        waiting: deque[_Task] = deque()
+        waiting: deque[tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]] = deque()
         with _Crew() as crew:
             while True:
                 block = self._next_lines()
                 if block is not None:
-                    waiting.append(self._begin(block, row, crew))
-                    row += waiting[-1].rows
+                    waiting.append(self._begin(block, crew))
                 # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
-                while waiting and (block is None or self._live or len(waiting) > _AHEAD):
-                    yield self._finish(waiting.popleft())
+                while waiting and (block is None or self._live or len(waiting) > crew.size):
+                    recording = self._finish(*waiting.popleft(), row)
+                    row += len(recording)
+                    yield recording
                 if block is None:
                     break
         if row == 1:
@@ -276,30 +263,19 @@ class TextFile:
 
     # --- rows --------------------------------------------------------------------------------------------------
 
-    def _begin(self, block: bytes, row: int, crew: _Crew) -> _Task:
-        """Begin to parse a block of whole lines, in as many parts as there are threads."""
-        parts = crew.size if len(block) >= _WORTH_SHARING else 1
-        cuts = [0, *(block.find(b"\n", len(block) * part // parts) + 1 for part in range(1, parts)), len(block)]
-        cuts = sorted(set(cuts))
-        lines = [block.count(b"\n", start, stop) for start, stop in pairwise(cuts)]
-        lines[-1] += 1
-        total = sum(lines)
-        out = np.empty((len(self._titles), total))
-        answers, first = [], 0
-        for count, (start, stop) in zip(lines, pairwise(cuts), strict=True):
-            job = partial(_text.parse, block, self._delimiter, self._slots, out, total, start, stop, first)
-            answers.append((first, crew.begin(job) if parts > 1 else job))
-            first += count
-        return _Task(block, row, total, out, answers)
+    def _begin(self, block: bytes, crew: _Crew) -> tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]:
+        """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
+        capacity = block.count(b"\n") + 1
+        out = np.empty((len(self._titles), capacity))
+        job = partial(_text.parse, block, self._delimiter, self._slots, out, capacity)
+        return block, out, crew.begin(job) if len(block) >= _WORTH_SHARING else job
 
-    def _finish(self, task: _Task) -> Recording:
-        """Wait for a block and return its rows."""
-        row, rows = task.row, task.rows
-        for first, answer in task.answers:
-            done, problem, field = answer()
-            if problem:
-                self._refuse(task.block, row, first + done, problem, field)
-        columns = dict(zip(self._titles, task.out, strict=True))
+    def _finish(self, block: bytes, out: np.ndarray, answer: Callable[[], tuple[int, int, int]], row: int) -> Recording:
+        """Wait for a block and return its rows, which begin at row `row` of the file."""
+        rows, problem, field = answer()
+        if problem:
+            self._refuse(block, row, rows, problem, field)
+        columns = dict(zip(self._titles, out[:, :rows], strict=True))
         units = dict(self._units)
         layout = self._layout
         if layout is not None and layout.sample_rate is not None:
