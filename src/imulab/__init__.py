@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from imulab.calibration import Calibration as Calibration
     from imulab.calibration import load as load
     from imulab.errors import ImulabError as ImulabError
+    from imulab.exporters import export as export
     from imulab.gravity import normal_gravity as normal_gravity
     from imulab.present import write_report as write_report
     from imulab.readers import read as read
@@ -52,6 +53,7 @@ _HOME = {
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
     "apply": "applying",
+    "export": "exporters",
     "find_attitudes": "segment",
     "fit_tumble": "tumble.fit",
     "load": "calibration",

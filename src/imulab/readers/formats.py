@@ -96,7 +96,8 @@ def table() -> tuple[list[str], list[list[str]]]:
                 kind.endings,
                 "read, write" if kind.writes else "read",
                 {"none": "", "possible": "for foreign columns", "needed": "--layout"}[kind.layout],
-                needs or (f"{kind.library} is here" if optional else "nothing"),
+                (needs or (f"{kind.library} is here" if optional else "nothing"))
+                + (" (where compressed)" if kind.extra == "ros" else ""),
             ]
         )
     return ["format", "files", "", "layout", "needs"], rows

@@ -212,6 +212,8 @@ class TextFile:
             raise ReadError(f"{self._name}: only comments; expected a line of titles 'name [unit]' and rows")
         if line.lstrip().startswith("{"):
             raise ReadError(f"{self._name}: expected a recording, found JSON (a calibration record?)")
+        if line.startswith("FMT,"):
+            raise ReadError(f"{self._name}: an ArduPilot log as text; expected the binary log (.bin) it was made from")
         if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
             raise ReadError(
                 f"{self._name}: line {self._lines_before}: expected titles such as 'time [s],accel_x [m/s^2]', "
