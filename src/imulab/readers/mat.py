@@ -1,8 +1,8 @@
 """MATLAB files of version 5 to 7 through a layout: ``from = "variable"``, ``"struct/field"``, ``"matrix[0]"``.
 
 Read here and not by scipy.io, whose compiled reader ends the process on some damaged files. Source: MathWorks,
-"MAT-File Format" (version 5): a head of 128 bytes, then elements u32 type, u32 size, payload padded to 8 bytes; a matrix
-is an element that holds flags, dimensions, name and numbers.
+"MAT-File Format" (version 5): a head of 128 bytes, then elements u32 type, u32 size, payload padded to 8 bytes; a
+matrix is an element that holds flags, dimensions, name and numbers.
 """
 
 from __future__ import annotations
