@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from imulab.errors import ReadError
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import Layout, load_layout
 from imulab.readers.selection import Selection, windowed
 from imulab.readers.text import TextFile
-from imulab.recording import Recording, Source
+from imulab.recording import Array, Recording, Source
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
@@ -63,9 +64,9 @@ def read(
     blocks = list(windowed(_blocks(file, name, known, selection, hashed), window, name))
     source = Source(name, hashed.of(file))
     first = blocks[0]
-    joined = {key: np.concatenate([block.columns[key] for block in blocks]) for key in first.columns}
+    joined = {key: _joined([block.columns[key] for block in blocks]) for key in first.columns}
     return Recording(
-        columns=joined if len(blocks) > 1 else first.columns,
+        columns=joined,
         units=first.units,
         metadata=first.metadata,
         name=first.name,
@@ -91,6 +92,19 @@ def read_blocks(
     selection = Selection(topic, instance, window)
     name = _name(file)
     yield from windowed(_blocks(file, name, _layout(layout), selection, None), window, name)
+
+
+def _joined(parts: list[Array]) -> Array:
+    """Join the parts of a column, without a copy where they lie one behind the other in memory."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    begins = [part.__array_interface__["data"][0] for part in parts]
+    follows = [begin + part.nbytes for begin, part in zip(begins, parts, strict=True)]
+    one = first.base is not None and all(part.base is first.base and part.strides == (8,) for part in parts)
+    if one and begins[1:] == follows[:-1]:
+        return as_strided(first, shape=(sum(map(len, parts)),), strides=(8,))
+    return np.concatenate(parts)
 
 
 class _Hash:
@@ -137,7 +151,7 @@ def _blocks(
         return
     selection.refuse(name, "a text file")
     with _open(file) as stream:
-        text = TextFile(stream, name, layout, hashed=hashed is not None)
+        text = TextFile(stream, name, layout, hashed=hashed is not None, whole=hashed is not None)
         if hashed is not None:
             hashed.text = text
         yield from text.blocks()

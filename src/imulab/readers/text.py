@@ -78,7 +78,9 @@ class _Hash:
 class TextFile:
     """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
 
-    def __init__(self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True) -> None:
+    def __init__(
+        self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True, whole: bool = False
+    ) -> None:
         self._live = _is_pipe(stream)
         self._read = getattr(stream, "read1", stream.read) if self._live else stream.read
         self._name = name
@@ -86,6 +88,10 @@ class TextFile:
         self._hash = _Hash() if hashed else None
         self._rest = b""
         self._ended = False
+        self._taken = 0
+        self._size = os.fstat(stream.fileno()).st_size if whole and not self._live and _is_file(stream) else 0
+        self._room: np.ndarray | None = None
+        self._used = 0
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
         self._lines_before = 0
         self._read_more()
@@ -145,6 +151,7 @@ class TextFile:
         except OSError as error:
             raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
         self._ended = not data
+        self._taken += len(data)
         if self._hash:
             self._hash.update(data)
         return data
@@ -268,9 +275,22 @@ class TextFile:
     def _begin(self, block: bytes, crew: _Crew) -> tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]:
         """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
         capacity = block.count(b"\n") + 1
-        out = np.empty((len(self._titles), capacity))
-        job = partial(_text.parse, block, self._delimiter, self._slots, out, capacity)
-        return block, out, crew.begin(job) if len(block) >= _WORTH_SHARING else job
+        room, first = self._place_for(capacity, len(block))
+        job = partial(_text.parse, block, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
+        return block, room[:, first : first + capacity], crew.begin(job) if len(block) >= _WORTH_SHARING else job
+
+    def _place_for(self, rows: int, size: int) -> tuple[np.ndarray, int]:
+        """Return an array of columns, and the row of it where a block of so many rows and bytes goes.
+
+        A file that is read as a whole goes into one array, made for as many rows as its first block foretells.
+        """
+        if self._size and self._room is None:
+            left = max(self._size - self._taken + len(self._rest), 0)
+            self._room = np.empty((len(self._titles), rows + int(1.02 * rows * left / size) + 16))
+        if self._room is None or self._used + rows > self._room.shape[1]:
+            return np.empty((len(self._titles), rows)), 0
+        first, self._used = self._used, self._used + rows
+        return self._room, first
 
     def _finish(self, block: bytes, out: np.ndarray, answer: Callable[[], tuple[int, int, int]], row: int) -> Recording:
         """Wait for a block and return its rows, which begin at row `row` of the file."""
@@ -310,6 +330,14 @@ class TextFile:
 def _fields(line: str, delimiter: str) -> list[str]:
     """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
     return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
+
+
+def _is_file(stream: BinaryIO) -> bool:
+    """Whether the stream is an open file, whose size is known."""
+    try:
+        return stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def _is_pipe(stream: BinaryIO) -> bool:
