@@ -35,7 +35,7 @@ docs: $(STAMP) $(VENV)/.docs
 clean:
 	rm -rf $(VENV) demo docs/_build build dist
 
-C_SOURCES := src/imulab/readers/_text.c src/imulab/_runtime.c $(wildcard runtime/*.[ch])
+C_SOURCES := $(wildcard src/imulab/*.c src/imulab/readers/*.c runtime/*.[ch])
 
 $(STAMP): pyproject.toml CMakeLists.txt $(C_SOURCES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imulab needs Python 3.11 or later")'

@@ -93,7 +93,7 @@ static void numbers(cursor *c, il_real *out, size_t n) {
             uint32_t bits = u32(c->at);
             float narrow;
             memcpy(&narrow, &bits, sizeof narrow);
-            out[i] = narrow;
+            out[i] = (il_real)narrow;
         }
         if (!il_finite(out[i])) fail(c, IL_TABLE_NOT_FINITE);
     }

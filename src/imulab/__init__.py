@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from imulab.attitudes import Attitudes as Attitudes
     from imulab.calibration import Calibration as Calibration
     from imulab.calibration import load as load
+    from imulab.centrifuge.fit import CentrifugeFit as CentrifugeFit
+    from imulab.centrifuge.fit import fit_centrifuge as fit_centrifuge
+    from imulab.centrifuge.manifest import load_manifest as load_manifest
+    from imulab.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.errors import ImulabError as ImulabError
     from imulab.gravity import normal_gravity as normal_gravity
     from imulab.gyro_array.compare import compare_methods as compare_methods
@@ -50,6 +54,7 @@ if TYPE_CHECKING:
     from imulab.tumble.fit import TumbleFit as TumbleFit
     from imulab.tumble.fit import fit_tumble as fit_tumble
     from imulab.tumble.simulate import simulate_tumble as simulate_tumble
+    from imulab.writers import write as write
     from imulab.writers import write_csv as write_csv
 
 _HOME = {
@@ -63,17 +68,22 @@ _HOME = {
     "simulate_array": "gyro_array.simulate",
     "Attitudes": "attitudes",
     "Calibration": "calibration",
+    "CentrifugeFit": "centrifuge.fit",
     "ImulabError": "errors",
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
     "apply": "applying",
     "find_attitudes": "segment",
+    "fit_centrifuge": "centrifuge.fit",
     "fit_tumble": "tumble.fit",
     "load": "calibration",
+    "load_manifest": "centrifuge.manifest",
     "normal_gravity": "gravity",
     "read": "readers",
     "read_blocks": "readers",
+    "simulate_centrifuge": "centrifuge.simulate",
     "simulate_tumble": "tumble.simulate",
+    "write": "writers",
     "write_csv": "writers",
     "write_report": "present",
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ class Blob:
     text: Mapping[str, Any]
 
 
-def make_blob(records: list[Calibration], tables: list[Table]) -> bytes:
+def make_blob(records: Sequence[Calibration], tables: Sequence[Table]) -> bytes:
     """Return the blob of these tables, float numbers, with what the desk needs to apply it.
 
     Raises
@@ -45,30 +45,23 @@ def make_blob(records: list[Calibration], tables: list[Table]) -> bytes:
     return pack(tables, 4, plain_values(text, ""))
 
 
-def tables_of_all(records: list[Calibration], names: list[str]) -> list[Table]:
-    """Return the tables of several records of one unit.
+def tables_of_all(records: Sequence[Calibration]) -> list[Table]:
+    """Return the tables of several records of one unit, in their order.
 
     Raises
     ------
     RecordError
         Two records give the same section, or are of different units.
     """
-    found: dict[str, tuple[Table, str]] = {}
-    serials = {
-        serial: name for record, name in zip(records, names, strict=True) if (serial := record.sensor.get("serial"))
-    }
+    serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
-        raise RecordError("records of different units: " + ", ".join(f"{n} of {s}" for s, n in serials.items()))
-    for record, name in zip(records, names, strict=True):
-        try:
-            tables = tables_of(record)
-        except RecordError as error:
-            raise RecordError(f"{name}: {error}") from None
-        for table in tables:
-            if table.kind in found:
-                raise RecordError(f"{name}: a second {table.kind} record; the first is {found[table.kind][1]}")
-            found[table.kind] = (table, name)
-    return [table for table, _ in found.values()]
+        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
+    tables = [table for record in records for table in tables_of(record)]
+    kinds = [table.kind for table in tables]
+    twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
+    if twice:
+        raise RecordError(f"two records give a {twice[0]} table; a unit has one")
+    return tables
 
 
 def is_blob(path: str | Path) -> bool:

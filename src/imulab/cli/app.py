@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import allan, array, records, tumble
+from imulab.cli import allan, array, centrifuge, convert, export, records, tumble
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -24,7 +24,14 @@ def command() -> Any:
         tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
     )
     app.add_typer(array.commands(_SETTINGS), name="array", help="Fuse several gyroscopes on one axis into one rate.")
+    app.add_typer(
+        centrifuge.commands(_SETTINGS),
+        name="centrifuge",
+        help="Measure how a gyroscope's g-sensitive drift changes with g.",
+    )
     records.add_commands(app)
+    app.command("convert")(convert.convert)
+    app.command("export")(export.export)
     app.command("allan")(allan.allan)
     return typer.main.get_command(app)
 

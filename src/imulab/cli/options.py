@@ -4,21 +4,33 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from imulab.errors import OptionError, ReadError, UnitError
 from imulab.units import parse_unit, to_si
 
+if TYPE_CHECKING:
+    from imulab.recording import Recording
+
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
 LayoutFile = Annotated[str | None, typer.Option("--layout", metavar="L.toml", help="Columns of a foreign file.")]
 OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
 ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]
+Topic = Annotated[
+    str | None, typer.Option("--topic", metavar="TOPIC", help="Topic of a bag or log, where there are several.")
+]
+Instance = Annotated[
+    str | None, typer.Option("--instance", metavar="N", help="Sensor of a flight log, from 0; the first if not given.")
+]
+Window = Annotated[
+    str | None, typer.Option("--window", metavar="FROM:TO", help="Part to read, s; either side may be left out.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
@@ -59,6 +71,47 @@ def whole_number(text: str, option: str) -> int:
         raise OptionError(f"{option} {text!r}: expected a whole number") from None
 
 
+def chosen(topic: str | None, instance: str | None, window: str | None) -> dict[str, Any]:
+    """Return the options of `read` that choose a part of a file.
+
+    Raises
+    ------
+    OptionError
+        The instance is no number, or the window is not FROM:TO.
+    """
+    part: tuple[float | None, ...] | None = None
+    if window is not None:
+        ends = window.split(":")
+        if len(ends) != 2 or not any(end.strip() for end in ends):
+            raise OptionError(f"--window {window!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
+        part = tuple(quantity(end, "--window", "time", "s") if end.strip() else None for end in ends)
+    number = None if instance is None else whole_number(instance, "--instance")
+    return {"topic": topic, "instance": number, "window": part}
+
+
+def heard(blocks: Iterable[Recording], *, notes: bool = True) -> Iterator[Recording]:
+    """Pass blocks on, and say on standard error what the reader did to the data, each thing once."""
+    said: set[str] = set()
+    for block in blocks:
+        for note in block.notes:
+            kind = note.partition(":")[0]
+            if kind not in said and note.startswith("truncated"):
+                warn(f"{block.name}: {note}")
+            elif note not in said and notes and not note.startswith("truncated"):
+                print(f"imulab: note: {block.name}: {note}", file=sys.stderr)
+            said |= {kind, note}
+        yield block
+
+
+def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recording:
+    """Read a recording as a whole, and warn where it was cut."""
+    from imulab.readers import read
+
+    recording = read(file, layout, **part)
+    list(heard([recording], notes=False))
+    return recording
+
+
 def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
     """Check before the work that each output has a folder to go to, and is no input nor another output.
 
@@ -82,7 +135,7 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
 
 def is_json(file: str) -> bool:
     """Return whether a file is a record rather than a recording, by its first character."""
-    if file == "-":
+    if file == "-" or Path(file).is_dir():
         return False
     try:
         with Path(file).open("rb") as stream:

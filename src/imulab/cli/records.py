@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator
-from itertools import chain
 from json import dumps
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imulab.cli.options import AsJson, LayoutFile, OutputFile, RecordFile, check_outputs, is_json, warn
-from imulab.errors import OptionError
+from imulab.cli.convert import write_out
+from imulab.cli.options import (
+    AsJson,
+    Instance,
+    LayoutFile,
+    OutputFile,
+    RecordFile,
+    Topic,
+    Window,
+    check_outputs,
+    chosen,
+    heard,
+    is_json,
+    warn,
+)
+from imulab.errors import ImulabError, OptionError
 
 if TYPE_CHECKING:
     from imulab.blob import Blob
@@ -28,35 +40,31 @@ def add_commands(app: typer.Typer) -> None:
 def apply(
     files: Annotated[list[str], typer.Argument(metavar="RECORD... FILE", help="Records, then the recording.")],
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     output: OutputFile = None,
 ) -> None:
-    """Correct a recording by one or more records, in the order given; native CSV to OUT or standard output."""
+    """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
     from imulab.applying import apply_blocks
     from imulab.blob import load_any
     from imulab.readers import read_blocks
-    from imulab.writers import write_csv, write_csv_to
 
     if len(files) < 2:
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
     *names, file = files
     check_outputs([output], files)
+    part = chosen(topic, instance, window)
     records = [load_any(name) for name in names]
-    blocks = apply_blocks(records, _warned(records, read_blocks(file, layout)))
-    if output:
-        write_csv(blocks, output)
-    else:
-        # The first block is corrected before anything is written, so that a refusal leaves no head behind.
-        first = next(iter(blocks))
-        write_csv_to(chain([first], blocks), sys.stdout.buffer)
-        sys.stdout.buffer.flush()
+    blocks = heard(read_blocks(file, layout, **part), notes=False)
+    write_out(apply_blocks(records, _warned(records, blocks)), output)
 
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say at the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.applying import beyond_test_of, identity, warnings_of
-    from imulab.units import from_si
+    from imulab.applying import beyond_message, beyond_test_of, identity, warnings_of
 
-    count, largest, name = 0, 0.0, ""
+    counts, largest, name = [0] * len(records), [0.0] * len(records), ""
     for number, block in enumerate(blocks):
         if number == 0:
             messages = [message for record in records for message in warnings_of(record, block)]
@@ -64,22 +72,38 @@ def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> I
                 messages.append("the same record is applied twice")
             for message in dict.fromkeys(messages):
                 warn(message)
-        here, most = beyond_test_of(records[0], block)
-        count, largest, name = count + here, max(largest, most), block.name
+        for index, record in enumerate(records):
+            try:
+                here, most = beyond_test_of(record, block)
+            except ImulabError:  # what only an earlier record of the chain makes usable; apply itself refuses the rest
+                continue
+            counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
         yield block
-    if count:
-        warn(
-            f"{name}: {count} samples beyond 2 g (up to {from_si(largest, 'g'):.1f} g): "
-            "the record's nonlinearity was measured within 1 g"
-        )
+    for record, count, most in zip(records, counts, largest, strict=True):
+        if count:
+            warn(f"{name}: {beyond_message(record, count, most)}")
 
 
 def show(
-    files: Annotated[list[str], typer.Argument(metavar="FILE [FILE]", help="Record or recording, or two records.")],
+    files: Annotated[
+        list[str] | None, typer.Argument(metavar="FILE [FILE]", help="Record or recording, or two records.")
+    ] = None,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
+    formats: Annotated[bool, typer.Option("--formats", help="List the kinds of recording that can be read.")] = False,
     json: AsJson = False,
 ) -> None:
     """Say what is in a record or a recording, or what changed between two records of one unit."""
+    if formats:
+        from imulab.cli.show import aligned
+        from imulab.readers.formats import table
+
+        print("\n".join(aligned(*table())))
+        return
+    if not files:
+        raise OptionError("show: expected a FILE, two records, or --formats")
     if len(files) > 2:
         raise OptionError(f"show: expected one file or two records, found {len(files)} files")
     if len(files) == 2:
@@ -89,7 +113,7 @@ def show(
     from imulab.blob import is_blob, load_blob
     from imulab.calibration import load
     from imulab.cli.show import describe_blob, describe_record, describe_recording
-    from imulab.readers import read
+    from imulab.readers import read_blocks
 
     if layout is None and is_blob(file):
         blob = load_blob(file)
@@ -101,7 +125,7 @@ def show(
         return
     if json:
         raise OptionError(f"{file}: --json prints records; expected a record")
-    print(describe_recording(read(file, layout)))
+    print(describe_recording(read_blocks(file, layout, **chosen(topic, instance, window))))
 
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:

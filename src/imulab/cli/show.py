@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import numpy as np
 
 from imulab.blob import Blob
 from imulab.calibration import Calibration
+from imulab.errors import ReadError
 from imulab.exhibit import Table
 from imulab.present import exhibits_of
-from imulab.recording import Recording
+from imulab.recording import Array, Recording
 from imulab.tumble.compare import Comparison
 from imulab.tumble.engineering import change_rows
 
@@ -61,26 +65,80 @@ def describe_changes(first: str, second: str, comparison: Comparison, output: st
     return "\n".join(lines)
 
 
-def describe_recording(recording: Recording) -> str:
-    """Return what a recording holds: samples, rate, gaps, duration, and each column's range."""
-    lines = [f"{recording.name}: {len(recording)} samples"]
-    time = recording.time
-    if time is None:
-        lines.append("no time column: a table of attitudes, a row each")
-    elif len(time) > 1 and np.isfinite(time).all():
-        step = np.diff(time)
-        usual = float(np.median(step))
-        gaps = int(np.count_nonzero(step > _GAP * usual)) if usual > 0 else 0
-        rate = f"{1 / usual:.6g} Hz" if usual > 0 else "unknown, time does not rise"
-        lines.append(f"duration {time[-1] - time[0]:.6g} s, rate {rate}, gaps {gaps}")
-    lines += [f"{key}: {value}" for key, value in recording.metadata.items()]
-    rows = []
-    for name, values in recording.columns.items():
+@dataclass
+class _Column:
+    """Range of a column, as its blocks pass by."""
+
+    low: float = np.inf
+    high: float = -np.inf
+    total: float = 0.0
+    finite: int = 0
+    missing: int = 0
+
+    def add(self, values: Array) -> None:
         finite = values[np.isfinite(values)]
-        shown = [f"{x:.6g}" for x in (finite.min(), finite.mean(), finite.max())] if finite.size else ["–"] * 3
-        rows.append([name, recording.units[name], *shown, str(len(values) - finite.size)])
+        self.missing += len(values) - finite.size
+        self.finite += finite.size
+        if finite.size:
+            self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
+            self.total += float(finite.sum())
+
+    def texts(self) -> list[str]:
+        numbers = (self.low, self.total / self.finite, self.high) if self.finite else ()
+        return [*([f"{x:.6g}" for x in numbers] or ["–"] * 3), str(self.missing)]
+
+
+@dataclass
+class _Clock:
+    """Duration, rate and gaps, as the blocks pass by; the usual step is that of the first block."""
+
+    first: float | None = None
+    last: float = 0.0
+    usual: float = np.nan
+    gaps: int = 0
+    widest: float = 0.0
+    broken: bool = False
+
+    def add(self, time: Array) -> None:
+        self.broken = self.broken or not np.isfinite(time).all()
+        step = np.diff(time) if self.first is None else np.diff(time, prepend=self.last)
+        if np.isnan(self.usual) and step.size:
+            self.usual = float(np.median(step))
+        if step.size:
+            self.gaps += int(np.count_nonzero(step > _GAP * self.usual))
+            self.widest = max(self.widest, float(step.max()))
+        self.first = float(time[0]) if self.first is None else self.first
+        self.last = float(time[-1])
+
+    def text(self) -> list[str]:
+        if self.broken or self.first is None or np.isnan(self.usual):
+            return []
+        rising = self.usual > 0
+        rate = f"{1 / self.usual:.6g} Hz" if rising else "unknown, time does not rise"
+        widest = f" (the widest {self.widest:.6g} s)" if self.gaps and rising else ""
+        return [f"duration {self.last - self.first:.6g} s, rate {rate}, gaps {self.gaps if rising else 0}{widest}"]
+
+
+def describe_recording(blocks: Iterable[Recording]) -> str:
+    """Return what a recording holds: samples, rate, gaps, duration, and each column's range."""
+    columns: dict[str, _Column] = {}
+    clock, samples, notes = _Clock(), 0, dict[str, None]()
+    block = None
+    for block in blocks:
+        samples += len(block)
+        notes |= dict.fromkeys(block.notes)
+        if block.time is not None and len(block):
+            clock.add(block.time)
+        for name, values in block.columns.items():
+            columns.setdefault(name, _Column()).add(values)
+    if block is None:
+        raise ReadError("the recording is empty")
+    lines = [f"{block.name}: {samples} samples"]
+    lines += clock.text() if "time" in block else ["no time column: a table of attitudes, a row each"]
+    lines += [f"{key}: {value}" for key, value in block.metadata.items()]
+    rows = [[name, block.units[name], *column.texts()] for name, column in columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
-    lines += [f"note: {note}" for note in recording.notes]
+    lines += [f"{'warning' if note.startswith('truncated') else 'note'}: {note}" for note in notes]
     return "\n".join(lines)
 
 

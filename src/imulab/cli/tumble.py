@@ -10,13 +10,18 @@ import typer
 
 from imulab.cli.options import (
     AsJson,
+    Instance,
     LayoutFile,
     OutputFile,
     RecordingFile,
     ReportFile,
+    Topic,
+    Window,
     check_outputs,
+    chosen,
     progress_bar,
     quantity,
+    read_recording,
     warn,
     whole_number,
 )
@@ -73,7 +78,7 @@ def plan(
 
 
 def simulate(
-    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.csv", help="Recording to write.")],
+    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Recording to write.")],
     attitudes: Annotated[str, typer.Option(help="Number of static attitudes.")] = "24",
     order: Annotated[str, typer.Option(help="Order of the true nonlinearity, 1 to 5.")] = "2",
     rate: Annotated[str, typer.Option(help="Sample rate.")] = "100 Hz",
@@ -87,8 +92,9 @@ def simulate(
 ) -> None:
     """Simulate a tumble recording of a random MEMS triad, with its truth in the head of the file."""
     from imulab.tumble.simulate import simulate_tumble
-    from imulab.writers import write_csv
+    from imulab.writers import check_writable, write
 
+    check_writable(output)
     recording = simulate_tumble(
         attitudes=whole_number(attitudes, "--attitudes"),
         order=whole_number(order, "--order"),
@@ -101,13 +107,16 @@ def simulate(
         knock=None if knock is None else whole_number(knock, "--knock"),
         seed=whole_number(seed, "--seed"),
     )
-    write_csv(recording, output)
+    write(recording, output)
     print(f"{output}: {len(recording)} samples, {attitudes} attitudes, serial {recording.metadata['serial']}")
 
 
 def fit(
     file: RecordingFile,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     order: Annotated[str, typer.Option(help="auto, or 1 to 5.")] = "auto",
     method: Annotated[str, typer.Option(help="norm or linearised.")] = "norm",
     loss: Annotated[str, typer.Option(help="square, or huber against single disturbed attitudes.")] = "square",
@@ -129,14 +138,14 @@ def fit(
     Prints what was found; -o writes the calibration record, --report its figures.
     """
     from imulab.calibration import load
-    from imulab.readers import read
     from imulab.segment import find_attitudes
     from imulab.tumble.fit import fit_tumble
 
     check_outputs([output, report], [name for name in (file, layout, prior) if name])
     local = _gravity(gravity, latitude, height)
+    part = chosen(topic, instance, window)
     trials = None if monte_carlo is None else whole_number(monte_carlo, "--monte-carlo")
-    attitudes = find_attitudes(read(file, layout))
+    attitudes = find_attitudes(read_recording(file, layout, part))
     with progress_bar("Monte Carlo", trials) as progress:
         result = fit_tumble(
             attitudes,
@@ -189,6 +198,9 @@ def gyro(
     accel_layout: Annotated[
         str | None, typer.Option("--accel-layout", metavar="L.toml", help="Columns of the accelerometers' file.")
     ] = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     fit_bias: Annotated[bool, typer.Option("--fit-bias", help="Fit the biases to the turns too.")] = False,
     g_sensitivity: Annotated[str, typer.Option(help="auto, yes or no.")] = "auto",
     output: OutputFile = None,
@@ -197,7 +209,6 @@ def gyro(
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
     from imulab.calibration import load
-    from imulab.readers import read
     from imulab.segment import find_attitudes
     from imulab.tumble.gyro import fit_gyro
     from imulab.tumble.gyrorecord import with_gyro
@@ -205,8 +216,8 @@ def gyro(
     inputs = [name for name in (file, accel, accel_file, layout, accel_layout) if name]
     check_outputs([output, report], inputs)
     record = load(accel)
-    recording = read(file, layout)
-    own = recording if accel_file is None else read(accel_file, accel_layout or layout)
+    recording = read_recording(file, layout, chosen(topic, instance, window))
+    own = recording if accel_file is None else read_recording(accel_file, accel_layout or layout, {})
     result = fit_gyro(record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity)
     finish(with_gyro(record, result, recording, own), output, report, json=json)
 
@@ -215,17 +226,19 @@ def check(
     record: Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")],
     file: RecordingFile,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     limit: Annotated[str, typer.Option(help="Largest | |f| - g | that passes.")] = "1 mg",
     gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2; that of the record if not given.")] = None,
 ) -> int:
     """Hold fresh attitudes against a record, without refitting; exit status 0 if all pass, 1 if not."""
     from imulab.calibration import load
-    from imulab.readers import read
     from imulab.segment import find_attitudes
     from imulab.tumble.compare import check_tumble
     from imulab.tumble.figures import small_g
 
-    attitudes = find_attitudes(read(file, layout))
+    attitudes = find_attitudes(read_recording(file, layout, chosen(topic, instance, window)))
     result = check_tumble(
         load(record),
         attitudes,

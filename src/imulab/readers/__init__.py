@@ -2,35 +2,50 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
-from collections.abc import Iterator
-from io import BufferedReader
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, cast
 
 import numpy as np
 
 from imulab.errors import ReadError
+from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import Layout, load_layout
-from imulab.readers.mimu import is_mimu, read_mimu
+from imulab.readers.selection import Selection, windowed
 from imulab.readers.text import TextFile
 from imulab.recording import Recording, Source
 
 _LIVE_BYTES = 1 << 16
 
-__all__ = ["Layout", "load_layout", "read", "read_blocks"]
+__all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
 
-def read(file: str | Path, layout: str | Path | Layout | None = None) -> Recording:
+def read(
+    file: str | Path,
+    layout: str | Path | Layout | None = None,
+    *,
+    topic: str | None = None,
+    instance: int | None = None,
+    window: tuple[float | None, float | None] | None = None,
+) -> Recording:
     """Read a recording as a whole.
 
     Parameters
     ----------
     file
-        Path of the file; ``-`` reads standard input.
+        Path of the file, or the folder of a ROS 2 bag; ``-`` reads text from standard input.
     layout
-        How to read a file that is not native CSV: the path of a layout file, or a `Layout`.
+        Where the columns of a foreign file are: the path of a layout file, or a `Layout`.
+    topic
+        Which topic of a bag or log, where there are several.
+    instance
+        Which sensor of a flight log, from 0; by default the first.
+    window
+        First and last time to read, s; None for no bound.
 
     Returns
     -------
@@ -41,41 +56,122 @@ def read(file: str | Path, layout: str | Path | Layout | None = None) -> Recordi
     ------
     ReadError, UnitError
         The file cannot be read; the message names file, row and column.
+    OptionError
+        The file has no such topic, instance or window.
     """
-    with _open(file) as stream:
-        if layout is None and is_mimu(_start(stream)):
-            return read_mimu(stream, _name(file))
-        text = TextFile(stream, _name(file), _layout(layout))
-        blocks = list(text.blocks())
-        source = Source(_name(file), text.sha256())
+    selection = Selection(topic, instance, window)
+    name, known = _name(file), _layout(layout)
+    hashed = _Hash()
+    blocks = list(windowed(_blocks(file, name, known, selection, hashed), window, name))
+    source = Source(name, hashed.of(file))
     first = blocks[0]
-    joined = {name: np.concatenate([block.columns[name] for block in blocks]) for name in first.columns}
+    joined = {key: np.concatenate([block.columns[key] for block in blocks]) for key in first.columns}
     return Recording(
         columns=joined if len(blocks) > 1 else first.columns,
         units=first.units,
         metadata=first.metadata,
         name=first.name,
         source=source,
+        first_row=first.first_row,
         lines_before=first.lines_before,
-        notes=first.notes,
+        notes=tuple(dict.fromkeys(note for block in blocks for note in block.notes)),
     )
 
 
 def read_blocks(
-    file: str | Path, layout: str | Path | Layout | None = None, *, live: bool = False
+    file: str | Path,
+    layout: str | Path | Layout | None = None,
+    *,
+    topic: str | None = None,
+    instance: int | None = None,
+    window: tuple[float | None, float | None] | None = None,
+    live: bool = False,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
     Parameters and errors are those of `read`; every block has the metadata, and knows its first row. With `live`, whole
     lines of standard input are a block as soon as they are there.
     """
+    selection = Selection(topic, instance, window)
+    name = _name(file)
+    yield from windowed(_blocks(file, name, _layout(layout), selection, None, live=live), window, name)
+
+
+class _Hash:
+    """SHA-256 of a source: taken while text is read, afterwards for everything else."""
+
+    def __init__(self) -> None:
+        self.text: TextFile | None = None
+
+    def of(self, file: str | Path) -> str:
+        if self.text is not None:
+            return self.text.sha256()
+        total = hashlib.sha256()
+        path = Path(file)
+        parts = [path]
+        if path.is_dir():
+            from imulab.readers.rosfiles import files_of
+
+            parts = files_of(path, str(file))
+        for part in parts:
+            with part.open("rb") as stream:
+                while data := stream.read(1 << 22):
+                    total.update(data)
+        return total.hexdigest()
+
+
+def _blocks(
+    file: str | Path,
+    name: str,
+    layout: Layout | None,
+    selection: Selection,
+    hashed: _Hash | None,
+    *,
+    live: bool = False,
+) -> Iterator[Recording]:
+    """Yield the blocks of a file by what its first bytes say it is."""
+    if str(file) != "-" and Path(file).is_dir():
+        kind = next(kind for kind in FORMATS if kind.module == "rosbag")
+    else:
+        kind = TEXT
+        if str(file) != "-" and not (layout is not None and layout.text):
+            with _open(file) as stream:
+                kind = recognised(stream.read(1024))
+    if kind.layout == "none" and layout is not None:
+        raise ReadError(f"{name}: a {kind.name} file says itself what its columns are; leave out {layout.name}")
+    if kind is not TEXT:
+        try:
+            yield from _FAMILIES[kind.module](Path(file), name, layout, selection)
+        except OSError as error:
+            raise ReadError(f"{name}: cannot be read: {error.strerror or error}") from None
+        return
+    selection.refuse(name, "a text file")
     with _open(file) as stream:
-        if layout is None and not live and is_mimu(_start(stream)):
-            yield read_mimu(stream, _name(file))
-            return
         if live:
             stream = cast(BinaryIO, _Live(stream))
-        yield from TextFile(stream, _name(file), _layout(layout)).blocks()
+        text = TextFile(stream, name, layout, hashed=hashed is not None)
+        if hashed is not None:
+            hashed.text = text
+        yield from text.blocks()
+        if hashed is not None:
+            text.drain()
+
+
+def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording]]:
+    """Return the reader of a family of formats, imported when it is used."""
+
+    def blocks(path: Path, name: str, layout: Layout | None, selection: Selection) -> Iterator[Recording]:
+        reader = import_module(f"imulab.readers.{module}")
+        if by_layout:
+            selection.refuse(name, "such a file")
+            yield from reader.blocks(path, name, layout)
+        else:
+            yield from reader.blocks(path, name, selection)
+
+    return blocks
+
+
+_FAMILIES = {kind.module: _family(kind.module, by_layout=kind.layout != "none") for kind in FORMATS}
 
 
 class _Live:
@@ -86,11 +182,6 @@ class _Live:
 
     def read(self, size: int) -> bytes:
         return bytes(self._stream.read1(min(size, _LIVE_BYTES)))  # type: ignore[attr-defined]
-
-
-def _start(stream: BinaryIO) -> bytes:
-    """Return the first bytes of a stream without taking them."""
-    return bytes(stream.peek(_LIVE_BYTES)) if isinstance(stream, BufferedReader) else b""
 
 
 def _name(file: str | Path) -> str:

@@ -5,7 +5,7 @@ header = false                      # true: the first line names the columns
 skip_lines = 0                      # lines above the header or the data
 sample_rate = { value = 100, unit = "Hz" }      # only where no column holds time
 [columns]
-time = { from = 0, unit = "s" }     # 0-based number, or name in the header
+time = { from = 0, unit = "s" }     # 0-based number, or name in the header; "variable" or "group/dataset" elsewhere
 accel_x = { from = 1, unit = "count" }
 [metadata]
 serial = "SN42"
@@ -37,9 +37,10 @@ class LayoutColumn:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How to read a foreign file of delimited text.
+    """Where the columns of a foreign file are.
 
-    ``delimiter`` is one character, a blank meaning any run of blanks; ``sample_rate`` in Hz or None.
+    ``delimiter`` is one character, a blank meaning any run of blanks; ``sample_rate`` in Hz or None; ``text`` says that
+    the file is delimited text whatever it looks like (the layout file names a delimiter).
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -49,6 +50,7 @@ class Layout:
     sample_rate: float | None = None
     metadata: Mapping[str, str] | None = None
     name: str = "layout"
+    text: bool = False
 
 
 def load_layout(path: str | Path) -> Layout:
@@ -102,6 +104,7 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
         sample_rate=sample_rate,
         metadata={key: str(value) for key, value in metadata.items()},
         name=path,
+        text="delimiter" in table,
     )
 
 

@@ -9,12 +9,15 @@ Arrays-BCD; GT Silicon, MIMU4444 interface description.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import ReadError
+from imulab.readers.selection import Selection
 from imulab.recording import Array, Recording, Source
 from imulab.units import STANDARD_GRAVITY
 
@@ -31,6 +34,13 @@ _GYRO_STEP = 1 / 16.4  # deg/s
 def is_mimu(start: bytes) -> bool:
     """Return whether the first bytes of a file (two frames of them at least) hold a MIMU4444 frame with its sum."""
     return _first_frame(start) is not None
+
+
+def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
+    """Yield the whole log, ten minutes of which are 25 MB."""
+    selection.refuse(name, "such a log")
+    with path.open("rb") as stream:
+        yield read_mimu(stream, name)
 
 
 def read_mimu(stream: BinaryIO, name: str) -> Recording:

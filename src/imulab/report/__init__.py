@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -13,7 +14,7 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure
 from imulab.files import write_text
 
-_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array"}
+_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array", "centrifuge": "Centrifuge test"}
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
@@ -38,6 +39,28 @@ def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicte
 
     shown = [{**item, "picture": Markup(item["picture"])} for item in attitudes]
     return str(_template("plan.html.j2").render(title=title, lead=lead, attitudes=shown, predicted=predicted))
+
+
+@dataclass(frozen=True)
+class Card:
+    """What an index shows of one piece of work: question, answer, commands, a figure and the report to open."""
+
+    question: str
+    answer: str
+    commands: list[str]
+    figure: Figure | None = None
+    link: str = ""
+
+
+def render_index(title: str, lead: str, cards: list[Card]) -> str:
+    """Return a page that leads to several reports as HTML text."""
+    figures = [card.figure for card in cards]
+    plots = [None if f is None else {"data": f.traces, "layout": f.layout, "height": f.height} for f in figures]
+    return str(
+        _template("index.html.j2").render(
+            title=title, lead=lead, cards=cards, plots=_json_for_script(plots), plotly=_plotly()
+        )
+    )
 
 
 def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:

@@ -1,0 +1,81 @@
+"""Records to the files of other programs: one module per program, one dispatch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from imulab.calibration import Calibration
+from imulab.errors import OptionError
+
+EXPORTERS = {
+    "c": "c",
+    "blob": "blob",
+    "px4": "px4",
+    "ardupilot": "ardupilot",
+    "kalibr": "kalibr",
+    "openvins": "openvins",
+    "ros": "ros",
+}
+"""Target to module; each has ``export(records, folder, options) -> list of the files written``."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """What the command line of ``export`` offers.
+
+    Attributes
+    ----------
+    lossy
+        Whether parameters that the target cannot hold may be left out.
+    device_id
+        PX4's number of the sensor; 0 where it is not known.
+    noise
+        What ``allan --json`` found, for targets with noise keys.
+    """
+
+    lossy: bool = False
+    device_id: int = 0
+    noise: Mapping[str, Any] = field(default_factory=dict)
+
+
+def export(
+    target: str, records: Sequence[Calibration], folder: str | Path, options: ExportOptions | None = None
+) -> list[Path]:
+    """Write records in the form of another program.
+
+    Parameters
+    ----------
+    target
+        One of `EXPORTERS`.
+    records
+        The unit's records.
+    folder
+        Where to; made where it is not there.
+
+    Returns
+    -------
+    list
+        The files written.
+
+    Raises
+    ------
+    OptionError
+        An unknown target, or one that cannot hold the records; nothing is written then.
+    RecordError
+        A record lacks what is needed.
+    """
+    if target not in EXPORTERS:
+        raise OptionError(f"unknown target {target!r}; known targets: {' '.join(EXPORTERS)}")
+    module = f"imulab.exporters.{EXPORTERS[target]}"
+    try:
+        exporter = import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        raise OptionError(f"target {target} is not there yet; known targets: {' '.join(EXPORTERS)}") from None
+    files: list[Path] = exporter.export(records, Path(folder), options or ExportOptions())
+    return files

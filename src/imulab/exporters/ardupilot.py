@@ -1,0 +1,73 @@
+"""ArduPilot parameters: ``(raw - INS_ACCOFFS) * INS_ACCSCAL`` in m/s^2, ``raw - INS_GYROFFS`` in rad/s, on each axis.
+
+Source: ArduPilot AP_InertialSensor_Backend, _rotate_and_correct_accel (rotate, subtract the offset, scale; since
+October 2015, pull request 3029: Copter 3.4, Plane 3.5). Lines ``NAME,value``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from imulab.calibration import Calibration
+from imulab.errors import OptionError
+from imulab.exporters import ExportOptions
+from imulab.exporters.model import (
+    AXES,
+    accel_loss,
+    accel_terms,
+    gyro_terms,
+    one_unit,
+    refuse_raw,
+    settle_losses,
+    single_precision,
+    write_one,
+)
+
+_LARGEST_OFFSET = 3.5
+_SCALES = (0.8, 1.2)
+
+
+def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
+    """Write ``imulab.param``.
+
+    Raises
+    ------
+    OptionError
+        ArduPilot cannot hold the record.
+    """
+    unit = one_unit(records, "ardupilot")
+    refuse_raw(unit, "ardupilot")
+    accel, gyro = unit.accel, unit.gyro
+    scale = 1 / accel.scale
+    offset = accel.scale * accel.bias
+    for axis, s, o in zip(AXES, scale, offset, strict=True):
+        if not _SCALES[0] <= s <= _SCALES[1]:
+            raise OptionError(
+                f"ardupilot: scale of axis {axis} is {s:.4g}; ArduPilot takes {_SCALES[0]} to {_SCALES[1]}"
+            )
+        if abs(o) > _LARGEST_OFFSET:
+            raise OptionError(
+                f"ardupilot: offset of axis {axis} is {o:.4g} m/s^2; ArduPilot takes at most {_LARGEST_OFFSET}"
+            )
+    error = accel_loss(accel, lambda output: (output - offset) * scale)
+    lost = settle_losses(
+        "ardupilot",
+        (accel_terms(accel, misalignment=True), error),
+        gyro_terms(gyro, bias=False) if gyro is not None else ([], []),
+        lossy=options.lossy,
+    )
+    rows = [(f"INS_ACCOFFS_{a.upper()}", v) for a, v in zip(AXES, offset, strict=True)]
+    rows += [(f"INS_ACCSCAL_{a.upper()}", v) for a, v in zip(AXES, scale, strict=True)]
+    if gyro is not None:
+        rows += [(f"INS_GYROFFS_{a.upper()}", v) for a, v in zip(AXES, gyro.scale * gyro.bias, strict=True)]
+    comments = [
+        "ArduPilot parameters, " + unit.origin[0],
+        unit.origin[1],
+        "for Copter 3.4, Plane 3.5 and later: corrected = (raw - OFFS) * SCAL, m/s^2; older versions scale first",
+        "gyroscopes: raw - OFFS, rad/s; ArduPilot measures these again at each start unless INS_GYR_CAL is 0",
+        "no axes are turned: the record's axes are taken as ArduPilot's body axes (FRD, after the board's rotation)",
+        *lost,
+    ]
+    lines = [f"# {line}" for line in comments] + [f"{name},{single_precision(value)}" for name, value in rows]
+    return write_one(folder, "imulab.param", lines)

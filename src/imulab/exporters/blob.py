@@ -1,0 +1,33 @@
+"""Records to one blob: the tables that the C core loads at run time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from imulab.blob import make_blob, tables_of_all
+from imulab.calibration import Calibration
+from imulab.errors import OptionError
+from imulab.exporters import ExportOptions
+from imulab.files import replacing
+
+
+def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
+    """Write ``unit.blob``.
+
+    Raises
+    ------
+    RecordError
+        A record lacks something, two give the same table, or a number is beyond the range of a float.
+    OptionError
+        The file cannot be written.
+    """
+    data = make_blob(records, tables_of_all(records))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"{folder}: the folder cannot be made: {error.strerror}") from None
+    target = folder / "unit.blob"
+    with replacing(target) as stream:
+        stream.write(data)
+    return [target]

@@ -1,0 +1,203 @@
+"""Records to C: the core in one file, the unit's numbers, and a self-test against what the desk computes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.blob import make_blob, tables_of_all
+from imulab.calibration import Calibration
+from imulab.errors import OptionError
+from imulab.exporters import ExportOptions
+from imulab.exporters.golden import golden_of
+from imulab.files import replacing
+from imulab.tables import KINDS, Field, Table
+
+_CORE = ("tumble.c", "centrifuge.c", "warmup.c", "array.c", "robust.c", "table.c")
+_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array)\.h"\n', re.MULTILINE)
+
+
+def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
+    """Write the core, the unit's numbers, a self-test with its golden vectors, a Makefile and a README.
+
+    Raises
+    ------
+    RecordError
+        A record lacks something, or two give the same table.
+    OptionError
+        The folder cannot be written to.
+    """
+    tables = tables_of_all(records)
+    blob = make_blob(records, tables)
+    contents = {
+        "imulab.h": _source("imulab.h"),
+        "imulab.c": _amalgamation(),
+        "unit.h": _unit_h(records, tables),
+        "unit.c": _unit_c(records, tables),
+        "golden.h": _golden_h(tables, blob),
+        "selftest.c": _firmware("selftest.c"),
+        "Makefile": _firmware("Makefile"),
+        "README.md": _readme(records, tables, len(blob)),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"{folder}: the folder cannot be made: {error.strerror}") from None
+    for name, text in contents.items():
+        with replacing(folder / name) as stream:
+            stream.write(text.encode("utf-8"))
+    with replacing(folder / "unit.blob") as stream:
+        stream.write(blob)
+    return [folder / name for name in (*contents, "unit.blob")]
+
+
+def _source(name: str) -> str:
+    """A file of the core: installed beside the package, or in the checkout."""
+    installed = files("imulab") / "core" / name
+    if installed.is_file():
+        return installed.read_text(encoding="utf-8")
+    return (Path(__file__).resolve().parents[3] / "runtime" / name).read_text(encoding="utf-8")
+
+
+def _firmware(name: str) -> str:
+    return (files("imulab.exporters") / "firmware" / name).read_text(encoding="utf-8")
+
+
+def _amalgamation() -> str:
+    """The core's sources as one file, so that a project has one to add."""
+    parts = ["/* The core of imulab in one file; the same for every unit. */\n", '#include "imulab.h"\n']
+    for name in ("real.h", "array.h", *_CORE):
+        parts += [f"\n/* ==== {name} ==== */\n", _OWN_INCLUDE.sub("", _source(name))]
+    return "".join(parts)
+
+
+def _who(records: Sequence[Calibration]) -> str:
+    serial = next((record.sensor["serial"] for record in records if "serial" in record.sensor), None)
+    return _harmless(serial) if serial else "a unit without serial number"
+
+
+def _harmless(text: str) -> str:
+    """Text that cannot end a C comment."""
+    return text.replace("*/", "* /").replace("\\", "/").replace("\n", " ")
+
+
+def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
+    kinds = {table.kind: table for table in tables}
+    lines = [
+        f"/* The numbers of {_who(records)}. */",
+        "#ifndef UNIT_H",
+        "#define UNIT_H",
+        "",
+        '#include "imulab.h"',
+        "",
+    ]
+    lines += [f"#define UNIT_HAS_{kind.upper()} {int(kind in kinds)}" for kind in KINDS]
+    lines.append(f"#define UNIT_HAS {sum(1 << (KINDS[kind] - 1) for kind in kinds)}u /* as in il_unit.has */")
+    if "warmup" in kinds:
+        lines.append(f"#define UNIT_WARMUP_AXES {len(kinds['warmup'].columns['axes'])}")
+    if "array" in kinds:
+        lines.append(f"#define UNIT_ARRAY_AXES {kinds['array'].columns['axes']}")
+        lines.append(f"#define UNIT_ARRAY_ELEMENTS {kinds['array'].columns['elements']}")
+    lines += ["", *(f"extern const il_{kind} unit_{kind};" for kind in kinds), "", "#endif", ""]
+    return "\n".join(lines)
+
+
+def _unit_c(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
+    lines = [f"/* The numbers of {_who(records)}; made from the records"]
+    lines += [f" *   {record.procedure} {record.created} SHA-256 {_digest(record)}" for record in records]
+    lines += [
+        " * by " + _harmless(records[0].software) + ". */",
+        '#include "unit.h"',
+        "",
+        "#define R(x) ((il_real)(x))",
+    ]
+    for table in tables:
+        lines += ["", *_definition(table)]
+    return "\n".join(lines) + "\n"
+
+
+def _digest(record: Calibration) -> str:
+    return str(record.to_dict()["content_sha256"])
+
+
+def _definition(table: Table) -> list[str]:
+    """The struct of one table, after the arrays that it points to."""
+    pointed = [field for field in table.fields if field.pointed and field.values is not None]
+    lines = [f"static const il_real {table.kind}_{field.name}[] = {{{_numbers(field.values)}}};" for field in pointed]
+    lines.append(f"const il_{table.kind} unit_{table.kind} = {{")
+    names = {field.name for field in pointed}
+    lines += [
+        f"    .{field.name} = {f'{table.kind}_{field.name}' if field.name in names else _member(field)},"
+        for field in table.fields
+        if field.values is not None and field.values.size
+    ]
+    return [*lines, "};"]
+
+
+def _member(field: Field) -> str:
+    values = field.values
+    assert values is not None
+    if values.ndim == 0:
+        return str(int(values)) if field.whole else _number(float(values))
+    if values.ndim == 2:
+        return "{" + ", ".join("{" + _numbers(row) + "}" for row in values) + "}"
+    return "{" + (", ".join(str(int(v)) for v in values) if field.whole else _numbers(values)) + "}"
+
+
+def _number(value: float) -> str:
+    return "IL_NAN" if np.isnan(value) else f"R({value!r})"
+
+
+def _numbers(values: NDArray[Any] | None) -> str:
+    return ", ".join(_number(float(value)) for value in np.asarray(values).reshape(-1))
+
+
+def _golden_h(tables: Sequence[Table], blob: bytes) -> str:
+    lines = [
+        "/* Inputs, and what the desk made of them; for selftest.c only. */",
+        "#ifndef GOLDEN_H",
+        "#define GOLDEN_H",
+    ]
+    lines += ["", "#include <math.h>", "", '#include "imulab.h"', "", "#define IL_NAN ((il_real)NAN)"]
+    lines += ["#define R(x) ((il_real)(x))"]
+    for table in tables:
+        lines.append("")
+        for name, value in golden_of(table).items():
+            lines.append(_golden(f"golden_{table.kind}" + (f"_{name}" if name else ""), value))
+    rows = [", ".join(map(str, blob[i : i + 24])) for i in range(0, len(blob), 24)]
+    lines += ["", "static const uint8_t golden_blob[] = {", *(f"    {row}," for row in rows), "};", "", "#endif", ""]
+    return "\n".join(lines)
+
+
+def _golden(name: str, value: int | float | NDArray[Any]) -> str:
+    if isinstance(value, int):
+        return f"#define {name.upper()} {value}"
+    if isinstance(value, float):
+        return f"static const il_real {name} = {_number(value)};"
+    kind = "uint32_t" if value.dtype.kind == "u" else "il_real"
+    sizes = "".join(f"[{size}]" for size in value.shape)
+    return f"static const {kind} {name}{sizes} = {_nested(value)};"
+
+
+def _nested(value: NDArray[Any]) -> str:
+    if value.ndim == 1:
+        return "{" + (", ".join(f"{v}u" for v in value) if value.dtype.kind == "u" else _numbers(value)) + "}"
+    return "{\n" + ",\n".join("    " + _nested(row) for row in value) + "}"
+
+
+def _readme(records: Sequence[Calibration], tables: Sequence[Table], blob_size: int) -> str:
+    from jinja2 import Environment, StrictUndefined
+
+    # The output is Markdown and C, not HTML: nothing is escaped.
+    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
+    kinds = {kind: next((t.columns for t in tables if t.kind == kind), None) for kind in KINDS}
+    text: str = environment.from_string(_firmware("README.md.j2")).render(
+        serial=_who(records), software=records[0].software, blob_size=blob_size, **kinds
+    )
+    return text + "\n"

@@ -1,0 +1,309 @@
+"""A tumble record as matrices, what a target leaves out of it, and what that costs.
+
+Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyroscopes: ``M = S (T w + G f + b)``.
+Outputs M are in SI, or in counts or volts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imulab._version import VERSION
+from imulab.calibration import Calibration
+from imulab.errors import OptionError, RecordError
+from imulab.files import write_text
+from imulab.recording import Array
+from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
+
+AXES = "xyz"
+_NEGLIGIBLE = 1e-6
+_GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
+_ELSEWHERE = {
+    "warmup": "{target} has no parameter that follows the time since power-on, only ones that follow temperature",
+    "gyro_array": "{target} fuses no array of gyroscopes",
+    "centrifuge": "{target} has no parameter for drift that depends on acceleration",
+}
+
+
+@dataclass(frozen=True)
+class Gyroscopes:
+    """``M = S (T w + G f + b)``: scale factor (3,), matrix T (3, 3), g-sensitivity G (3, 3), bias (3,), unit of M."""
+
+    scale: Array
+    matrix: Array
+    sensitivity: Array
+    bias: Array
+    unit: str
+
+    @property
+    def gain(self) -> Array:
+        """``S T``: output per rate, shape (3, 3)."""
+        return self.scale[:, None] * self.matrix
+
+
+@dataclass(frozen=True)
+class Accelerometers:
+    """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M."""
+
+    scale: Array
+    matrix: Array
+    bias: Array
+    nonlinearity: Array
+    unit: str
+
+    @property
+    def gain(self) -> Array:
+        """``S T``: output per specific force, shape (3, 3)."""
+        return self.scale[:, None] * self.matrix
+
+    def output(self, force: Array) -> Array:
+        """Return the outputs for specific forces, m/s^2, shape (n, 3)."""
+        sensed = force @ self.matrix.T
+        reading = sensed + sum(k * sensed ** (power + 2) for power, k in enumerate(self.nonlinearity))
+        output: Array = self.scale * (reading + self.bias)
+        return output
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The triads of one unit, and the record they come from."""
+
+    record: Calibration
+    accel: Accelerometers
+    gyro: Gyroscopes | None
+
+    @property
+    def origin(self) -> list[str]:
+        """Where the numbers come from, for the comments of a file."""
+        content = self.record.to_dict()["content_sha256"]
+        serial = " ".join(str(self.record.sensor.get("serial", "without serial number")).split())
+        return [
+            f"written by imulab {VERSION} for unit {serial}",
+            f"from the record of {self.record.created}, content_sha256 {content}",
+        ]
+
+
+def one_unit(records: Sequence[Calibration], target: str) -> Unit:
+    """Return the triads of the one tumble record among the records.
+
+    Raises
+    ------
+    OptionError
+        There is another record, which the target cannot hold, or not exactly one.
+    RecordError
+        The record lacks a parameter.
+    """
+    for record in records:
+        if record.procedure != "tumble":
+            reason = _ELSEWHERE.get(record.procedure, "{target} cannot hold it").format(target=target)
+            raise OptionError(
+                f"{target}: a {record.procedure} record cannot be exported: {reason}; use --to c or --to blob"
+            )
+    if len(records) != 1:
+        raise OptionError(f"{target}: expected one tumble record, found {len(records)}")
+    (record,) = records
+    try:
+        return Unit(record, _accelerometers(record), _gyroscopes(record))
+    except KeyError as error:
+        raise RecordError(f"{target}: the record lacks {error.args[0]}") from None
+    except (TypeError, ValueError) as error:
+        raise RecordError(f"{target}: the record has a value that cannot be: {error}") from None
+
+
+def _accelerometers(record: Calibration) -> Accelerometers:
+    unit = str(record.model["output_unit"])
+    factor, kept = _to_si(unit, "m/s^2")
+    matrix = np.eye(3)
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        matrix[i, j] = record.value(f"misalignment_{AXES[i]}{AXES[j]}")
+    order = int(record.model["order"])
+    terms = [[record.value(f"k{power}_{axis}") for axis in AXES] for power in range(2, order + 1)]
+    return Accelerometers(
+        scale=np.array([record.value(f"scale_factor_{axis}") for axis in AXES]) * factor,
+        matrix=matrix,
+        bias=np.array([record.value(f"bias_{axis}") for axis in AXES]),
+        nonlinearity=np.array(terms).reshape(order - 1, 3),
+        unit=kept,
+    )
+
+
+def _gyroscopes(record: Calibration) -> Gyroscopes | None:
+    if "gyro_output_unit" not in record.model:
+        return None
+    factor, kept = _to_si(str(record.model["gyro_output_unit"]), "rad/s")
+    matrix, sensitivity = np.eye(3), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            pair = AXES[i] + AXES[j]
+            if i != j:
+                matrix[i, j] = record.value(f"gyro_misalignment_{pair}")
+            if "gyro_g_sensitivity_xx" in record.parameters:
+                sensitivity[i, j] = record.value(f"gyro_g_sensitivity_{pair}")
+    return Gyroscopes(
+        scale=np.array([record.value(f"gyro_scale_factor_{axis}") for axis in AXES]) * factor,
+        matrix=matrix,
+        sensitivity=sensitivity,
+        bias=np.array([record.value(f"gyro_bias_{axis}") for axis in AXES]),
+        unit=kept,
+    )
+
+
+def _to_si(unit: str, si: str) -> tuple[float, str]:
+    """Return the factor from outputs to SI, and the unit that they then have; counts and volts stay."""
+    if parse_unit(unit).quantity == "output":
+        return 1.0, parse_unit(unit).symbol
+    return conversion_factor(unit, si), si
+
+
+def refuse_raw(unit: Unit, target: str) -> None:
+    """Refuse a record of outputs in counts or volts.
+
+    Raises
+    ------
+    OptionError
+        It is one; the message names the unit.
+    """
+    for sensor, triad in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
+        if triad is not None and triad.unit not in ("m/s^2", "rad/s"):
+            raise OptionError(
+                f"{target}: corrects outputs in {'m/s^2' if sensor == 'accelerometers' else 'rad/s'}, but the record "
+                f"is for {sensor} with outputs in {triad.unit}"
+            )
+
+
+# --- what is lost --------------------------------------------------------------------------------------------------
+
+
+def accel_loss(accel: Accelerometers, correct: Callable[[Array], Any]) -> float:
+    """Return the largest error, m/s^2, of a target's correction over specific forces of +-1 g on each axis."""
+    force = np.stack(np.meshgrid(_GRID, _GRID, _GRID, indexing="ij"), axis=-1).reshape(-1, 3)
+    return float(np.abs(correct(accel.output(force)) - force).max())
+
+
+def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
+    """Name the accelerometers' parameters that a target leaves out."""
+    names = []
+    if misalignment and np.abs(accel.matrix - np.eye(3)).max() > 0:
+        names += [f"misalignment_{AXES[i]}{AXES[j]}" for i, j in ((1, 0), (2, 0), (2, 1)) if accel.matrix[i, j] != 0]
+    names += [
+        f"k{power + 2}_{axis}"
+        for power, row in enumerate(accel.nonlinearity)
+        for axis, k in zip(AXES, row, strict=True)
+        if k
+    ]
+    return names
+
+
+def gyro_terms(gyro: Gyroscopes, *, bias: bool) -> tuple[list[str], list[str]]:
+    """Name the gyroscopes' parameters that a target without gain (if `bias`: without bias) leaves out, and the cost.
+
+    Returns
+    -------
+    tuple
+        Names; and a phrase for each kind of error that they would leave.
+    """
+    names, costs = [], []
+    share = float(np.abs(gyro.gain - np.eye(3)).sum(axis=1).max()) if gyro.unit == "rad/s" else np.inf
+    if share > _NEGLIGIBLE:
+        names += ["gyro_scale_factor", "gyro_misalignment"]
+        costs.append(
+            f"up to {100 * share:.3g} % of the rate" if np.isfinite(share) else "as much as the gyroscopes' scale"
+        )
+    drift = float((np.abs(gyro.sensitivity).sum(axis=1) * STANDARD_GRAVITY).max())
+    if drift > 0:
+        names.append("gyro_g_sensitivity")
+        costs.append(f"up to {np.degrees(drift):.3g} deg/s within +-1 g")
+    if bias and np.abs(gyro.bias).max() > 0:
+        names.append("gyro_bias")
+        costs.append(f"up to {np.degrees(np.abs(gyro.bias).max()):.3g} deg/s of bias")
+    return names, costs
+
+
+def settle_losses(
+    target: str,
+    accel: tuple[list[str], float],
+    gyro: tuple[list[str], list[str]] = ([], []),
+    *,
+    lossy: bool,
+) -> list[str]:
+    """Refuse what would be lost, or return the comment that says so.
+
+    Parameters
+    ----------
+    accel
+        Names of the accelerometers' parameters that are left out, and the largest error that this causes, m/s^2.
+    gyro
+        Names of the gyroscopes', and phrases for the errors.
+
+    Raises
+    ------
+    OptionError
+        Something that matters would be lost, and `lossy` was not asked for.
+    """
+    names, costs = list(gyro[0]), list(gyro[1])
+    if accel[0] and accel[1] > _NEGLIGIBLE * STANDARD_GRAVITY:
+        names = accel[0] + names
+        costs.insert(0, f"up to {_in_g(accel[1])} within +-1 g")
+    if not costs:
+        return []
+    what = f"{' '.join(names)}, which changes outputs by {', '.join(costs)}"
+    if not lossy:
+        raise OptionError(f"{target} cannot hold {what}; add --lossy to leave it out")
+    return [f"left out (lossy): {what}"]
+
+
+def _in_g(error: float) -> str:
+    g = error / STANDARD_GRAVITY
+    return f"{1e3 * g:.3g} mg" if g >= 1e-3 else f"{1e6 * g:.3g} ug"
+
+
+# --- writing -------------------------------------------------------------------------------------------------------
+
+
+def write_one(folder: Path, name: str, lines: Sequence[str]) -> list[Path]:
+    """Write the one file of a target; the folder is made where it is not there.
+
+    Raises
+    ------
+    OptionError
+        It cannot be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"{folder}: cannot be made: {error.strerror}") from None
+    file = folder / name
+    write_text(file, "\n".join(lines) + "\n")
+    return [file]
+
+
+def single_precision(value: float) -> str:
+    """Return a parameter as the shortest plain decimal that gives its nearest single-precision number."""
+    return np.format_float_positional(np.float32(value), unique=True, trim="0")
+
+
+def yaml_number(value: Any) -> str:
+    """Return a number as YAML 1.1 understands it: ``4.0e-06``, since ``4e-06`` is text to it."""
+    text = repr(float(value) + 0.0)
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+def yaml_matrix(matrix: Array, indent: str) -> list[str]:
+    """Return the rows of a matrix as lines of YAML."""
+    return [f"{indent}- [{', '.join(yaml_number(value) for value in row)}]" for row in matrix]
+
+
+def lower_times_rotation(matrix: Array) -> tuple[Array, Array]:
+    """Return L and C with ``matrix = L C``: L lower triangular, C a rotation or its product with -1.
+
+    From the QR decomposition of the transpose (G. H. Golub and C. F. Van Loan, Matrix Computations, 5.2); signs are
+    chosen so that C is nearest to the identity.
+    """
+    q, r = np.linalg.qr(matrix.T)
+    sign = np.where(np.diag(q) < 0, -1.0, 1.0)
+    return np.tril((sign[:, None] * r).T), sign[:, None] * q.T

@@ -1,0 +1,47 @@
+"""ROS imu_calib: ``a = SM raw - bias``, accelerometers only.
+
+Source: imu_calib (D. Koch), accel_calib.cpp: ``SM`` holds 9 numbers row by row, ``bias`` 3, subtracted after scaling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from imulab.calibration import Calibration
+from imulab.exporters import ExportOptions
+from imulab.exporters.model import accel_loss, accel_terms, gyro_terms, one_unit, settle_losses, write_one, yaml_number
+
+
+def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
+    """Write ``imu_calib.yaml``.
+
+    Raises
+    ------
+    OptionError
+        imu_calib cannot hold the record.
+    """
+    unit = one_unit(records, "ros")
+    accel, gyro = unit.accel, unit.gyro
+    matrix = np.linalg.inv(accel.gain)
+    bias = np.linalg.solve(accel.matrix, accel.bias)
+    error = accel_loss(accel, lambda output: output @ matrix.T - bias)
+    lost = settle_losses(
+        "ros",
+        (accel_terms(accel, misalignment=False), error),
+        gyro_terms(gyro, bias=True) if gyro is not None else ([], []),
+        lossy=options.lossy,
+    )
+    comments = [
+        "ROS imu_calib, " + unit.origin[0],
+        unit.origin[1],
+        f"a = SM raw - bias, m/s^2, from raw outputs in {accel.unit}",
+        "no axes are turned: the result is in the record's axes",
+        *lost,
+    ]
+    lines = [f"# {line}" for line in comments]
+    lines += ["SM:", *(f"  - {yaml_number(value)}" for value in matrix.ravel())]
+    lines += ["bias:", *(f"  - {yaml_number(value)}" for value in bias)]
+    return write_one(folder, "imu_calib.yaml", lines)

@@ -1,0 +1,99 @@
+"""What the YAML files of Kalibr and OpenVINS have in common: noise keys, and the comment on biases."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from imulab.errors import OptionError
+from imulab.exporters import ExportOptions
+from imulab.exporters.model import AXES, Unit, accel_loss, accel_terms, settle_losses, yaml_number
+
+_KEYS = {
+    "accelerometer_noise_density": ("accel", "angle_random_walk", "m/s^2/sqrt(Hz)"),
+    "accelerometer_random_walk": ("accel", "rate_random_walk", "m/s^3/sqrt(Hz)"),
+    "gyroscope_noise_density": ("gyro", "angle_random_walk", "rad/s/sqrt(Hz)"),
+    "gyroscope_random_walk": ("gyro", "rate_random_walk", "rad/s^2/sqrt(Hz)"),
+}
+_UNITS = {"accel": "m/s^2", "gyro": "rad/s"}
+
+
+def noise_lines(options: ExportOptions, indent: str) -> list[str]:
+    """Return the noise keys and the update rate, or comments in their place.
+
+    The largest of a triad's three axes is taken, since both programs have one number for them.
+
+    Raises
+    ------
+    OptionError
+        What was given is not what ``allan --json`` prints.
+    """
+    if not options.noise:
+        keys = " ".join(_KEYS)
+        return [f"{indent}# not known, to be filled in (imulab export --noise FILE): {keys} update_rate"]
+    columns = options.noise.get("columns")
+    if not isinstance(columns, Mapping):
+        raise OptionError("the noise file lacks 'columns'; expected what 'imulab allan --json' printed")
+    lines = []
+    for key, (sensor, coefficient, unit) in _KEYS.items():
+        found = [_value(columns[name], coefficient, name) for name in _names(columns, sensor)]
+        value = max(found, default=0.0)
+        if value > 0:
+            lines.append(f"{indent}{key}: {yaml_number(value)}  # {unit}, the largest of {len(found)} axes")
+        else:
+            lines.append(f"{indent}# {key} is not known: {'not resolved' if found else 'not measured'}")
+    rate = options.noise.get("sample_rate")
+    rate = rate.get("value") if isinstance(rate, Mapping) else rate
+    if isinstance(rate, int | float) and rate > 0:
+        lines.append(f"{indent}update_rate: {yaml_number(rate)}  # Hz")
+    else:
+        lines.append(f"{indent}# update_rate is not known")
+    return lines
+
+
+def _names(columns: Mapping[str, Any], sensor: str) -> list[str]:
+    return [f"{sensor}_{axis}" for axis in AXES if f"{sensor}_{axis}" in columns]
+
+
+def _value(column: Any, coefficient: str, name: str) -> float:
+    try:
+        value = column[coefficient]["value"]
+        unit = column["unit"]
+    except (KeyError, TypeError):
+        raise OptionError(
+            f"the noise file lacks {coefficient} of {name}; expected what 'imulab allan --json' printed"
+        ) from None
+    needed = _UNITS[name.partition("_")[0]]
+    if unit != needed:
+        raise OptionError(f"the noise file has {name} in {unit!r}; expected {needed!r}")
+    if not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+        raise OptionError(f"the noise file has {coefficient} of {name} = {value!r}; expected a number of at least 0")
+    return float(value)
+
+
+def bias_lines(unit: Unit) -> list[str]:
+    """Return the constant biases as comments, in the units of the outputs."""
+    lines = ["constant bias has no key here, the program estimates it; as measured:"]
+    triads = [("accelerometers", unit.accel), ("gyroscopes", unit.gyro)]
+    for name, triad in triads:
+        if triad is not None:
+            values = ", ".join(repr(float(value)) for value in triad.scale * triad.bias)
+            lines.append(f"b of the {name} = [{values}] {triad.unit}")
+    return lines
+
+
+def unit_lines(unit: Unit) -> list[str]:
+    """Return comments that warn of outputs that are not in SI."""
+    lines = []
+    for name, triad in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
+        if triad is not None and triad.unit not in _UNITS.values():
+            lines.append(f"the {name}' outputs are in {triad.unit}: the messages must hold them as they are")
+    return lines
+
+
+def nonlinearity_lost(unit: Unit, inverse: Any, target: str, options: ExportOptions) -> list[str]:
+    """Refuse, or return the comment on, nonlinearity that a target with a full matrix and a bias leaves out."""
+    accel = unit.accel
+    error = accel_loss(accel, lambda output: (output - accel.scale * accel.bias) @ inverse.T)
+    return settle_losses(target, (accel_terms(accel, misalignment=False), error), lossy=options.lossy)

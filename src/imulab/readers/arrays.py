@@ -1,0 +1,126 @@
+"""Arrays that lie whole in a file, through a layout: what HDF5, MATLAB and Parquet files have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import ReadError
+from imulab.readers.layout import Layout
+from imulab.recording import Array, Recording
+
+ROWS = 1 << 16
+_INDEXED = re.compile(r"(.*?)\[(\d{1,9})\]")
+
+
+def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | None]]:
+    """Return for each column its variable and, from ``variable[2]``, the number of its column there.
+
+    Raises
+    ------
+    ReadError
+        The layout takes a column by number.
+    """
+    found: dict[str, tuple[str, int | None]] = {}
+    for column, entry in layout.columns.items():
+        if not isinstance(entry.origin, str):
+            raise ReadError(
+                f"{name}: {layout.name} takes {column} from column {entry.origin}; in a {kind} file they have names: "
+                f'from = "variable" or "group/dataset", with [0] behind it for a column of a matrix'
+            )
+        match = _INDEXED.fullmatch(entry.origin)
+        found[column] = (match[1], int(match[2])) if match else (entry.origin, None)
+    return found
+
+
+def sliced(
+    shape: tuple[int, ...], number: int | None, by_rows: bool, where: str
+) -> tuple[int, Callable[[Any, int, int], Any]]:
+    """Return the length of a column of an array, and a function that takes rows ``start`` to ``stop`` out of it.
+
+    Parameters
+    ----------
+    shape
+        Of the array.
+    number
+        Which column; None where the array is a vector.
+    by_rows
+        Whether each column of the matrix is a row of the array (MATLAB in HDF5).
+
+    Raises
+    ------
+    ReadError
+        The array has another shape; `where` begins the message.
+    """
+    long = [size for size in shape if size != 1]
+    if number is None and len(long) <= 1:
+        axis = next((i for i, size in enumerate(shape) if size != 1), len(shape) - 1)
+        if not shape:
+            raise ReadError(f"{where}: expected a vector, found a single value")
+
+        def vector(array: Any, start: int, stop: int) -> Any:
+            index: list[Any] = [0] * len(shape)
+            index[axis] = slice(start, stop)
+            return array[tuple(index)]
+
+        return shape[axis], vector
+    if len(shape) != 2:
+        raise ReadError(f"{where}: expected a vector or a matrix, found an array of {' x '.join(map(str, shape))}")
+    if number is None:
+        raise ReadError(
+            f"{where}: a matrix of {' x '.join(map(str, shape))}; say which column, with [0] behind its name"
+        )
+    rows, columns = (shape[1], shape[0]) if by_rows else shape
+    if number >= columns:
+        raise ReadError(f"{where}: column {number} of a matrix with {columns} columns (counted from 0)")
+    if by_rows:
+        return rows, lambda array, start, stop: array[number, start:stop]
+    return rows, lambda array, start, stop: array[start:stop, number]
+
+
+def to_floats(values: Any, where: str) -> Array:
+    """Return an array as float64.
+
+    Raises
+    ------
+    ReadError
+        It holds no real numbers.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "iufb":
+        raise ReadError(f"{where}: expected real numbers, found {array.dtype}")
+    return array.astype(np.float64)
+
+
+def recordings(
+    take: Mapping[str, Callable[[int, int], Array]], lengths: Mapping[str, int], layout: Layout, name: str
+) -> Iterator[Recording]:
+    """Yield blocks of columns that are read by ``take[column](start, stop)``.
+
+    Raises
+    ------
+    ReadError
+        The columns have different lengths, or none at all.
+    """
+    if len(set(lengths.values())) > 1:
+        found = ", ".join(f"{column} {length}" for column, length in lengths.items())
+        raise ReadError(f"{name}: columns of different length: {found}")
+    total = next(iter(lengths.values()), 0)
+    if total == 0:
+        raise ReadError(f"{name}: no rows of data")
+    units = {column: entry.unit for column, entry in layout.columns.items()}
+    for start in range(0, total, ROWS):
+        stop = min(start + ROWS, total)
+        columns = {column: function(start, stop) for column, function in take.items()}
+        if layout.sample_rate is not None:
+            columns = {"time": np.arange(start, stop) / layout.sample_rate, **columns}
+        yield Recording(
+            columns=columns,
+            units={"time": "s", **units} if layout.sample_rate is not None else units,
+            metadata=dict(layout.metadata or {}),
+            name=name,
+            first_row=start + 1,
+        )

@@ -1,0 +1,276 @@
+"""ArduPilot DataFlash (.bin): IMU, or ACC and GYR.
+
+Source: ArduPilot AP_Logger (LogStructure.h): messages A3 95, u8 type, payload; messages of type 128 (FMT) give each
+type's length, name, field types and field names. Time is ``TimeUS`` (``TimeMS`` in old logs), since boot.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from imulab.errors import OptionError, ReadError
+from imulab.readers import logs
+from imulab.readers.selection import Selection
+from imulab.readers.streams import Piece, Stream, on_one_clock
+from imulab.recording import Array, Recording
+
+MAGIC = b"\xa3\x95\x80"
+_FMT = 128
+_KINDS = {
+    "a": ("<i2", 32, 1.0),
+    "b": ("i1", 1, 1.0),
+    "B": ("u1", 1, 1.0),
+    "h": ("<i2", 1, 1.0),
+    "H": ("<u2", 1, 1.0),
+    "i": ("<i4", 1, 1.0),
+    "I": ("<u4", 1, 1.0),
+    "f": ("<f4", 1, 1.0),
+    "d": ("<f8", 1, 1.0),
+    "g": ("<f2", 1, 1.0),
+    "n": ("S4", 1, 1.0),
+    "N": ("S16", 1, 1.0),
+    "Z": ("S64", 1, 1.0),
+    "c": ("<i2", 1, 0.01),
+    "C": ("<u2", 1, 0.01),
+    "e": ("<i4", 1, 0.01),
+    "E": ("<u4", 1, 0.01),
+    "L": ("<i4", 1, 1e-7),
+    "M": ("u1", 1, 1.0),
+    "q": ("<i8", 1, 1.0),
+    "Q": ("<u8", 1, 1.0),
+}
+_ACCEL = {f"accel_{axis}": "m/s^2" for axis in "xyz"}
+_GYRO = {f"gyro_{axis}": "rad/s" for axis in "xyz"}
+_FIELDS = {
+    "IMU": ("AccX", "AccY", "AccZ", "GyrX", "GyrY", "GyrZ"),
+    "ACC": ("AccX", "AccY", "AccZ"),
+    "GYR": ("GyrX", "GyrY", "GyrZ"),
+}
+_NAME = re.compile(
+    r"(IMU|ACC|GYR)([1-9]?)"
+)  # before ArduPilot 4.1 each instance had its own message: IMU, IMU2, ACC1 ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    offset: int
+    kind: str
+    factor: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Format:
+    """A message type: its name, its fields, and the length of its payload."""
+
+    name: str
+    fields: dict[str, _Field]
+    length: int
+    sensor: str | None
+    instance: int | None  # None: field I tells
+
+    def rows(self, records: logs.Records, kind: int, file: str) -> np.ndarray:
+        """Payloads of the messages of this type, shape (n, length)."""
+        indices = records.of(kind)
+        if not (records.sizes[indices] == self.length).all():
+            raise ReadError(f"{file}: the format of message {self.name} changes within the file")
+        return logs.gather(records.block, records.offsets[indices], self.length)
+
+    def column(self, rows: np.ndarray, key: str) -> Array:
+        f = self.fields[key]
+        values = logs.field(rows, f.offset, f.kind).astype(np.float64)
+        return values if f.factor == 1.0 else values * f.factor
+
+    def ticks(self, rows: np.ndarray) -> np.ndarray:
+        """Time since boot, microseconds."""
+        key = "TimeUS" if "TimeUS" in self.fields else "TimeMS"
+        stamps = logs.field(rows, self.fields[key].offset, self.fields[key].kind).astype(np.int64)
+        return stamps if key == "TimeUS" else stamps * 1000
+
+
+@dataclass(slots=True)
+class _Contents:
+    """What a first pass over the file finds: formats, and how many messages of each type and instance."""
+
+    formats: dict[int, _Format] = field(default_factory=dict)
+    counts: dict[tuple[int, int], int] = field(default_factory=dict)
+    other: set[str] = field(default_factory=set)
+    version: str = ""
+    notes: list[str] = field(default_factory=list)
+
+
+def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
+    """Yield the samples of one accelerometer and gyroscope.
+
+    Raises
+    ------
+    ReadError
+        The file is no DataFlash log, is damaged, or has no such message or instance.
+    OptionError
+        An unknown message name.
+    """
+    contents = _survey(path, name)
+    streams, sources = _choose(contents, selection, name)
+    metadata = {"autopilot": contents.version or "ArduPilot", "time_origin": "boot"}
+    yield from on_one_clock(
+        streams,
+        _pieces(path, contents, sources, name),
+        name=name,
+        per_second=1_000_000,
+        origin=0,
+        metadata=lambda _: metadata,
+        notes=(*contents.notes, "ArduPilot logs outputs that it has already corrected by its INS_ parameters"),
+    )
+
+
+# --- what is inside ----------------------------------------------------------------------------------------------
+
+
+def _survey(path: Path, name: str) -> _Contents:
+    contents = _Contents()
+    ending: list[logs.Ending] = []
+    with path.open("rb") as stream:
+        for records in logs.walk_stream(stream, logs.DATAFLASH, 0, path.stat().st_size, ending):
+            for index in records.of(_FMT).tolist():
+                _define(contents, records.payload(index), name)
+            for kind in np.unique(records.keys).tolist():
+                form = contents.formats.get(kind)
+                if form is None:
+                    continue
+                if form.name == "MSG" and not contents.version and "Message" in form.fields:
+                    _version(contents, form, records, kind)
+                if form.sensor is None:
+                    contents.other.add(form.name)
+                    continue
+                rows = form.rows(records, kind, name)
+                instances = form.column(rows, "I") if form.instance is None else np.full(len(rows), form.instance)
+                for instance, count in zip(*np.unique(instances, return_counts=True), strict=True):
+                    place = (kind, int(instance))
+                    contents.counts[place] = contents.counts.get(place, 0) + int(count)
+    (end,) = ending
+    # Cards and flash chips are filled with 00 or FF behind the end of a log.
+    filled = end.left and _is_fill(path, end.position)
+    if end.damaged and not filled:
+        shown = end.left[:3].hex(" ")
+        raise ReadError(f"{name}: damaged at byte {end.position}: expected a message (a3 95 ..), found {shown}")
+    if end.left:
+        what = "filling behind" if filled else "the last message, cut,"
+        contents.notes.append(f"truncated: {what} at byte {end.position}; read up to there")
+    return contents
+
+
+def _is_fill(path: Path, position: int) -> bool:
+    with path.open("rb") as stream:
+        stream.seek(position)
+        first = stream.read(1)
+        if first not in (b"\x00", b"\xff"):
+            return False
+        while data := stream.read(1 << 20):
+            if data.strip(first):
+                return False
+    return True
+
+
+def _define(contents: _Contents, payload: bytes, name: str) -> None:
+    """Take in a format message: u8 type, u8 length, char[4] name, char[16] types, char[64] field names."""
+    kind, length = payload[0], payload[1]
+    title = payload[2:6].rstrip(b"\0").decode("ascii", "replace")
+    types = payload[6:22].rstrip(b"\0").decode("ascii", "replace")
+    names = payload[22:86].rstrip(b"\0").decode("ascii", "replace").split(",")
+    if kind == _FMT:
+        return
+    fields: dict[str, _Field] = {}
+    offset = 0
+    for code, key in zip(types, names, strict=False):
+        if code not in _KINDS:
+            break
+        dtype, count, factor = _KINDS[code]
+        fields[key.strip()] = _Field(offset, dtype, factor)
+        offset += np.dtype(dtype).itemsize * count
+    match = _NAME.fullmatch(title)
+    sensor = match[1] if match else None
+    instance = None
+    if match and sensor:
+        wanted = _FIELDS[sensor]
+        instance = None if "I" in fields else int(match[2] or 1) - 1
+        missing = [key for key in wanted if key not in fields]
+        if missing or not ({"TimeUS", "TimeMS"} & set(fields)):
+            lacks = missing[0] if missing else "TimeUS"
+            raise ReadError(f"{name}: message {title} has no field {lacks}; found {' '.join(fields) or 'none'}")
+        if offset > length - 3 or any(fields[key].kind[0] == "S" for key in (*wanted, "I") if key in fields):
+            raise ReadError(f"{name}: message {title}: fields of {offset} bytes in {length - 3}")
+    elif offset > length - 3:
+        fields = {}
+    contents.formats[kind] = _Format(title, fields, max(length - 3, 0), sensor, instance)
+
+
+def _version(contents: _Contents, form: _Format, records: logs.Records, kind: int) -> None:
+    for index in records.of(kind)[:20].tolist():
+        text = records.payload(index)[form.fields["Message"].offset :].rstrip(b"\0").decode("utf-8", "replace")
+        if text.startswith("Ardu"):
+            contents.version = " ".join(text.split())
+            return
+
+
+def _choose(
+    contents: _Contents, selection: Selection, name: str
+) -> tuple[list[Stream], dict[int, list[tuple[int, int | None, tuple[str, ...]]]]]:
+    """Return the streams, and for each message type its stream, instance and fields."""
+    if selection.topic not in (None, "IMU", "ACC", "GYR"):
+        raise OptionError(f"{name}: topic {selection.topic!r}; of a DataFlash log these can be read: IMU ACC GYR")
+    there: dict[tuple[str, int], tuple[int, int | None]] = {}
+    for kind, instance in contents.counts:
+        form = contents.formats[kind]
+        there[str(form.sensor), instance] = (kind, instance if form.instance is None else None)
+    titles = {title for title, _ in there}
+    if not titles:
+        found = " ".join(sorted(contents.other)) or "none"
+        raise ReadError(f"{name}: no IMU, ACC or GYR messages; messages found: {found}")
+    topic = selection.topic or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
+    instance = selection.instance or 0
+    if (topic, instance) not in there:
+        found = ", ".join(f"{title} {number}" for title, number in sorted(there))
+        raise OptionError(f"{name}: no {topic} of instance {instance}; found {found}")
+    several = sum(title == topic for title, _ in there)
+    if several > 1:
+        contents.notes.append(f"instance {instance} of {several} of {topic}")
+    sources: dict[int, list[tuple[int, int | None, tuple[str, ...]]]] = {}
+    kind, number = there[topic, instance]
+    form = contents.formats[kind]
+    if topic == "GYR":
+        sources[kind] = [(0, number, _FIELDS["GYR"])]
+        return [Stream("gyroscope", _GYRO)], sources
+    if topic == "IMU":
+        warm = ("T",) if "T" in form.fields and form.fields["T"].kind[0] != "S" else ()
+        sources[kind] = [(0, number, (*_FIELDS["IMU"], *warm))]
+        units = {**_ACCEL, **_GYRO, **({"temperature": "degC"} if warm else {})}
+        return [Stream("accelerometer", units)], sources
+    sources[kind] = [(0, number, _FIELDS["ACC"])]
+    streams = [Stream("accelerometer", _ACCEL)]
+    if ("GYR", instance) in there:
+        kind, number = there["GYR", instance]
+        sources[kind] = [(1, number, _FIELDS["GYR"])]
+        streams.append(Stream("gyroscope", _GYRO))
+    return streams, sources
+
+
+# --- samples -----------------------------------------------------------------------------------------------------
+
+
+def _pieces(
+    path: Path, contents: _Contents, sources: dict[int, list[tuple[int, int | None, tuple[str, ...]]]], name: str
+) -> Iterator[Piece]:
+    with path.open("rb") as stream:
+        for records in logs.walk_stream(stream, logs.DATAFLASH, 0, path.stat().st_size, []):
+            for kind, parts in sources.items():
+                form = contents.formats[kind]
+                rows = form.rows(records, kind, name)
+                for slot, instance, keys in parts:
+                    mine = rows if instance is None else rows[form.column(rows, "I") == instance]
+                    values = np.column_stack([form.column(mine, key) for key in keys])
+                    if len(mine):
+                        yield Piece(slot, form.ticks(mine), values)

@@ -1,0 +1,111 @@
+"""The kinds of file that can be read: how each is recognised, which library it needs, and whether that is here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from imulab.errors import ReadError
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_MAT = b"MATLAB 5.0 MAT-file"
+_MAT73 = b"MATLAB 7.3 MAT-file"
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A kind of file.
+
+    Attributes
+    ----------
+    name, endings
+        What people call it, and how its file names usually end.
+    module
+        The module of `imulab.readers` that reads it.
+    matches
+        Whether the first 1024 bytes are of this kind.
+    library, extra
+        What it needs beyond imulab's own dependencies, and the extra that installs it.
+    layout
+        ``needed``, ``possible`` or ``none``: whether a layout file says where the columns are.
+    writes
+        Whether `convert` writes it.
+    """
+
+    name: str
+    endings: str
+    module: str
+    matches: Callable[[bytes], bool]
+    library: str = ""
+    extra: str = ""
+    layout: str = "none"
+    writes: bool = False
+
+    @property
+    def available(self) -> bool:
+        """Whether the library is here."""
+        return not self.library or find_spec(self.library) is not None
+
+
+FORMATS = (
+    Format("Parquet", ".parquet", "parquet", lambda h: h.startswith(b"PAR1"), "pyarrow", "tables", "possible", True),
+    Format("MATLAB v7.3", ".mat", "hdf5", lambda h: h.startswith(_MAT73), "h5py", "hdf5", "needed"),
+    Format("MATLAB v5 to v7", ".mat", "mat", lambda h: h.startswith(_MAT), "scipy", "", "needed"),
+    Format("HDF5", ".h5 .hdf5", "hdf5", lambda h: h.startswith(_HDF5) or h[512:520] == _HDF5, "h5py", "hdf5", "needed"),
+    Format("ROS 1 bag", ".bag", "rosbag", lambda h: h.startswith(b"#ROSBAG V"), "lz4", "ros"),
+    Format("ROS 2 MCAP", ".mcap, a folder", "rosbag", lambda h: h.startswith(b"\x89MCAP"), "lz4", "ros"),
+    Format("ROS 2 sqlite", ".db3, a folder", "rosbag", lambda h: h.startswith(b"SQLite format 3\0")),
+    Format("PX4 ULog", ".ulg", "ulog", lambda h: h.startswith(b"ULog")),
+    Format("MIMU4444 log", ".bin", "mimu", lambda h: _is_mimu(h)),
+    Format("ArduPilot DataFlash", ".bin", "dataflash", lambda h: h.startswith(b"\xa3\x95")),
+)
+TEXT = Format("text", ".csv, any", "text", lambda _: True, layout="possible", writes=True)
+
+
+def _is_mimu(head: bytes) -> bool:
+    if b"\xaa" not in head:
+        return False
+    from imulab.readers.mimu import is_mimu
+
+    return is_mimu(head)
+
+
+def recognised(head: bytes) -> Format:
+    """Return the kind of a file by its first bytes; text where nothing else fits."""
+    return next((kind for kind in FORMATS if kind.matches(head)), TEXT)
+
+
+def library(module: str, kind: str, extra: str, name: str) -> Any:
+    """Import the library that a kind of file needs.
+
+    Raises
+    ------
+    ReadError
+        It is not here; the message says how to install it.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise ReadError(f"{name}: {kind} needs {package}, which is not here: pip install 'imulab[{extra}]'") from None
+
+
+def table() -> tuple[list[str], list[list[str]]]:
+    """Return titles and rows of what can be read and written."""
+    rows = []
+    for kind in (TEXT, *FORMATS):
+        needs = f"pip install 'imulab[{kind.extra}]'" if kind.extra and not kind.available else ""
+        optional = kind.extra and kind.available
+        rows.append(
+            [
+                kind.name,
+                kind.endings,
+                "read, write" if kind.writes else "read",
+                {"none": "", "possible": "for foreign columns", "needed": "--layout"}[kind.layout],
+                needs or (f"{kind.library} is here" if optional else "nothing"),
+            ]
+        )
+    return ["format", "files", "", "layout", "needs"], rows

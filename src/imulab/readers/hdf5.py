@@ -1,0 +1,91 @@
+"""HDF5, and MATLAB v7.3 (which is HDF5 with transposed matrices), through a layout: ``from = "group/dataset"``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from imulab.errors import ReadError
+from imulab.readers.arrays import origins, recordings, sliced, to_floats
+from imulab.readers.formats import library
+from imulab.readers.layout import Layout
+from imulab.recording import Array, Recording
+
+_LISTED = 20
+
+
+def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
+    """Yield the columns that a layout names.
+
+    Raises
+    ------
+    ReadError
+        The library is missing, the file is cut or damaged, there is no layout, or a dataset is not there or no column.
+    """
+    h5py = library("h5py", "HDF5", "hdf5", name)
+    try:
+        file = h5py.File(path, "r")
+    except Exception as error:  # h5py raises OSError, RuntimeError, KeyError ...
+        raise ReadError(f"{name}: not a whole HDF5 file: {_short(error)}") from None
+    with file:
+        try:
+            yield from _recordings(h5py, file, name, layout)
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError) as error:
+            raise ReadError(f"{name}: damaged: {_short(error)}") from None
+
+
+def _recordings(h5py: Any, file: Any, name: str, layout: Layout | None) -> Iterator[Recording]:
+    if layout is None:
+        raise ReadError(
+            f"{name}: say with --layout FILE.toml which dataset is which column; datasets found: {_list(h5py, file)}"
+        )
+    take: dict[str, Callable[[int, int], Array]] = {}
+    lengths: dict[str, int] = {}
+    for column, (variable, number) in origins(layout, name, "HDF5").items():
+        where = f"{name}: {layout.name} takes {column} from {variable!r}"
+        dataset, member = _dataset(h5py, file, variable)
+        if dataset is None:
+            raise ReadError(f"{where}, found {_list(h5py, file)}")
+        lengths[column], rows = sliced(dataset.shape or (), number, "MATLAB_class" in dataset.attrs, where)
+        source = dataset if member is None else dataset.fields(member)
+        take[column] = partial(_floats, rows, source, where)
+    yield from recordings(take, lengths, layout, name)
+
+
+def _floats(rows: Callable[[Any, int, int], Any], source: Any, where: str, start: int, stop: int) -> Array:
+    return to_floats(rows(source, start, stop), where)
+
+
+def _dataset(h5py: Any, file: Any, variable: str) -> tuple[Any, str | None]:
+    """Return a dataset, or a table's dataset and the name of its member."""
+    found = file.get(variable) if variable else None
+    if isinstance(found, h5py.Dataset):
+        return found, None
+    parent, _, member = variable.rpartition("/")
+    found = file.get(parent) if parent else None
+    if isinstance(found, h5py.Dataset) and found.dtype.names and member in found.dtype.names:
+        return found, member
+    return None, None
+
+
+def _list(h5py: Any, file: Any) -> str:
+    names: list[str] = []
+
+    def note(path: str, item: Any) -> bool | None:
+        if isinstance(item, h5py.Dataset) and not path.startswith("#"):
+            members = item.dtype.names
+            names.extend([f"{path}/{m}" for m in members] if members else [f"{path} ({_size(item.shape)})"])
+        return True if len(names) > _LISTED else None
+
+    file.visititems(note)
+    return ", ".join(names[:_LISTED]) + (" ..." if len(names) > _LISTED else "") if names else "none"
+
+
+def _size(shape: tuple[int, ...] | None) -> str:
+    return " x ".join(map(str, shape)) if shape else "a single value"
+
+
+def _short(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__

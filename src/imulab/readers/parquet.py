@@ -1,0 +1,88 @@
+"""Parquet: columns named ``name [unit]``, or any names through a layout; file metadata as ``key: value``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import ReadError
+from imulab.readers.arrays import ROWS, origins, to_floats
+from imulab.readers.formats import library
+from imulab.readers.layout import Layout
+from imulab.recording import Array, Recording, parse_column_title
+
+_NOT_OURS = ("ARROW:", "pandas", "org.apache", "huggingface", "geo")
+
+
+def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
+    """Yield the rows of a Parquet file.
+
+    Raises
+    ------
+    ReadError
+        The library is missing, the file is cut or damaged, has no rows, or a column that holds no numbers.
+    UnitError
+        A column has no unit or an unknown one.
+    """
+    arrow = library("pyarrow", "Parquet", "tables", name)
+    from pyarrow import parquet
+
+    row = 1
+    try:
+        with parquet.ParquetFile(path, memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
+            there = file.schema_arrow.names
+            columns, units = _columns(there, name, layout)
+            metadata = {**_metadata(file.schema_arrow.metadata), **((layout and layout.metadata) or {})}
+            for batch in file.iter_batches(
+                batch_size=ROWS, columns=list(dict.fromkeys(columns.values())), use_threads=False
+            ):
+                if batch.num_rows == 0:
+                    continue
+                values = {key: _floats(arrow, batch.column(title), title, name) for key, title in columns.items()}
+                if layout is not None and layout.sample_rate is not None:
+                    stamps = np.arange(row - 1, row - 1 + batch.num_rows) / layout.sample_rate
+                    values = {"time": stamps, **values}
+                yield Recording(columns=values, units=units, metadata=metadata, name=name, first_row=row)
+                row += batch.num_rows
+    except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
+        raise ReadError(f"{name}: not a whole Parquet file: {' '.join(str(error).split())[:160]}") from None
+    if row == 1:
+        raise ReadError(f"{name}: no rows of data")
+
+
+def _columns(there: list[str], name: str, layout: Layout | None) -> tuple[dict[str, str], dict[str, str]]:
+    """Return for each of our columns its title in the file, and its unit."""
+    columns: dict[str, str] = {}
+    units: dict[str, str] = {}
+    if layout is None:
+        for title in there:
+            key, unit = parse_column_title(title, name)
+            if key in columns:
+                raise ReadError(f"{name}: column {key} appears twice")
+            columns[key], units[key] = title, unit
+        return columns, units
+    if layout.sample_rate is not None:
+        units["time"] = "s"
+    for key, (title, number) in origins(layout, name, "Parquet").items():
+        title = title if number is None else f"{title}[{number}]"
+        if there.count(title) != 1:
+            raise ReadError(f"{name}: {layout.name} takes {key} from a column named {title!r}, found {' '.join(there)}")
+        columns[key], units[key] = title, layout.columns[key].unit
+    return columns, units
+
+
+def _metadata(pairs: dict[bytes, bytes] | None) -> dict[str, str]:
+    texts = {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in (pairs or {}).items()}
+    return {key: " ".join(value.splitlines()) for key, value in texts.items() if not key.startswith(_NOT_OURS)}
+
+
+def _floats(arrow: Any, column: Any, title: str, name: str) -> Array:
+    kind = column.type
+    if not (arrow.types.is_integer(kind) or arrow.types.is_floating(kind) or arrow.types.is_boolean(kind)):
+        raise ReadError(f"{name}: column {title}: expected numbers, found {kind}")
+    if column.null_count or arrow.types.is_boolean(kind):
+        column = column.cast(arrow.float64(), safe=False).fill_null(float("nan"))
+    return to_floats(column.to_numpy(zero_copy_only=False), f"{name}: column {title}")

@@ -1,0 +1,83 @@
+"""Which part of a file to read: topic, instance, time window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imulab.errors import OptionError
+from imulab.recording import Recording
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What to take out of a file that holds more than one recording.
+
+    Attributes
+    ----------
+    topic
+        ROS topic (two, separated by a comma: the accelerometer's and the gyroscope's), ULog topic or DataFlash message.
+    instance
+        Number of the sensor in a flight log, from 0.
+    window
+        First and last time to read, s, each None for no bound; the bounds belong to the window.
+    """
+
+    topic: str | None = None
+    instance: int | None = None
+    window: tuple[float | None, float | None] | None = None
+
+    def __post_init__(self) -> None:
+        if self.instance is not None and self.instance < 0:
+            raise OptionError(f"instance {self.instance}: expected a number from 0")
+        first, last = self.window or (None, None)
+        if first is not None and last is not None and not first < last:
+            raise OptionError(f"window {first:g}:{last:g}: expected a start before its end")
+
+    def refuse(self, name: str, kind: str, *, topic: bool = True, instance: bool = True) -> None:
+        """Refuse choices that a kind of file cannot offer."""
+        if topic and self.topic is not None:
+            raise OptionError(f"{name}: {kind} has no topics to choose from; leave out the topic {self.topic!r}")
+        if instance and self.instance is not None:
+            raise OptionError(f"{name}: {kind} has no instances to choose from; leave out the instance {self.instance}")
+
+
+def windowed(
+    blocks: Iterator[Recording], window: tuple[float | None, float | None] | None, name: str
+) -> Iterator[Recording]:
+    """Pass on the rows within a time window, and stop reading behind it.
+
+    Raises
+    ------
+    OptionError
+        The recording has no time, or nothing in the window.
+    """
+    if window is None:
+        yield from blocks
+        return
+    first, last = (-np.inf if window[0] is None else window[0]), (np.inf if window[1] is None else window[1])
+    low, high, found = np.inf, -np.inf, False
+    for block in blocks:
+        time = block.time
+        if time is None:
+            raise OptionError(f"{name}: no time column, so there is no window of it to read")
+        finite = time[np.isfinite(time)]
+        if finite.size:
+            low, high = min(low, float(finite.min())), max(high, float(finite.max()))
+        inside = (time >= first) & (time <= last)
+        edges = np.flatnonzero(np.diff(inside, prepend=False, append=False))
+        for start, stop in edges.reshape(-1, 2).tolist():
+            found = True
+            yield replace(
+                block,
+                columns={key: values[start:stop] for key, values in block.columns.items()},
+                first_row=block.first_row + start,
+            )
+        if found and finite.size and finite.min() > last:
+            break
+    if not found:
+        raise OptionError(
+            f"{name}: nothing in the window {first:g} to {last:g} s; the file runs from {low:g} to {high:g} s"
+        )

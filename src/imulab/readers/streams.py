@@ -1,0 +1,191 @@
+"""Streams of different clocks to one recording.
+
+Logs interleave the samples of several sensors. The accelerometer's samples (or whatever stream comes first) are the
+clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import ReadError
+from imulab.recording import Array, Recording
+
+Ticks = NDArray[np.int64]
+
+_ROWS = 1 << 16
+_PATIENCE = 1 << 20
+_WIDEST_GAP = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """The columns of one stream, what to call it, and whether its values are slow enough to bridge any gap."""
+
+    what: str
+    units: Mapping[str, str]
+    slow: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Consecutive samples of a stream: integer time stamps (n,), values (n, columns)."""
+
+    stream: int
+    ticks: Ticks
+    values: Array
+
+
+class _Buffer:
+    """Samples of a stream that are not used up yet."""
+
+    def __init__(self, stream: Stream) -> None:
+        self.stream = stream
+        self.ticks: Ticks = np.empty(0, dtype=np.int64)
+        self.values: Array = np.empty((0, len(stream.units)))
+        self._waiting: list[Piece] = []
+        self.count = 0
+        self.step = np.nan
+
+    def add(self, piece: Piece) -> None:
+        self._waiting.append(piece)
+        self.count += len(piece.ticks)
+
+    def join(self) -> None:
+        """Put the pieces together."""
+        if self._waiting:
+            self.ticks = np.concatenate([self.ticks, *(piece.ticks for piece in self._waiting)])
+            self.values = np.concatenate([self.values, *(piece.values for piece in self._waiting)])
+            self._waiting = []
+        if np.isnan(self.step) and self.count > 1:
+            self.step = float(np.median(np.diff(self.ticks)))
+
+    def drop(self, count: int) -> None:
+        self.ticks, self.values = self.ticks[count:], self.values[count:]
+        self.count -= count
+
+
+def on_one_clock(
+    streams: Sequence[Stream],
+    pieces: Iterable[Piece],
+    *,
+    name: str,
+    per_second: int,
+    origin: int | None,
+    metadata: Callable[[int], Mapping[str, str]],
+    notes: tuple[str, ...] = (),
+) -> Iterator[Recording]:
+    """Yield blocks on the clock of the first stream.
+
+    Parameters
+    ----------
+    streams
+        The clock's first.
+    pieces
+        In the order of the file.
+    per_second
+        Ticks in a second.
+    origin
+        Tick of time 0; None: the clock's first sample.
+    metadata
+        Of the recording, for a given origin.
+
+    Raises
+    ------
+    ReadError
+        There is no sample, or a stream to interpolate runs backwards.
+    """
+    buffers = [_Buffer(stream) for stream in streams]
+    clock, others = buffers[0], buffers[1:]
+    row = 1
+    for piece in _and_end(pieces):
+        if piece is not None:
+            buffers[piece.stream].add(piece)
+            if piece.stream or clock.count < _ROWS:
+                continue
+        for buffer in buffers:
+            buffer.join()
+        ready = _ready(clock, others, last=piece is None)
+        if ready == 0:
+            continue
+        ticks = clock.ticks[:ready]
+        start = int(ticks[0]) if origin is None else origin
+        origin = start
+        columns: dict[str, Array] = {"time": (ticks - start) / per_second}
+        units = {"time": "s"}
+        said = list(notes)
+        values = clock.values[:ready]
+        for buffer in buffers:
+            if buffer is not clock:
+                values, moved = _interpolated(buffer, ticks, start, per_second, name)
+                if moved:
+                    said.append(_note(buffer, clock, per_second))
+            columns |= {key: np.ascontiguousarray(values[:, i]) for i, key in enumerate(buffer.stream.units)}
+            units |= buffer.stream.units
+        yield Recording(
+            columns=columns, units=units, metadata=metadata(start), name=name, first_row=row, notes=tuple(said)
+        )
+        row += ready
+        clock.drop(ready)
+    if row == 1:
+        raise ReadError(f"{name}: no samples of the {clock.stream.what}")
+
+
+def _and_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
+    yield from pieces
+    yield None
+
+
+def _ready(clock: _Buffer, others: list[_Buffer], *, last: bool) -> int:
+    """How many samples of the clock have their neighbours in all other streams."""
+    if last or not others or clock.count > _PATIENCE:  # a stream that has ended does not hold up the others
+        return clock.count
+    if any(other.count == 0 for other in others):
+        return 0
+    horizon = min(int(other.ticks[-1]) for other in others)
+    return int(np.searchsorted(np.maximum.accumulate(clock.ticks), horizon, side="right"))
+
+
+def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:
+    """Values of a stream at the clock's ticks, shape (n, columns), and whether any had to be interpolated."""
+    if buffer.count == 0:
+        return np.full((len(ticks), buffer.values.shape[1]), np.nan), False
+    step = np.diff(buffer.ticks)
+    if step.size and step.min() < 0:
+        index = int(np.argmax(step < 0))
+        before, after = ((int(t) - origin) / per_second for t in buffer.ticks[index : index + 2])
+        raise ReadError(
+            f"{name}: the time of the {buffer.stream.what} runs backwards: "
+            f"expected more than {before:.9g} s, found {after:.9g} s"
+        )
+    known, wanted = (buffer.ticks - origin).astype(np.float64), (ticks - origin).astype(np.float64)
+    values = np.column_stack([np.interp(wanted, known, column) for column in buffer.values.T])
+    right = np.clip(np.searchsorted(buffer.ticks, ticks), 0, buffer.count - 1)
+    met = buffer.ticks[right] == ticks
+    left = np.clip(right - 1, 0, None)
+    if not buffer.stream.slow and not np.isnan(buffer.step):
+        # Across a gap, or beyond the ends by more than a gap, there is no reading: that is not invented.
+        outside = (ticks < buffer.ticks[0]) | (ticks > buffer.ticks[-1])
+        distance = np.where(
+            outside,
+            np.minimum(np.abs(ticks - buffer.ticks[0]), np.abs(ticks - buffer.ticks[-1])),
+            buffer.ticks[right] - buffer.ticks[left],
+        )
+        values[~met & (distance > _WIDEST_GAP * buffer.step)] = np.nan
+    # The sample before the last tick stays: the next block may begin right behind it.
+    buffer.drop(max(int(np.searchsorted(buffer.ticks, ticks.max(), side="right")) - 1, 0))
+    return values, not met.all()
+
+
+def _note(buffer: _Buffer, clock: _Buffer, per_second: int) -> str:
+    def rate(step: float) -> str:
+        return f" ({per_second / step:.6g} Hz)" if step > 0 else ""
+
+    return (
+        f"{buffer.stream.what}{rate(buffer.step)} interpolated to the clock of the "
+        f"{clock.stream.what}{rate(clock.step)}"
+    )

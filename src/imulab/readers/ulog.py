@@ -1,0 +1,268 @@
+"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined.
+
+Source: the file format in the PX4 user guide ("ULog File Format", version 1): a header of 16 bytes, then messages
+u16 size, u8 type, payload. Time is ``timestamp_sample`` (``timestamp`` where a log has none), microseconds since boot.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from imulab.errors import OptionError, ReadError
+from imulab.readers import logs
+from imulab.readers.selection import Selection
+from imulab.readers.streams import Piece, Stream, on_one_clock
+from imulab.recording import Recording
+
+MAGIC = b"ULog\x01\x12\x35"
+_HEADER = 16
+_SIZES = {
+    "int8_t": "i1",
+    "uint8_t": "u1",
+    "bool": "u1",
+    "char": "u1",
+    "int16_t": "<i2",
+    "uint16_t": "<u2",
+    "int32_t": "<i4",
+    "uint32_t": "<u4",
+    "int64_t": "<i8",
+    "uint64_t": "<u8",
+    "float": "<f4",
+    "double": "<f8",
+}
+_TOPICS = ("sensor_accel", "sensor_gyro", "sensor_combined")
+_ACCEL = {f"accel_{axis}": "m/s^2" for axis in "xyz"}
+_GYRO = {f"gyro_{axis}": "rad/s" for axis in "xyz"}
+_NO_ACCEL = 2**31 - 1
+_KEPT = {"sys_name": "autopilot", "ver_hw": "hardware", "sys_uuid": "autopilot_uuid"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    offset: int
+    kind: str
+    count: int
+
+
+@dataclass(slots=True)
+class _Contents:
+    """What a first pass over the file finds."""
+
+    formats: dict[str, str] = field(default_factory=dict)
+    subscriptions: dict[int, tuple[str, int]] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    smallest: dict[int, int] = field(default_factory=dict)
+    info: dict[str, str] = field(default_factory=dict)
+    dropouts: list[int] = field(default_factory=list)
+    limit: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
+    """Yield the samples of one accelerometer and gyroscope.
+
+    Raises
+    ------
+    ReadError
+        The file is no ULog, is damaged, or has no such topic or instance.
+    OptionError
+        An unknown topic.
+    """
+    contents = _survey(path, name)
+    streams, sources = _choose(contents, selection, name)
+    yield from on_one_clock(
+        streams,
+        _pieces(path, contents, sources, name),
+        name=name,
+        per_second=1_000_000,
+        origin=0,
+        metadata=lambda _: {**contents.info, "time_origin": "boot"},
+        notes=tuple(contents.notes),
+    )
+
+
+# --- what is inside ----------------------------------------------------------------------------------------------
+
+
+def _survey(path: Path, name: str) -> _Contents:
+    contents = _Contents(limit=path.stat().st_size)
+    with path.open("rb") as stream:
+        head = stream.read(_HEADER)
+        if len(head) < _HEADER or not head.startswith(MAGIC):
+            raise ReadError(f"{name}: not a ULog: expected a header of {_HEADER} bytes, found {len(head)}")
+        size = contents.limit
+        contents.limit = _end_of_log(stream.read(43), size, name)
+        ending: list[logs.Ending] = []
+        for records in logs.walk_stream(stream, logs.ULOG, _HEADER, contents.limit, ending):
+            kinds = records.keys & 0xFF
+            for index in np.flatnonzero((kinds != ord("D")) & (kinds != ord("S"))).tolist():
+                _define(contents, chr(int(kinds[index])), records.payload(index), name)
+            data = np.flatnonzero(kinds == ord("D"))
+            ids = records.keys[data] >> 8
+            for number in np.unique(ids).tolist():
+                sizes = records.sizes[data[ids == number]]
+                contents.counts[number] = contents.counts.get(number, 0) + sizes.size
+                contents.smallest[number] = min(contents.smallest.get(number, 1 << 16), int(sizes.min()))
+    (end,) = ending
+    if end.damaged and end.position < contents.limit:
+        shown = end.left[:3].hex(" ")
+        raise ReadError(f"{name}: damaged at byte {end.position}: expected a ULog message, found {shown}")
+    if end.left and contents.limit == size:
+        contents.notes.append(f"truncated: the last message, at byte {end.position}, is cut; read up to there")
+    if contents.dropouts:
+        contents.notes.append(f"{len(contents.dropouts)} dropouts of the logger, {sum(contents.dropouts)} ms in all")
+    return contents
+
+
+def _end_of_log(first: bytes, size: int, name: str) -> int:
+    """Return where the log ends: the first message tells whether other data were appended behind it (after a crash)."""
+    if len(first) < 43 or first[2:3] != b"B":
+        return size
+    flags, appended = first[11:19], int.from_bytes(first[19:27], "little")
+    if flags[0] & ~1 or any(flags[1:]):
+        raise ReadError(f"{name}: needs a newer reader (incompatible flags {flags.hex()})")
+    if not flags[0] & 1 or appended == 0:
+        return size
+    if not _HEADER <= appended <= size:
+        raise ReadError(f"{name}: says that data were appended at byte {appended}, but has {size} bytes")
+    return appended
+
+
+def _define(contents: _Contents, kind: str, payload: bytes, name: str) -> None:
+    if kind == "F":
+        title, colon, fields = logs.text_of(payload, name, "a message format").partition(":")
+        if not colon:
+            raise ReadError(f"{name}: message format {title[:40]!r}: expected 'name:fields'")
+        contents.formats[title] = fields
+    elif kind == "A":
+        if len(payload) < 4:
+            raise ReadError(f"{name}: a subscription of {len(payload)} bytes, expected at least 4")
+        number = int.from_bytes(payload[1:3], "little")
+        contents.subscriptions[number] = (logs.text_of(payload[3:], name, "a subscription"), payload[0])
+    elif kind == "I" and payload and len(payload) > payload[0]:
+        key = payload[1 : 1 + payload[0]].decode("utf-8", "replace").partition(" ")
+        if key[0].startswith("char[") and _KEPT.get(key[2]):
+            contents.info[_KEPT[key[2]]] = payload[1 + payload[0] :].decode("utf-8", "replace").strip("\0 ")
+    elif kind == "O" and len(payload) >= 2:
+        contents.dropouts.append(int.from_bytes(payload[:2], "little"))
+
+
+def _choose(
+    contents: _Contents, selection: Selection, name: str
+) -> tuple[list[Stream], dict[int, tuple[int, str, dict[str, _Field]]]]:
+    """Return the streams, and for each subscription its stream, its topic and where its fields are."""
+    topic = selection.topic
+    if topic is not None and topic not in _TOPICS:
+        raise OptionError(f"{name}: topic {topic!r}; of a ULog these can be read: {' '.join(_TOPICS)}")
+    there = {
+        (title, instance): number
+        for number, (title, instance) in contents.subscriptions.items()
+        if contents.counts.get(number) and title in _TOPICS
+    }
+    if not there:
+        others = sorted({contents.subscriptions[n][0] for n in contents.counts if n in contents.subscriptions})
+        raise ReadError(
+            f"{name}: no {' '.join(_TOPICS[:2])} or {_TOPICS[2]}; topics found: {' '.join(others) or 'none'}"
+        )
+    titles = {title for title, _ in there}
+    wanted = [topic] if topic else [t for t in _TOPICS[:2] if t in titles] or ["sensor_combined"]
+    if wanted == ["sensor_accel"] and "sensor_gyro" in titles:
+        wanted.append("sensor_gyro")
+    instance = selection.instance or 0
+    chosen = [title for title in wanted if (title, instance) in there]
+    if not chosen:
+        found = ", ".join(f"{title} {number}" for title, number in sorted(there))
+        raise OptionError(f"{name}: no {' '.join(wanted)} of instance {instance}; found {found}")
+    several = [f"{title} {number}" for title, number in sorted(there) if title in wanted]
+    if len(several) > len(chosen):
+        contents.notes.append(f"instance {instance} of {', '.join(several)}")
+    streams: list[Stream] = []
+    sources: dict[int, tuple[int, str, dict[str, _Field]]] = {}
+    for title in chosen:
+        number = there[title, instance]
+        fields = _fields(contents, title, name)
+        needed = max(f.offset + np.dtype(f.kind).itemsize * f.count for f in fields.values())
+        if contents.smallest[number] < needed:
+            raise ReadError(
+                f"{name}: a {title} message of {contents.smallest[number]} bytes, expected at least {needed}"
+            )
+        sources[number] = (len(streams), title, fields)
+        if title == "sensor_accel":
+            warm = {"temperature": "degC"} if "temperature" in fields else {}
+            streams.append(Stream("accelerometer", {**_ACCEL, **warm}))
+        elif title == "sensor_gyro":
+            streams.append(Stream("gyroscope", _GYRO))
+        else:
+            streams += [Stream("accelerometer", _ACCEL), Stream("gyroscope", _GYRO)]
+            contents.notes.append("sensor_combined holds outputs that PX4 has already corrected")
+    return streams, sources
+
+
+def _fields(contents: _Contents, title: str, name: str) -> dict[str, _Field]:
+    """Return where the fields that we need are in a message."""
+    if title not in contents.formats:
+        raise ReadError(f"{name}: {title} is logged, but its format is not in the file")
+    layout: dict[str, _Field] = {}
+    offset = 0
+    for entry in contents.formats[title].split(";"):
+        if not entry:
+            continue
+        match = re.fullmatch(r"(\w+?)(?:\[(\d{1,6})\])? (\w+)", entry)
+        if match is None or match[1] not in _SIZES:
+            if all(key in layout for key in _needed(title, layout)):
+                break  # what follows is of no interest here
+            raise ReadError(f"{name}: format of {title}: expected 'type name', found {entry[:40]!r}")
+        count = int(match[2] or 1)
+        layout[match[3]] = _Field(offset, _SIZES[match[1]], count)
+        offset += np.dtype(_SIZES[match[1]]).itemsize * count
+    needed = _needed(title, layout)
+    for key in needed:
+        if key not in layout or layout[key].count != (3 if key in ("gyro_rad", "accelerometer_m_s2") else 1):
+            raise ReadError(f"{name}: {title} has no field {key}; found {' '.join(layout)}")
+    return {key: layout[key] for key in needed}
+
+
+def _needed(title: str, layout: dict[str, _Field]) -> list[str]:
+    if title == "sensor_combined":
+        relative = ["accelerometer_timestamp_relative"] if "accelerometer_timestamp_relative" in layout else []
+        return ["timestamp", "gyro_rad", "accelerometer_m_s2", *relative]
+    stamp = "timestamp_sample" if "timestamp_sample" in layout else "timestamp"
+    warm = ["temperature"] if title == "sensor_accel" and "temperature" in layout else []
+    return [stamp, "x", "y", "z", *warm]
+
+
+# --- samples -----------------------------------------------------------------------------------------------------
+
+
+def _pieces(
+    path: Path, contents: _Contents, sources: dict[int, tuple[int, str, dict[str, _Field]]], name: str
+) -> Iterator[Piece]:
+    with path.open("rb") as stream:
+        for records in logs.walk_stream(stream, logs.ULOG, _HEADER, contents.limit, []):
+            for number, (slot, title, fields) in sources.items():
+                indices = records.of(ord("D") | number << 8)
+                if not indices.size:
+                    continue
+                width = max(f.offset + np.dtype(f.kind).itemsize * f.count for f in fields.values())
+                rows = logs.gather(records.block, records.offsets[indices], width)
+                got = {key: logs.field(rows, f.offset, f.kind, f.count) for key, f in fields.items()}
+                if title == "sensor_combined":
+                    yield from _combined(got, slot)
+                    continue
+                stamp, *names = fields
+                values = np.column_stack([got[key].astype(np.float64) for key in names])
+                yield Piece(slot, got[stamp].astype(np.int64), values)
+
+
+def _combined(got: dict[str, np.ndarray], slot: int) -> Iterator[Piece]:
+    """Split sensor_combined: the accelerometer has its own time, relative to the gyroscope's."""
+    stamp = got["timestamp"].astype(np.int64)
+    relative = got.get("accelerometer_timestamp_relative", np.zeros_like(stamp)).astype(np.int64)
+    there = relative != _NO_ACCEL
+    yield Piece(slot, (stamp + relative)[there], got["accelerometer_m_s2"][there].astype(np.float64))
+    yield Piece(slot + 1, stamp, got["gyro_rad"].astype(np.float64))

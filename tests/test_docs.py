@@ -1,0 +1,51 @@
+"""What the documentation shows is run: marked blocks of every page, in order, in an empty folder; docstrings too."""
+
+import doctest
+import importlib
+import pkgutil
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import imulab
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r"<!-- tested -->\n+```(\w*)\n(.*?)```", re.DOTALL)
+PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_what_a_page_shows_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
+        if language == "python":
+            (tmp_path / "example.py").write_text(text, encoding="utf-8")
+            runpy.run_path("example.py")
+            continue
+        for line in text.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if not words:
+                continue
+            assert words[0] in ("imulab", "make"), line
+            command = [sys.executable, "-m", *words] if words[0] == "imulab" else words
+            done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+            assert done.returncode == 0, f"{page.name}: {line}\n{done.stderr}"
+
+
+def test_pages_with_a_worked_example_are_there():
+    assert "tumble" in [page.stem for page in PAGES]
+
+
+MODULES = [module.name for module in pkgutil.walk_packages(imulab.__path__, "imulab.")]
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name != "imulab.__main__"])
+def test_docstring_examples_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    failed, _ = doctest.testmod(importlib.import_module(name))
+    assert failed == 0
