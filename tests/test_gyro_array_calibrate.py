@@ -79,8 +79,8 @@ def test_alignment_covers_the_truth(axes):
 
 def test_the_bias_is_the_plain_mean_and_its_uncertainty_holds():
     within = []
-    for seed in range(40):
-        recording = simulate_array(experiment="static", duration=300.0, seed=seed)
+    for seed in range(3):
+        recording = simulate_array(experiment="static", duration=60.0, seed=seed)
         record = calibrate_array(recording).calibration
         for element in record.sections["elements"]:
             mean = np.radians(recording.columns[element["name"]].mean())
@@ -88,7 +88,7 @@ def test_the_bias_is_the_plain_mean_and_its_uncertainty_holds():
             assert element["bias"]["unit"] == "rad/s"
             assert record.parameters[element["name"].replace("gyro", "bias")].value == element["bias"]["value"]
     white = NoiseModel(gauss_markov=0.0, walk=0.0)
-    for seed in range(100, 140):
+    for seed in range(100, 125):
         recording = simulate_array(experiment="static", duration=60.0, noise=white, seed=seed)
         record = calibrate_array(recording).calibration
         for i, element in enumerate(record.sections["elements"]):

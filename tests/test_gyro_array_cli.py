@@ -121,14 +121,13 @@ def test_readings_may_be_nan_inf_or_missing(imulab, tmp_path):
 
 def test_every_method_and_start_runs(imulab, run_file):
     record = run_file / "array.json"
-    for method in METHODS:
+    for method in ("feedback", "covariance", "kalman"):  # the others run in test_compare_prints_all_seven
         extra = ["--calibration", record] if method in ("covariance", "kalman") else ["--initial-bias", "zero"]
         done = imulab("array", "fuse", run_file / "run.csv", "--method", method, *extra)
         assert done.returncode == 0, done.stderr
         assert len(done.stdout.splitlines()) == 2000 + 10
-    for memory in ("growing:100", "0.01"):
-        options = ["--method", "feedback", "--memory", memory, "--initial-bias", record]
-        assert imulab("array", "fuse", run_file / "run.csv", *options).returncode == 0
+    options = ["--method", "feedback", "--memory", "growing:100", "--initial-bias", record]
+    assert imulab("array", "fuse", run_file / "run.csv", *options).returncode == 0
 
 
 def test_three_axes_come_out_as_three_columns_in_their_unit(imulab, tmp_path):
