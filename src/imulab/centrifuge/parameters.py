@@ -18,6 +18,10 @@ from imulab.estimate import chi_square_probability, coverage_factor
 from imulab.recording import Array
 
 
+_ROUNDING = 1e-7
+"""Turning of the drift, rad, below which nothing is said of it however small the noise."""
+
+
 @dataclass
 class _Row:
     """A parameter under construction: value, derivative with respect to the levels' vectors, and to ln R."""
@@ -191,7 +195,7 @@ def _direction(
     # Angles of the levels against the pooled one; their covariance has one degree less than levels.
     angle = np.angle(lines / unit)
     spread = across - derivative
-    covariance = spread @ V @ spread.T
+    covariance = spread @ V @ spread.T + _ROUNDING**2 * np.eye(len(mine))
     probability = 1.0
     if len(mine) > 1:
         chi_square = float(angle @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ angle)
