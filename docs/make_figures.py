@@ -58,14 +58,16 @@ def centrifuge(folder: Path) -> None:
     colours = dict(zip(curves, (BAD, "#b8860b", GOOD), strict=True))
     figure = Figure(
         "False nonlinearity of a perfectly linear gyroscope, table axis tilted by 10 arcsec",
-        "zeta = K(a)/K(1 g) - 1 by the line at the table rate of X alone, of Y less the FOG as it is, and of X less the FOG. "
-        "Noise-free.",
+        "zeta = K(a)/K(1 g) - 1 by the line at the table rate of X alone, of Y less the FOG as it is, and of "
+        "X less the FOG. Noise-free.",
         [
-            {"type": "scatter", "mode": "lines+markers", "x": force, "y": [100 * (k / K_all[0] - 1) for k in K_all], "name": name,
+            {"type": "scatter", "mode": "lines+markers", "x": force, "name": name,
+             "y": [100 * (k / K_all[0] - 1) for k in K_all],
              "line": {"color": colours[name], "width": 2.5}, "marker": {"size": 8}}
             for name, K_all in curves.items()
         ],
-        {"xaxis": {"title": {"text": "specific force, g"}, "gridcolor": "#e6eaed"}, "legend": {"orientation": "h", "y": 1.12},
+        {"xaxis": {"title": {"text": "specific force, g"}, "gridcolor": "#e6eaed"},
+         "legend": {"orientation": "h", "y": 1.12},
          "yaxis": {"title": {"text": "zeta, %"}, "gridcolor": "#e6eaed", "zeroline": True}},
     )  # fmt: skip
     worst = max(abs(k / curves["X alone"][0] - 1) for k in curves["X alone"])

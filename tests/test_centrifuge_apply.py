@@ -38,7 +38,8 @@ def record():
 
 def flight(units=("deg/h", "g"), **columns):
     force = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, -2.0], [6.0, 8.0], [np.nan, 1.0]])
-    data = {"time": np.arange(5.0), "dtg_x": np.full(5, 100.0), "dtg_y": np.full(5, -50.0), "accel_x": force[:, 0].copy(),
+    data = {"time": np.arange(5.0), "dtg_x": np.full(5, 100.0), "dtg_y": np.full(5, -50.0),
+            "accel_x": force[:, 0].copy(),
             "accel_y": force[:, 1].copy(), "fog": np.arange(5.0)} | columns  # fmt: skip
     unit = {"time": "s", "dtg_x": units[0], "dtg_y": units[0], "accel_x": units[1], "accel_y": units[1], "fog": "deg/h"}
     return Recording(data, {name: unit.get(name, "1") for name in data}, name="flight.csv", lines_before=1)
@@ -178,7 +179,8 @@ def test_the_report_shows_what_was_asked(record):
     exhibits = exhibits_of(record)
     titles = [item.title for item in exhibits.items]
     assert [t for t in titles if isinstance(next(i for i in exhibits.items if i.title == t), Figure)] == [
-        "Change of the drift factor with specific force", "Complex drift factor of each level", "Repeatability over power cycles",
+        "Change of the drift factor with specific force", "Complex drift factor of each level",
+        "Repeatability over power cycles",
         "Spectrum around the table rate",
     ]  # fmt: skip
     assert exhibits.headline.startswith("X drifts by 3.")
@@ -190,7 +192,8 @@ def test_the_report_shows_what_was_asked(record):
 
 
 def plan(**change):
-    options = {"levels": [G, 5 * G, 20 * G], "radius": 2.0, "net_rate": NET, "K": 3.3 * DEG_H / G, "dtg_noise": 0.01 * DEG_H * 60,
+    options = {"levels": [G, 5 * G, 20 * G], "radius": 2.0, "net_rate": NET, "K": 3.3 * DEG_H / G,
+               "dtg_noise": 0.01 * DEG_H * 60,
                "fog_noise": 0.005 * DEG_H * 60, "uncertainty": 0.01} | change  # fmt: skip
     return plan_centrifuge(**options)
 

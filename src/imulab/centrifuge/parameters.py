@@ -17,7 +17,6 @@ from imulab.centrifuge.model import CROSS_UNIT, CURVE_UNITS, K_UNIT
 from imulab.estimate import chi_square_probability, coverage_factor
 from imulab.recording import Array
 
-
 _ROUNDING = 1e-7
 """Turning of the drift, rad, below which nothing is said of it however small the noise."""
 
