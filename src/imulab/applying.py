@@ -11,10 +11,11 @@ from imulab.calibration import Calibration
 from imulab.errors import RecordError
 from imulab.recording import Recording
 from imulab.tumble.apply import apply_tumble, beyond_test
+from imulab.warmup.apply import apply_warmup, temperature_warning
 
 _FAR_IN_TEMPERATURE = 20.0
 
-_APPLY = {"tumble": apply_tumble}
+_APPLY = {"tumble": apply_tumble, "warmup": apply_warmup}
 
 
 def apply(record: Calibration, recording: Recording) -> Recording:
@@ -52,6 +53,9 @@ def warnings_of(record: Calibration, recording: Recording) -> list[str]:
     mine, its = record.sensor.get("serial"), recording.metadata.get("serial")
     if mine and its and mine != its:
         found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
+    if record.procedure == "warmup":
+        message = temperature_warning(record, recording)
+        return [*found, message] if message else found
     made = record.model.get("temperature")
     here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:

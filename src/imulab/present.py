@@ -9,8 +9,9 @@ from imulab.calibration import Calibration
 from imulab.errors import RecordError
 from imulab.exhibit import Exhibits
 from imulab.tumble import figures as tumble
+from imulab.warmup import figures as warmup
 
-_EXHIBITS = {"tumble": tumble.exhibits}
+_EXHIBITS = {"tumble": tumble.exhibits, "warmup": warmup.exhibits}
 
 
 def exhibits_of(record: Calibration) -> Exhibits:

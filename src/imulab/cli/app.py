@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import records, tumble
+from imulab.cli import records, tumble, warmup
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -23,6 +23,7 @@ def command() -> Any:
     app.add_typer(
         tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
     )
+    app.add_typer(warmup.commands(_SETTINGS), name="warmup", help="Tabulate and subtract the bias after power-on.")
     records.add_commands(app)
     return typer.main.get_command(app)
 
