@@ -240,14 +240,20 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
         Field("axes", _whole(len(axes))),
         Field("terms", _whole(terms)),
         Field("settling_time", np.array(float(table["settling_time"]))),
-        Field("taper_time", np.array(float(table.get("taper_time") or 0.0))),
+        Field("taper_time", np.array(float(table["taper_time"]) if table["exit"] == "taper" else 0.0)),
         Field("time_scale", np.array(float(table.get("time_scale") or 0.0))),
         Field("time_constant", constants),
         Field("temperature", temperatures, pointed=True),
         Field("coefficient", coefficients, pointed=True),
         Field("slope", slopes, pointed=True),
     )
-    return Table("warmup", fields, {"axes": axes, "units": list(table["units"])})
+    ends = [float(temperatures[0]), float(temperatures[-1])]
+    return Table("warmup", fields, {"axes": axes, "units": list(table["units"]), "range": ends, "end": _end(table)})
+
+
+def _end(table: Mapping[str, Any]) -> float:
+    """Time from which on the table's curve no longer changes, s."""
+    return float(table["settling_time"]) + (float(table["taper_time"]) if table["exit"] == "taper" else 0.0)
 
 
 # ---- gyro array ----------------------------------------------------------------------------------------------------
