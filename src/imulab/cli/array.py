@@ -198,7 +198,7 @@ def fuse(
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
         still=None if interval is None else _interval(interval, "--still"),
     )
-    fuser = Fuser(options)
+    fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
     blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout, live=file == "-")))
     if output:
         write_csv(blocks, output)
