@@ -206,7 +206,7 @@ def test_k_at_20_g_within_five_parts_in_ten_thousand():
     test = levels_test(1, 5, 10, 20, cycles=2)
     true = np.hypot(truth.x.D_x, truth.x.D_y) * (1 + 0.01)
     errors, zetas = [], []
-    for seed in range(6):
+    for seed in range(4):
         record = il.fit_centrifuge(test, Simulation(test, truth, 20.0, 900.0, 5.0, seed=seed)).calibration
         p = {n: record.value(f"x_{n}") if f"x_{n}" in record.parameters else 0.0 for n in ("K0", "c1", "c2")}
         a = 20 * G
@@ -214,7 +214,7 @@ def test_k_at_20_g_within_five_parts_in_ten_thousand():
         zetas.append(
             (record.value("x_zeta_4") - 0.01 * (1 - 1 / 400)) / record.parameters["x_zeta_4"].standard_uncertainty
         )
-    assert np.sqrt(np.mean(np.square(errors))) <= 7e-4  # 0.05 % rms, known to 30 % from six trials; see the benchmark
+    assert np.sqrt(np.mean(np.square(errors))) <= 7e-4  # 0.05 % rms, known to 35 % from four trials; see the benchmark
     assert np.abs(zetas).max() < 4
 
 
@@ -280,7 +280,7 @@ def test_magnitudes_are_corrected_for_noise():
     loud = Truth(AxisTruth(D_x=K, angle_random_walk=2.2e-5), None, FogTruth(), TILTED)
     test = replace(levels_test(1), reference=G)
     plain, corrected = [], []
-    for seed in range(150):
+    for seed in range(100):
         fit = il.fit_centrifuge(test, Simulation(test, loud, 10.0, 60.0, 2.0, seed=seed))
         corrected.append(fit.calibration.value("x_K_1") / K)
         plain.append(abs(axis_lines(fit.runs[0], "least-squares")[0][0]) / fit.runs[0].force / K)

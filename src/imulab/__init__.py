@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from imulab.centrifuge.manifest import load_manifest as load_manifest
     from imulab.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.errors import ImulabError as ImulabError
+    from imulab.exporters import export as export
     from imulab.gravity import normal_gravity as normal_gravity
     from imulab.gyro_array.compare import compare_methods as compare_methods
     from imulab.gyro_array.fit import ArrayFit as ArrayFit
@@ -73,6 +74,7 @@ _HOME = {
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
     "apply": "applying",
+    "export": "exporters",
     "find_attitudes": "segment",
     "fit_centrifuge": "centrifuge.fit",
     "fit_tumble": "tumble.fit",

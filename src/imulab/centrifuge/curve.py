@@ -12,6 +12,7 @@ from imulab.recording import Array
 
 MODELS: dict[str, tuple[int, ...]] = {"constant": (), "c1": (1,), "c2": (2,), "c1+c2": (1, 2)}
 _GAIN = 0.05
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
     if model != "auto" and len(MODELS[model]) + 1 > len(K):
         raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(MODELS[model]) + 1}")
     names = [name for name, terms in MODELS.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]
-    whitened = np.asarray(np.linalg.cholesky(_regular(covariance)), dtype=np.float64)
+    whitened = np.asarray(np.linalg.cholesky(_regular(covariance, K)), dtype=np.float64)
     found = {name: _solve(force, K, whitened, MODELS[name]) for name in names}
     chosen = model
     if model == "auto":
@@ -86,9 +87,9 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
     )  # fmt: skip
 
 
-def _regular(covariance: Array) -> Array:
-    """Keep a covariance of (nearly) noise-free data invertible."""
-    floor = max(float(np.diagonal(covariance).max()) * 1e-12, 1e-60)
+def _regular(covariance: Array, K: Array) -> Array:
+    """Keep a covariance of (nearly) noise-free data invertible, and rounding from looking significant."""
+    floor = max(float(np.diagonal(covariance).max()) * 1e-12, (_ROUNDING * float(np.abs(K).max())) ** 2, 1e-60)
     regular: Array = covariance + floor * np.eye(len(covariance))
     return regular
 

@@ -110,7 +110,7 @@ def _facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
     facts = []
     for prefix in sets[:2]:
         K0 = record.parameters[f"{prefix}K0"]
-        value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G)
+        value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G, digits=1)
         digits = u.replace(".", "").lstrip("0")
         facts.append((f"K0 {_label(prefix)}, deg/h/g", f"{value}({digits})"))
     loaded = [row for row in record.sections["runs"] if row["role"] == "loaded"]

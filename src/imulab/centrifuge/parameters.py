@@ -17,6 +17,9 @@ from imulab.centrifuge.model import CROSS_UNIT, CURVE_UNITS, K_UNIT
 from imulab.estimate import chi_square_probability, coverage_factor
 from imulab.recording import Array
 
+_ROUNDING = 1e-7
+"""Turning of the drift, rad, below which nothing is said of it however small the noise."""
+
 
 @dataclass
 class _Row:
@@ -191,7 +194,7 @@ def _direction(
     # Angles of the levels against the pooled one; their covariance has one degree less than levels.
     angle = np.angle(lines / unit)
     spread = across - derivative
-    covariance = spread @ V @ spread.T
+    covariance = spread @ V @ spread.T + _ROUNDING**2 * np.eye(len(mine))
     probability = 1.0
     if len(mine) > 1:
         chi_square = float(angle @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ angle)

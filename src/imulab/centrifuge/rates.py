@@ -197,7 +197,7 @@ def _check_wandering(cells: Cells, place: str) -> None:
             continue
         if abs(np.corrcoef(np.flatnonzero(clear), peak[clear])[0, 1]) > _STEADILY:
             raise DataError(
-                f"{place}: a line moves from {_deg(float(peak[clear][0]))} to {_deg(float(peak[clear][-1]))} over the run; "
+                f"{place}: a line moves from {_deg(float(peak[clear][0]))} to {_deg(float(peak[clear][-1]))}; "
                 f"expected steady rates, table_rate {_deg(abs(cells.table_rate))} (a rate ramp?)"
             )
 

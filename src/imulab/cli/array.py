@@ -199,7 +199,7 @@ def fuse(
         still=None if interval is None else _interval(interval, "--still"),
     )
     fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
-    blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout, live=file == "-")))
+    blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout)))
     if output:
         write_csv(blocks, output)
     else:
