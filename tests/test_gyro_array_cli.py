@@ -138,6 +138,15 @@ def test_every_method_and_start_runs(imulab, run_file):
     assert imulab("array", "fuse", run_file / "run.csv", *options).returncode == 0
 
 
+def test_parquet_comes_out_the_same(imulab, run_file, tmp_path):
+    assert imulab("array", "fuse", run_file / "run.csv", "-o", "a.parquet").returncode == 0
+    assert imulab("array", "fuse", run_file / "run.csv", "-o", "a.csv").returncode == 0
+    csv, parquet = il.read(tmp_path / "a.csv"), il.read(tmp_path / "a.parquet")
+    assert parquet.units == csv.units
+    assert parquet.metadata == csv.metadata
+    np.testing.assert_array_equal(parquet.columns["rate"], csv.columns["rate"])
+
+
 def test_three_axes_come_out_as_three_columns_in_their_unit(imulab, tmp_path):
     il.write_csv(simulate_array(axes=3, duration=4.0, unit="rad/s"), tmp_path / "a.csv")
     done = imulab("array", "fuse", "a.csv", "-o", "out.csv")
