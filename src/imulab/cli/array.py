@@ -181,7 +181,7 @@ def fuse(
     layout: LayoutFile = None,
     output: OutputFile = None,
 ) -> None:
-    """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; FILE - fuses each line as it comes."""
+    """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
     from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording, parse_memory
     from imulab.readers import read_blocks
     from imulab.writers import check_writable, write, write_csv_to
