@@ -31,6 +31,8 @@ _SLOW, _SLOW_WARNING = 0.1, 0.02
 _RATE_CHANGE = 1e-3
 _ROUNDS = 8
 _SEGMENTS, _STEADILY = 8, 0.9
+_FINE = 4
+"""Points of a spectrum per inverse of the run."""
 
 
 @dataclass(frozen=True)
@@ -343,9 +345,9 @@ def residual_noise(cells: Cells, solution: Solution) -> Complex:
     """Return the covariance of a sample's residuals: that of white noise, shape (k, k)."""
     columns = cells.moments.shape[1] - len(cells.offset)
     P = basis(cells, solution.middle, solution.half, solution.table_shift, solution.net_shift) @ solution.coefficients
-    cross = np.tensordot(P, cells.moments[:, :columns, columns:], axes=((0, 1), (0, 1)))
+    cross = (P.transpose(0, 2, 1) @ cells.moments[:, :columns, columns:]).sum(axis=0)
     square = cells.moments[:, columns:, columns:].sum(axis=0)
-    fitted = np.tensordot(P, cells.moments[:, :columns, :columns] @ P, axes=((0, 1), (0, 1)))
+    fitted = (P.transpose(0, 2, 1) @ cells.moments[:, :columns, :columns] @ P).sum(axis=0)
     left = square - cross - cross.T + fitted
     noise: Complex = (left / max(cells.samples - int(solution.kept.sum()), 1)).astype(np.complex128)
     return noise
@@ -383,25 +385,29 @@ def hann_spectrum(time: Array, values: Array, frequencies: Array) -> Complex:
 
 def _detrended(time: Array, values: Array) -> Array:
     middle = time - time.mean()
-    slope = (middle @ values) / (middle @ middle)
+    slope = (middle * values).sum() / (middle * middle).sum()
     left: Array = values - values.mean() - slope * middle
     return left
 
 
 def _search(cells: Cells, series: Array, rate: float, within: float) -> tuple[float, float]:
     """Return the shift of a line from `rate`, rad/s, and its height over the median of the spectrum around it."""
-    time = cells.series_time
-    seconds = cells.duration
-    values = _detrended(time, series)
-    bin_width = 2 * np.pi / seconds
-    near = rate + np.concatenate([np.arange(-24, -3.9), np.arange(4, 24.1)]) * bin_width
-    height = np.abs(hann_spectrum(time, values, near))
-    floor = max(float(np.median(height)), 1e-300)
-    if within < bin_width / 2:
-        return 0.0, float(np.abs(hann_spectrum(time, values, np.array([rate])))[0]) / floor
-    grid = np.arange(-within, within + bin_width / 8, bin_width / 4)
-    found = np.abs(hann_spectrum(time, values, rate + grid))
-    return _interpolated(grid, found), float(found.max()) / floor
+    count = len(series)
+    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
+    size = _FINE * count
+    height = np.abs(np.fft.rfft(window * _detrended(cells.series_time, series), size)).astype(np.float64)
+    step = 2 * np.pi / (size * cells.series_step)
+    centre = min(round(abs(rate) / step), len(height) - 1)
+    around = np.concatenate([np.arange(-24, -3), np.arange(4, 25)]) * _FINE + centre
+    near = height[around[(around > 2 * _FINE) & (around < len(height))]]
+    floor = max(float(np.median(near)) if near.size else 0.0, 1e-300)
+    reach = int(within / step)
+    if reach < _FINE // 2:
+        return 0.0, float(height[centre]) / floor
+    low, high = max(centre - reach, 0), min(centre + reach + 1, len(height))
+    found = height[low:high]
+    shift = _interpolated(np.arange(low, high) * step - abs(rate), found)
+    return float(np.sign(rate)) * shift, float(found.max()) / floor
 
 
 def _interpolated(grid: Array, height: Array) -> float:
@@ -468,7 +474,9 @@ def _without_table_lines(cells: Cells, table_shift: float, channel: int) -> Arra
     for times in (1, 2, 3):
         columns += [np.cos(times * chi), np.sin(times * chi)]
     design = np.stack(columns, axis=1)
-    left: Array = cells.series[channel] - design @ np.linalg.lstsq(design, cells.series[channel], rcond=None)[0]
+    normal = np.einsum("ni,nj->ij", design, design)
+    right = np.einsum("ni,n->i", design, cells.series[channel])
+    left: Array = cells.series[channel] - np.einsum("ni,i->n", design, np.linalg.lstsq(normal, right, rcond=None)[0])
     return left
 
 
