@@ -405,8 +405,9 @@ def _search(cells: Cells, series: Array, rate: float, within: float) -> tuple[fl
     if reach < _FINE // 2:
         return 0.0, float(height[centre]) / floor
     low, high = max(centre - reach, 0), min(centre + reach + 1, len(height))
-    found = height[low:high]
-    shift = _interpolated(np.arange(low, high) * step - abs(rate), found)
+    found: Array = height[low:high]
+    grid: Array = np.arange(low, high) * step - abs(rate)
+    shift = _interpolated(grid, found)
     return float(np.sign(rate)) * shift, float(found.max()) / floor
 
 
