@@ -396,7 +396,7 @@ def _search(cells: Cells, series: Array, rate: float, within: float) -> tuple[fl
     window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
     size = _FINE * count
     height = np.abs(np.fft.rfft(window * _detrended(cells.series_time, series), size)).astype(np.float64)
-    step = 2 * np.pi / (size * cells.series_step)
+    step = float(2 * np.pi / (size * cells.series_step))
     centre = min(round(abs(rate) / step), len(height) - 1)
     around = np.concatenate([np.arange(-24, -3), np.arange(4, 25)]) * _FINE + centre
     near = height[around[(around > 2 * _FINE) & (around < len(height))]]
@@ -405,8 +405,8 @@ def _search(cells: Cells, series: Array, rate: float, within: float) -> tuple[fl
     if reach < _FINE // 2:
         return 0.0, float(height[centre]) / floor
     low, high = max(centre - reach, 0), min(centre + reach + 1, len(height))
-    found: Array = height[low:high]
-    grid: Array = np.arange(low, high) * step - abs(rate)
+    found: Array = np.asarray(height[low:high], dtype=np.float64)
+    grid: Array = np.arange(low, high, dtype=np.float64) * step - abs(rate)
     shift = _interpolated(grid, found)
     return float(np.sign(rate)) * shift, float(found.max()) / floor
 
