@@ -11,10 +11,11 @@ static void hermite(il_warmup_state *state, il_real x, il_real width) {
     state->share[3] = -width * x * x * y;
 }
 
-/* Ticks in a time, rounded up and limited to what a counter holds. */
+/* Ticks in a time, rounded up and limited to what a counter holds; 0 for a time that is negative or no number. */
 static uint32_t ticks_in(il_real time, il_real tick) {
     il_real ticks = time / tick;
-    if (!(ticks < IL_C(4294967040.0))) return UINT32_MAX; /* largest float below 2^32 */
+    if (!(ticks > IL_C(0.0))) return 0;
+    if (ticks >= IL_C(4294967040.0)) return UINT32_MAX; /* largest float below 2^32 */
     uint32_t whole = (uint32_t)ticks;
     return (il_real)whole < ticks ? whole + 1u : whole;
 }
@@ -25,7 +26,7 @@ il_status il_warmup_start(const il_warmup *settings, il_warmup_state *state, il_
     if (!(tick > IL_C(0.0)) || !il_finite(tick) || w->temperatures < 2) return IL_ARGUMENT;
     state->settled = ticks_in(w->settling_time, tick);
     state->ended = ticks_in(w->settling_time + w->taper_time, tick);
-    state->per_tick = w->model == IL_EXPONENTIAL || w->model == IL_KNOT_LOG_CUBIC ? tick : tick / w->settling_time;
+    state->per_tick = w->model == IL_EXPONENTIAL ? tick : tick / w->settling_time;
     if (w->model == IL_KNOT_LOG_CUBIC) {
         state->per_tick = tick / w->time_scale;
         state->log_scale = IL_C(1.0) / il_log1p(w->settling_time / w->time_scale);
