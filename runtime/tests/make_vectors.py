@@ -2,7 +2,9 @@
 """Write vectors.h: what the C core must compute, from equations transcribed apart.
 
 Imports nothing of imulab. Triads, drift and warm-up are computed with 60 decimal digits; blobs are packed by hand; the
-array's methods are plain Python in double, the robust one from tests/reference. Run it as `python3 make_vectors.py`.
+array's methods are plain Python in double, the robust one from tests/reference.
+
+`make_vectors.py --seeds DIR` writes the blobs, a file each, for the fuzzer.
 """
 
 import math
@@ -267,10 +269,10 @@ def base_readings():
     rng = random.Random(5)
     offset = [rng.uniform(-5e-3, 5e-3) for _ in range(ELEMENTS)]
     sigma = [1e-3 * rng.uniform(0.6, 1.6) for _ in range(ELEMENTS)]
-    rows = []
-    for turn in TURN:
-        rows.append([math.ldexp(round(math.ldexp(turn + b + rng.gauss(0, s), 20)), -20) for b, s in zip(offset, sigma)])
-    return rows
+    return [
+        [math.ldexp(round(math.ldexp(turn + b + rng.gauss(0, s), 20)), -20) for b, s in zip(offset, sigma)]
+        for turn in TURN
+    ]
 
 
 def coarse(x, bits):
@@ -499,28 +501,41 @@ def make_sections(w):
     return tumble_of, gyro_of, drift, warm, sensors
 
 
+def make_blobs(w):
+    tumble_of, gyro_of, drift, warm, sensors = make_sections(w)
+    text = section(0, b'{"format": "imulab.blob"}')
+    made = [blob(w), blob(w, text), blob(w, text, tumble_of[1], gyro_of[1], drift, warm[3], sensors[4])]
+    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, *warm, *sensors)]
+
+
 def blobs():
     for w in (4, 8):
-        tumble_of, gyro_of, drift, warm, sensors = make_sections(w)
-        text = section(0, b'{"format": "imulab.blob"}')
-        made = [blob(w), blob(w, text), blob(w, text, tumble_of[1], gyro_of[1], drift, warm[3], sensors[4])]
-        made += [blob(w, s) for s in (*tumble_of, *gyro_of, drift, *warm, *sensors)]
+        made = make_blobs(w)
         for i, data in enumerate(made):
             emit_bytes(f"v_blob{w}_{i}", data)
-        LINES.append(
-            f"static const uint8_t *const v_blob{w}[] = {{{', '.join(f'v_blob{w}_{i}' for i in range(len(made)))}}};"
-        )
+        names = ", ".join(f"v_blob{w}_{i}" for i in range(len(made)))
+        LINES.append(f"static const uint8_t *const v_blob{w}[] = {{{names}}};")
         LINES.append(f"static const size_t v_blob{w}_size[] = {{{', '.join(str(len(b)) for b in made)}}};")
-    LINES.append(
-        f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8, V_BLOB_DRIFT = 10,"
-    )
-    LINES.append("       V_BLOB_WARMUP = 11, V_BLOB_ARRAY = 15 };")
+    LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
+    LINES.append("enum { V_BLOB_DRIFT = 10, V_BLOB_WARMUP = 11, V_BLOB_ARRAY = 15 };")
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)
     LINES.append(f"static const uint32_t v_crc = {zlib.crc32(letters)}u;")
 
 
+def write_seeds(folder):
+    """The blobs for the fuzzer, whose first byte says what it mends: once nothing, once size and CRC."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for w in (4, 8):
+        for i, data in enumerate(make_blobs(w)):
+            for choice in (2, 3 + (w & 8) // 2):
+                (folder / f"{w}-{i}-{choice}").write_bytes(bytes([choice]) + data)
+
+
 def main():
+    if sys.argv[1:2] == ["--seeds"]:
+        write_seeds(Path(sys.argv[2]))
+        return
     for part in (tumble, gyro, centrifuge, warmup, array, blobs):
         part()
     head = [

@@ -35,6 +35,16 @@ static void plain_methods_equal_the_equations(void) {
     }
 }
 
+static void kalman_starts_with_what_is_there(void) {
+    il_array a = settings_of(IL_KALMAN);
+    il_real rate[V_SAMPLES];
+    uint8_t flags[V_SAMPLES * V_ELEMENTS];
+    a.gain = &v_kalman_gain[0][0];
+    CHECK(run(&a, 14, rate, flags) == (IL_NOT_FINITE | IL_EXCLUDED)); /* gyro 2 comes late */
+    CHECK_CLOSE(rate[0], v_array_turn[0], REAL(0.01));
+    CHECK(flags[2] == (IL_NOT_FINITE | IL_EXCLUDED) && flags[0] == 0 && flags[160 * V_ELEMENTS + 2] == 0);
+}
+
 static void feedback_equals_the_source(void) {
     static const int initial[] = {IL_FIRST, IL_ZERO, IL_GIVEN, IL_FIRST, IL_ZERO};
     static const il_real memory[] = {REAL(0), REAL(0), REAL(0), REAL(0.125), REAL(0)};
@@ -319,6 +329,7 @@ static void the_largest_array_fits(void) {
 
 void test_array(void) {
     plain_methods_equal_the_equations();
+    kalman_starts_with_what_is_there();
     feedback_equals_the_source();
     alignment_comes_first();
     support_corners();

@@ -142,6 +142,78 @@ static void three_gyros_are_enough(void) {
     }
 }
 
+/* Run n healthy samples, so that biases and variances are known. */
+static void warm(const il_array *a, il_array_state *state, int n) {
+    il_real out;
+    CHECK(il_array_start(a, state) == IL_OK);
+    for (int k = 0; k < n; k++) (void)il_array_step(a, state, v_array_base[k], &out);
+}
+
+static void a_scale_factor_is_no_jump(void) {
+    const il_array a = settings_of(IL_ROBUST);
+    for (int jumps = 0; jumps < 2; jumps++) {
+        il_array_state state;
+        unsigned met = 0;
+        warm(&a, &state, 200);
+        for (int k = 0; k < 100; k++) { /* 10 rad/s, and one gyro 0.5 % or 5 % off: within the tolerance, or not */
+            il_real reading[V_ELEMENTS], out;
+            for (int i = 0; i < V_ELEMENTS; i++) reading[i] = REAL(10) + v_array_base[k][i] - v_array_turn[k];
+            reading[3] += jumps ? REAL(0.5) : REAL(0.05);
+            met |= il_array_step(&a, &state, reading, &out);
+            CHECK_CLOSE(out, REAL(10), REAL(0.01));
+        }
+        CHECK(met & IL_GATED && ((met & IL_JUMPED) != 0) == jumps);
+    }
+}
+
+static void the_most_central_gyro_serves_where_all_are_gated(void) {
+    il_array a = settings_of(IL_ROBUST);
+    il_array_state state;
+    il_real reading[4], out;
+    a.elements = 4;
+    a.spread_gate = REAL(0); /* else half of them are always inside */
+    CHECK(il_array_start(&a, &state) == IL_OK);
+    for (int k = 0; k < 200; k++) {
+        for (int i = 0; i < 4; i++) reading[i] = REAL(1e-3) * random_real();
+        (void)il_array_step(&a, &state, reading, &out);
+    }
+    reading[0] = REAL(1);
+    reading[1] = REAL(2);
+    reading[2] = REAL(-1);
+    reading[3] = REAL(-2);
+    CHECK(il_array_step(&a, &state, reading, &out) & IL_ALONE);
+    CHECK_CLOSE(out < REAL(0) ? -out : out, REAL(1), REAL(0.01));
+    CHECK(state.axis[0].weight[0] + state.axis[0].weight[2] == REAL(1));
+}
+
+/* Newcomers are used at once where nobody else is left. */
+static void nobody_waits_for_nobody(void) {
+    const il_array a = settings_of(IL_ROBUST);
+    il_array_state state;
+    CHECK(il_array_start(&a, &state) == IL_OK);
+    for (int k = 0; k < V_SAMPLES; k++) {
+        il_real reading[V_ELEMENTS], out;
+        for (int i = 0; i < V_ELEMENTS; i++) reading[i] = (i < 3) == (k < 100) ? v_array_base[k][i] : NAN_REAL;
+        CHECK(il_array_step(&a, &state, reading, &out) & IL_NOT_FINITE && isfinite(out));
+        CHECK_CLOSE(out, v_array_turn[k], REAL(0.02));
+        CHECK(state.axis[0].weight[k < 100 ? 0 : 3] > REAL(0));
+    }
+}
+
+/* Variances as only garbage can leave them: the weights still sum to one. */
+static void weights_survive_any_variances(void) {
+    const il_array a = settings_of(IL_ROBUST);
+    const il_real huge = IS_FLOAT ? REAL(1e28) : REAL(1e290);
+    il_array_state state;
+    il_real out, sum = REAL(0);
+    warm(&a, &state, 100);
+    for (int i = 0; i < V_ELEMENTS; i++) state.axis[0].variance[i] = i == 1 ? -REAL(6) * huge : huge;
+    (void)il_array_step(&a, &state, v_array_base[100], &out);
+    for (int i = 0; i < V_ELEMENTS; i++) sum += state.axis[0].weight[i];
+    CHECK_CLOSE(sum, REAL(1), ROUNDING_LIMIT);
+    CHECK_CLOSE(out, v_array_turn[100], REAL(0.02));
+}
+
 /* Everything that random faults can do to an array: finite in, finite out, whatever came before; weights sum to one. */
 static void random_faults_never_break_it(void) {
     for (int trial = 0; trial < 240; trial++) {
@@ -195,5 +267,9 @@ void test_robust(void) {
     faults_are_named_and_bounded();
     weights_are_capped();
     three_gyros_are_enough();
+    a_scale_factor_is_no_jump();
+    the_most_central_gyro_serves_where_all_are_gated();
+    nobody_waits_for_nobody();
+    weights_survive_any_variances();
     random_faults_never_break_it();
 }

@@ -3590,8 +3590,8 @@ static const uint8_t v_blob8_21[216] = {
 };
 static const uint8_t *const v_blob8[] = {v_blob8_0, v_blob8_1, v_blob8_2, v_blob8_3, v_blob8_4, v_blob8_5, v_blob8_6, v_blob8_7, v_blob8_8, v_blob8_9, v_blob8_10, v_blob8_11, v_blob8_12, v_blob8_13, v_blob8_14, v_blob8_15, v_blob8_16, v_blob8_17, v_blob8_18, v_blob8_19, v_blob8_20, v_blob8_21};
 static const size_t v_blob8_size[] = {20, 53, 1269, 152, 176, 200, 224, 248, 152, 224, 124, 248, 312, 312, 312, 144, 144, 144, 144, 480, 144, 216};
-enum { V_BLOBS = 22, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8, V_BLOB_DRIFT = 10,
-       V_BLOB_WARMUP = 11, V_BLOB_ARRAY = 15 };
+enum { V_BLOBS = 22, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 };
+enum { V_BLOB_DRIFT = 10, V_BLOB_WARMUP = 11, V_BLOB_ARRAY = 15 };
 static const uint8_t v_crc_bytes[280] = {
     105, 109, 117, 108, 97, 98, 32, 105, 109, 117, 108, 97, 98, 32, 105, 109, 117, 108, 97, 98, 32, 105, 109, 117, 108, 97, 98, 32,
     105, 109, 117, 108, 97, 98, 32, 105, 109, 117, 108, 97, 98, 32, 105, 109, 117, 108, 97, 98, 32, 105, 109, 117, 108, 97, 98, 32,
