@@ -68,7 +68,7 @@ static il_real support_step(const il_array *a, il_array_axis *s, const il_real *
         for (int32_t j = 0; j < i; j++) sum += s->flags[i] | s->flags[j] ? IL_C(0.0) : (z[i] - z[j]) * (z[i] - z[j]);
     }
     if (count > 1) {
-        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : il_array_gain(a, s->seen[0] + a->start);
+        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : il_array_gain(a, il_counted(s->seen[0], a->start));
         s->spread += gain * (sum / ((il_real)count * (il_real)(count - 1) / IL_C(2.0)) - s->spread);
         il_count(&s->seen[0]);
     }
@@ -92,14 +92,14 @@ static il_real least_squares_step(const il_array *a, il_array_axis *s, const il_
     il_real mean = finite_mean(a, s, z, &count);
     for (int32_t i = 0; i < a->elements; i++) {
         if (!s->flags[i] && count > 1) {
-            uint32_t k = s->seen[i] + a->start;
+            uint32_t k = il_counted(s->seen[i], a->start);
             il_real gain = s->seen[i] == 0 ? IL_C(1.0) : il_array_gain(a, k), residual = z[i] - mean - s->bias[i];
             s->bias[i] += gain * residual;
             s->variance[i] += gain * ((IL_C(1.0) - gain) * residual * residual - s->variance[i]);
             il_count(&s->seen[i]);
         }
         /* equal weights until every variance rests on two residuals */
-        s->weight[i] = s->count < a->start + 2 ? IL_C(1.0) : IL_C(1.0) / (s->variance[i] + IL_TINY);
+        s->weight[i] = s->count - a->start < 2 ? IL_C(1.0) : IL_C(1.0) / (s->variance[i] + IL_TINY);
     }
     return weighted(a, s, z);
 }

@@ -104,7 +104,9 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
     if "array" in kinds:
         lines.append(f"#define UNIT_ARRAY_AXES {kinds['array'].columns['axes']}")
         lines.append(f"#define UNIT_ARRAY_ELEMENTS {kinds['array'].columns['elements']}")
-    lines += ["", *(f"extern const il_{kind} unit_{kind};" for kind in kinds), "", "#endif", ""]
+    lines += ["", "#ifdef __cplusplus", 'extern "C" {', "#endif"]
+    lines += ["", *(f"extern const il_{kind} unit_{kind};" for kind in kinds), ""]
+    lines += ["#ifdef __cplusplus", "}", "#endif", "#endif", ""]
     return "\n".join(lines)
 
 
