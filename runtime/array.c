@@ -132,7 +132,8 @@ static inline il_real feedback_step(const il_array *a, il_array_axis *s, const i
     int32_t n = a->elements;
     if (s->count == a->start) return start_bias(a, s, z, axis);
     il_real gain = il_array_gain(a, s->count), keep = IL_C(1.0) - gain, before = s->rate;
-    il_real total = IL_C(0.0), sum = IL_C(0.0);
+    il_real total = IL_C(0.0), sum = IL_C(0.0), part[IL_ARRAY_ELEMENTS];
+    /* What does not depend on the other gyros first: compilers divide two or four at once here. */
     for (int32_t i = 0; i < n; i++) {
         il_real b = keep * s->bias[i] + gain * (z[i] - before), y = z[i] - b, error = y - before;
         il_real d = keep * s->variance[i] + gain * (error * error);
@@ -140,8 +141,11 @@ static inline il_real feedback_step(const il_array *a, il_array_axis *s, const i
         s->bias[i] = b;
         s->variance[i] = d;
         s->weight[i] = share;
-        total += share;
-        sum += share * y;
+        part[i] = share * y;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        total += s->weight[i];
+        sum += part[i];
     }
     return sum / total;
 }

@@ -171,11 +171,27 @@ static il_real weight_of_evidence(const il_array *a, const il_array_axis *s, int
     return a->memory > IL_C(0.0) && count * a->memory > IL_C(1.0) ? IL_C(1.0) / a->memory : count;
 }
 
-/* Variance of a gyro, drawn to the mean of all while it rests on few residuals. */
+/* Variance of a gyro, drawn to the mean of all while it rests on few residuals: (prior v_mean + count v) / (both). */
+static il_real drawn(const il_array *a, const il_array_axis *s, const sample *p, int32_t i, il_real count, il_real share) {
+    il_real prior = a->weight != NULL ? CALIBRATED : OWN;
+    il_real mixed = (prior * s->ratio[i] * p->mean_variance + count * s->variance[i]) * share;
+    return larger(larger(mixed, a->weight_floor * p->mean_variance), IL_TINY);
+}
+
 static il_real trusted(const il_array *a, const il_array_axis *s, const sample *p, int32_t i) {
     il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = weight_of_evidence(a, s, i);
-    il_real mixed = (prior * s->ratio[i] * p->mean_variance + count * s->variance[i]) / (prior + count);
-    return larger(larger(mixed, a->weight_floor * p->mean_variance), IL_TINY);
+    return drawn(a, s, p, i, count, IL_C(1.0) / (prior + count));
+}
+
+static void trust_all(const il_array *a, const il_array_axis *s, sample *p) {
+    il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = IL_C(0.0), share = IL_C(0.0);
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (i == 0 || s->seen[i] != s->seen[i - 1]) { /* nearly always all have seen the same: one division serves */
+            count = weight_of_evidence(a, s, i);
+            share = IL_C(1.0) / (prior + count);
+        }
+        p->trust[i] = drawn(a, s, p, i, count, share);
+    }
 }
 
 /* Both gates about the median: inside[] counts in the output, learns[] teaches as well. */
@@ -370,10 +386,10 @@ static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, sam
     int32_t used = 0, nearest = -1;
     gates(a, s, z, p, roll_call(a, s, p));
     judge(a, s, p);
+    trust_all(a, s, p); /* a gyro that is back has another variance now */
     for (int32_t i = 0; i < a->elements; i++) {
         int here = p->waived ? p->core[i] : p->usable[i] && !(s->standing[i] & OUT);
         p->used[i] = (uint8_t)(here && p->inside[i]);
-        p->trust[i] = trusted(a, s, p, i);
         used += p->used[i];
         if (!p->core[i]) continue;
         if (nearest < 0 || il_fabs(p->r[i] - p->middle) < il_fabs(p->r[nearest] - p->middle)) nearest = i;
@@ -417,9 +433,9 @@ il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, co
     p.mean_variance = mean_variance(a, s);
     for (int32_t i = 0; i < a->elements; i++) {
         p.r[i] = z[i] - s->bias[i];
-        p.trust[i] = trusted(a, s, &p, i);
         p.used[i] = p.learns[i] = 1;
     }
+    trust_all(a, s, &p);
     if (closer || !all_inside(a, s, &p)) used = choose(a, s, z, &p);
     if (used == 0) {
         report(a, s, &p, used);
