@@ -115,7 +115,7 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption=f"Root mean square over t < T_M and all axes, white noise taken off: of the cycles fitted, of each "
+        caption=f"Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles fitted, of each "
         f"{what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
         "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops "
         "at once. "
