@@ -115,11 +115,10 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption=f"Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles fitted, of each "
-        f"{what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
-        "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops "
-        "at once. "
-        f"No table can beat the repeatability of cycles, {floor} {label}.",
+        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles fitted, "
+        f"of each {what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
+        "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
+        f"once. No table can beat the repeatability of cycles, {floor} {label}.",
         columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],
         rows=rows,
         highlight=highlight,
