@@ -163,21 +163,18 @@ def fit(
 
     check_outputs([output, report], [*files, *([layout] if layout else [])])
     latest = quantity(latest_start, "--latest-start", "time", "s")
+    options: dict[str, Any] = {
+        "temperatures": temperature_list(temperatures),
+        "tolerance": _number(tolerance, "--tolerance"),
+        "settling_time": None if settling_time is None else quantity(settling_time, "--settling-time", "time", "s"),
+        "settling_limit": _limit(settling_limit),
+        "taper_time": quantity(taper_time, "--taper-time", "time", "s"),
+        "axes": None if axes is None else [name.strip() for name in axes.split(",")],
+    }
     cycles = [
         read_cycle(name, layout, latest_start=latest, temperature_from_column=temperature_column) for name in files
     ]
-    result = fit_warmup(
-        cycles,
-        model=model,
-        temperatures=temperature_list(temperatures),
-        tolerance=_number(tolerance, "--tolerance"),
-        settling_time=None if settling_time is None else quantity(settling_time, "--settling-time", "time", "s"),
-        settling_limit=_limit(settling_limit),
-        exit_rule=exit_rule,
-        taper_time=quantity(taper_time, "--taper-time", "time", "s"),
-        pool=pool,
-        axes=None if axes is None else [name.strip() for name in axes.split(",")],
-    )
+    result = fit_warmup(cycles, model=model, exit_rule=exit_rule, pool=pool, **options)
     finish(result.calibration, output, report, json=json)
 
 

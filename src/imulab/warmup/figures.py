@@ -32,7 +32,7 @@ def exhibits(record: Calibration) -> Exhibits:
     before, after = (_rms(row["training"], head) * factor for row in (none, chosen))
     floor = record.fit["repeatability"]["cycle"]
     facts = [
-        ("model", str(chosen["model"])),
+        ("model", table.model),
         ("power cycles", str(record.fit["cycles"])),
         ("T_M", f"{table.settling_time:g} s"),
         ("left at the tests", f"{plain_number(after, 2)} {label}"),
@@ -42,6 +42,8 @@ def exhibits(record: Calibration) -> Exhibits:
     items: list[Figure | Table] = []
     for kind, index in kinds.items():
         items.append(_models(record, table, kind, index))
+    if record.fit["repeatability"]["unit"] is not None:
+        items.append(_units(record, table, kinds))
     for kind, index in kinds.items():
         items.append(_cycles(record, table, kind, index))
     for kind, index in kinds.items():
@@ -113,13 +115,35 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption=f"Root mean square over t < T_M and all axes, white noise taken off: of the cycles fitted, of each "
-        f"{what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
-        "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at once. "
-        f"No table can beat the repeatability of cycles, {floor} {label}.",
+        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles fitted, "
+        f"of each {what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
+        "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
+        f"once. No table can beat the repeatability of cycles, {floor} {label}.",
         columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],
         rows=rows,
         highlight=highlight,
+    )
+
+
+def _units(record: Calibration, table: WarmupTable, kinds: dict[str, list[int]]) -> Table:
+    """Whether one table for the type is enough, axis by axis."""
+    found = record.fit["repeatability"]
+    rows = []
+    for index in kinds.values():
+        for i in index:
+            label, factor = engineering_unit(table.units[i])
+            unit, cycle = found["unit"][i], found["cycle"][i]
+            cycle_text = "–" if cycle is None else plain_number(cycle * factor, 2)
+            verdict = "–" if cycle is None else ("each unit" if unit > cycle else "one per type")
+            rows.append([table.axes[i], plain_number(unit * factor, 2), cycle_text, verdict, label])
+    return Table(
+        title=f"Spread between {record.fit['units']} units",
+        caption="Root mean square deviation of a unit's curve from that of the type, beside that of a cycle from its "
+        "unit. "
+        "Where units differ by more than their cycles do, a table for each unit would gain; otherwise one per type is "
+        "enough.",
+        columns=["axis", "between units", "between cycles", "table for", "unit"],
+        rows=rows,
     )
 
 

@@ -30,7 +30,7 @@ _HEAT = np.array(
 )
 # Slope of the zero with temperature x: smooth, s0 + s1 (x - 6) + s2 (x - 6)^2; bent, m + P tanh((x0 - x) / w).
 _SMOOTH = np.array([[21.5, -0.40, -1.8e-3], [19.0, -0.36, -1.6e-3], [24.0, -0.44, -2.0e-3]])  # deg/h/K
-_BENT = np.array([[11.5, 26.0, 26.0, 17.0], [10.0, 24.0, 25.0, 18.0], [13.0, 28.0, 27.0, 16.0]])  # deg/h/K, K
+_BENT = np.array([[11.5, 25.0, 26.0, 16.0], [10.0, 23.0, 25.0, 17.0], [13.0, 27.0, 27.0, 15.0]])  # deg/h/K, K
 _ACCEL = np.array([14.0, -11.0, 18.0]) / 21.5  # (ug/K) / (deg/h/K) of the gyros' laws
 _SIZE = np.array([_DEG_PER_HOUR] * 3 + list(_ACCEL * _MICRO_G))
 _TURN_ON = np.array([30 * _DEG_PER_HOUR] * 3 + [300 * _MICRO_G] * 3)
