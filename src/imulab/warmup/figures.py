@@ -32,7 +32,7 @@ def exhibits(record: Calibration) -> Exhibits:
     before, after = (_rms(row["training"], head) * factor for row in (none, chosen))
     floor = record.fit["repeatability"]["cycle"]
     facts = [
-        ("model", table.model),
+        ("largest edge jump", f"{_largest(chosen['edge_jump'], head, factor)} {label}"),
         ("power cycles", str(record.fit["cycles"])),
         ("T_M", f"{table.settling_time:g} s"),
         ("left at the tests", f"{plain_number(after, 2)} {label}"),
@@ -115,8 +115,8 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles fitted, "
-        f"of each {what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
+        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles "
+        f"fitted, of each {what} left out, of each temperature left out (its neighbours are then twice as far as in "
         "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
         f"once. No table can beat the repeatability of cycles, {floor} {label}.",
         columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],
