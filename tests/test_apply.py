@@ -91,7 +91,7 @@ def test_a_recording_without_the_triad_is_refused():
         apply(record(truth, 1, "g"), lame)
 
 
-@pytest.mark.parametrize("procedure", ["warmup", "gyro_array", "centrifuge"])
+@pytest.mark.parametrize("procedure", ["gyro_array", "centrifuge"])
 def test_a_record_with_nothing_to_apply_here_is_refused(procedure):
     other = Calibration(procedure, {}, Covariance((), ()), {}, {})
     with pytest.raises(RecordError, match=f"a {procedure} record cannot be applied"):

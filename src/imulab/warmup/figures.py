@@ -67,7 +67,7 @@ def exhibits(record: Calibration) -> Exhibits:
 def _handmade(table: WarmupTable) -> Exhibits:
     low, high = table.temperatures[[0, -1]]
     return Exhibits(
-        headline=f"A {table.model} table from {low:g} to {high:g} degC, made from a file of coefficients.",
+        headline=f"Table of model {table.model}, {low:g} to {high:g} degC, made from a file of coefficients.",
         facts=[("model", table.model), ("T_M", f"{table.settling_time:g} s"), ("axes", " ".join(table.axes))],
         items=[_over_temperature(table)],
     )
@@ -98,7 +98,7 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     for number, row in enumerate(record.fit["models"]):
         if row["chosen"]:
             highlight = number
-        scales = ", ".join(f"{value:.3g}" for value in row["scales"]) or "–"
+        scales = ", ".join(plain_number(value, 3) for value in row["scales"]) or "–"
         none = row["model"] == "none"
         rows.append(
             [
