@@ -30,12 +30,13 @@ def exhibits(record: Calibration) -> Exhibits:
     none = next(row for row in models if row["model"] == "none")
     head, (label, factor) = next(iter(kinds.values())), engineering_unit(table.units[0])
     before, after = (_rms(row["training"], head) * factor for row in (none, chosen))
+    left = f"{plain_number(after, 2)} {label}" if after > 0 else "nothing above the noise"
     floor = record.fit["repeatability"]["cycle"]
     facts = [
         ("largest edge jump", f"{_largest(chosen['edge_jump'], head, factor)} {label}"),
         ("power cycles", str(record.fit["cycles"])),
         ("T_M", f"{table.settling_time:g} s"),
-        ("left at the tests", f"{plain_number(after, 2)} {label}"),
+        ("left at the tests", f"{plain_number(after, 2)} {label}" if after > 0 else "within noise"),
         ("between them", _text(chosen["left_temperature"], head, factor, f" {label}")),
         ("repeatability", _text(floor, head, factor, f" {label}")),
     ]
@@ -52,7 +53,7 @@ def exhibits(record: Calibration) -> Exhibits:
         items.append(_by_temperature(record, table, kind, index))
     items += [_over_temperature(table), _tests(record, table)]
     return Exhibits(
-        headline=f"The {chosen['model']} table leaves {plain_number(after, 2)} {label} of "
+        headline=f"The {chosen['model']} table leaves {left} of "
         f"{plain_number(before, 2)} {label} rms in the {table.settling_time:g} s after power-on"
         + (
             f"; power cycles repeat to {_text(floor, head, factor, f' {label}')}."
