@@ -382,3 +382,25 @@ def test_what_makes_no_test_is_refused(temperatures, options, kind, words):
     cycles = [cycle_of(flat, t, name=f"c{i}", duration=360, rate=5) for i, t in enumerate(temperatures)]
     with pytest.raises(kind, match=words):
         il.fit_warmup(cycles, **({"temperatures": [-20, 0, 20]} | options))
+
+
+def test_a_flight_log_is_fitted_where_the_vehicle_stood_still():
+    """400 s at rest, then flight: the same table as from the 400 s alone, and the flight is named."""
+    rng = np.random.default_rng(6)
+    logs, cut = [], []
+    for t in (0, 20):
+        for c in (1, 2):
+            whole = cycle_of(lambda s, t=t: (1 + t / 40) * flat(s), t, name=f"log{t}{c}", duration=700)
+            time = whole.column("time")
+            flying = np.where(time > 400, 0.2 * np.sin(3 * time) * np.sin(1.7 * time + 1), 0.0)
+            noise = 1e-6 * rng.standard_normal((2, len(time)))
+            columns = {axis: whole.column(axis) + flying + noise[i] for i, axis in enumerate(("gyro_x", "accel_x"))}
+            logs.append(whole.with_columns(columns, {}))
+            early = {name: values[time < 399] for name, values in logs[-1].columns.items()}
+            cut.append(replace(logs[-1], columns=early))
+    options = {"temperatures": [0, 20], "settling_time": END, "model": "knot-log-cubic"}
+    fit = il.fit_warmup(logs, **options)
+    assert any("the unit moved" in message and "first at" in message for message in fit.calibration.warnings)
+    time = np.arange(0, 300.0)
+    want = evaluate(il.fit_warmup(cut, **options).table, time, 10.0)
+    np.testing.assert_allclose(evaluate(fit.table, time, 10.0), want, atol=2 * HOUR)

@@ -179,8 +179,8 @@ def _centrifuge(record: Calibration) -> tuple[Table, ...]:
     for axis in axes:
         if f"{axis}_direction" not in record.parameters:
             raise RecordError(
-                f"the record has no {axis}_direction: it was reduced without table_angle, "
-                "so the drift's direction is not known and cannot be removed"
+                f"the record has no {axis}_direction: it was made without table_angle, "
+                "so that the direction of the drift in the gyroscope is not known"
             )
 
     def both(name: str) -> Array:

@@ -30,12 +30,13 @@ def exhibits(record: Calibration) -> Exhibits:
     none = next(row for row in models if row["model"] == "none")
     head, (label, factor) = next(iter(kinds.values())), engineering_unit(table.units[0])
     before, after = (_rms(row["training"], head) * factor for row in (none, chosen))
+    left = f"{plain_number(after, 2)} {label}" if after > 0 else "nothing above the noise"
     floor = record.fit["repeatability"]["cycle"]
     facts = [
-        ("model", table.model),
+        ("largest edge jump", f"{_largest(chosen['edge_jump'], head, factor)} {label}"),
         ("power cycles", str(record.fit["cycles"])),
         ("T_M", f"{table.settling_time:g} s"),
-        ("left at the tests", f"{plain_number(after, 2)} {label}"),
+        ("left at the tests", f"{plain_number(after, 2)} {label}" if after > 0 else "within noise"),
         ("between them", _text(chosen["left_temperature"], head, factor, f" {label}")),
         ("repeatability", _text(floor, head, factor, f" {label}")),
     ]
@@ -52,7 +53,7 @@ def exhibits(record: Calibration) -> Exhibits:
         items.append(_by_temperature(record, table, kind, index))
     items += [_over_temperature(table), _tests(record, table)]
     return Exhibits(
-        headline=f"The {chosen['model']} table leaves {plain_number(after, 2)} {label} of "
+        headline=f"The {chosen['model']} table leaves {left} of "
         f"{plain_number(before, 2)} {label} rms in the {table.settling_time:g} s after power-on"
         + (
             f"; power cycles repeat to {_text(floor, head, factor, f' {label}')}."
@@ -67,7 +68,7 @@ def exhibits(record: Calibration) -> Exhibits:
 def _handmade(table: WarmupTable) -> Exhibits:
     low, high = table.temperatures[[0, -1]]
     return Exhibits(
-        headline=f"A {table.model} table from {low:g} to {high:g} degC, made from a file of coefficients.",
+        headline=f"Table of model {table.model}, {low:g} to {high:g} degC, made from a file of coefficients.",
         facts=[("model", table.model), ("T_M", f"{table.settling_time:g} s"), ("axes", " ".join(table.axes))],
         items=[_over_temperature(table)],
     )
@@ -98,7 +99,7 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     for number, row in enumerate(record.fit["models"]):
         if row["chosen"]:
             highlight = number
-        scales = ", ".join(f"{value:.3g}" for value in row["scales"]) or "–"
+        scales = ", ".join(plain_number(value, 3) for value in row["scales"]) or "–"
         none = row["model"] == "none"
         rows.append(
             [
@@ -115,8 +116,8 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles fitted, "
-        f"of each {what} left out of the fit, of each temperature left out (its neighbours are then twice as far as in "
+        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles "
+        f"fitted, of each {what} left out, of each temperature left out (its neighbours are then twice as far as in "
         "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
         f"once. No table can beat the repeatability of cycles, {floor} {label}.",
         columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],

@@ -16,7 +16,7 @@ _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8
 
 def axis_style(title: str, **more: Any) -> dict[str, Any]:
     """Return a Plotly axis in the style of the reports."""
-    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
+    return {"title": {"text": title, "standoff": 12}, "zeroline": False, "gridcolor": "#e6eaed", **more}
 
 
 def temperature_colour(temperature: float, temperatures: Array) -> str:
@@ -75,6 +75,9 @@ def grid(
             y_title if column == 0 else "",
             domain=[top - height, top],
             anchor=f"x{suffix}",
+            showticklabels=column == 0,
+            ticks="outside" if column == 0 else "",
+            tickcolor="#ffffff",
             **({} if number == 0 else {"matches": "y"}),
         )
         layout["annotations"].append(
