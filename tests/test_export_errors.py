@@ -1,5 +1,7 @@
 """Mistakes with `imulab export`: one line, exit 2, nothing made."""
 
+import shutil
+import subprocess
 from dataclasses import replace
 
 import pytest
@@ -70,3 +72,7 @@ def test_a_serial_cannot_end_a_comment(folder, capsys):
     assert main(["export", "--to", "c", "odd.json", "-o", "out"]) == 0
     text = (folder / "out" / "unit.c").read_text(encoding="utf-8")
     assert text.index("*/") > text.index("int main(void)")
+    compiler = shutil.which("cc")
+    if compiler:
+        strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+        subprocess.run([compiler, *strict, folder / "out" / "unit.c", folder / "out" / "selftest.c"], check=True)
