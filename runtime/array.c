@@ -135,7 +135,8 @@ static inline il_real feedback_step(const il_array *a, il_array_axis *s, const i
     il_real total = IL_C(0.0), sum = IL_C(0.0), part[IL_ARRAY_ELEMENTS];
     /* What does not depend on the other gyros first: compilers divide two or four at once here. */
     for (int32_t i = 0; i < n; i++) {
-        il_real b = keep * s->bias[i] + gain * (z[i] - before), y = z[i] - b, error = y - before;
+        /* Written as a step: (1-g) and g as rounded do not add up to one, which would let the common bias leak away. */
+        il_real b = s->bias[i] + gain * (z[i] - s->bias[i] - before), y = z[i] - b, error = y - before;
         il_real d = keep * s->variance[i] + gain * (error * error);
         il_real share = IL_C(1.0) / (d < IL_TINY ? IL_TINY : d);
         s->bias[i] = b;

@@ -80,11 +80,11 @@ def pack(tables: Sequence[Table], width: int, text: Mapping[str, Any] | None = N
     """
     sections = [] if text is None else [(TEXT, json.dumps(text, ensure_ascii=False, sort_keys=True).encode("utf-8"))]
     with np.errstate(over="ignore"):
-        sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
-    for table in tables:
-        for field in table.fields:
-            if field.values is not None and not np.isfinite(field.values.astype(f"<f{width}")).all():
-                raise RecordError(f"{table.kind} {field.name}: {field.values} is beyond what {width} bytes hold")
+        for table in tables:
+            for field in table.fields:
+                if field.values is not None and not np.isfinite(field.values.astype(f"<f{width}")).all():
+                    raise RecordError(f"{table.kind} {field.name}: {field.values} is beyond what {width} bytes hold")
+    sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
     body = b"".join(struct.pack("<II", kind, len(payload)) + payload for kind, payload in sections)
     head = BLOB_MAGIC + struct.pack("<HHI", VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4)
     return head + body + struct.pack("<I", zlib.crc32(head + body))

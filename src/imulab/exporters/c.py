@@ -83,8 +83,10 @@ def _who(records: Sequence[Calibration]) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Text that cannot end a C comment."""
-    return text.replace("*/", "* /").replace("\\", "/").replace("\n", " ")
+    """Text that neither ends a C comment nor makes a compiler warn in one."""
+    for wrong, right in (("\\", "|"), ("\n", " "), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
+        text = text.replace(wrong, right)
+    return text
 
 
 def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
