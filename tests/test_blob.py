@@ -214,6 +214,15 @@ def test_a_blob_with_a_section_that_apply_does_not_know_is_refused(tmp_path):
         loaded(load_blob(tmp_path / "unit.blob"))
 
 
+def test_the_table_of_an_array_is_for_array_fuse(tmp_path):
+    text = {"format": "imulab.blob", "sensor": {}, "software": "x", "records": [], "sections": [{"kind": "array"}]}
+    (tmp_path / "unit.blob").write_bytes(pack(tables_of(madeup.tumble(1)), 4, text))
+    with pytest.raises(
+        RecordError, match=r"unit\.blob: nothing in this blob corrects a recording; array fuse takes it"
+    ):
+        loaded(load_blob(tmp_path / "unit.blob"))
+
+
 @pytest.mark.parametrize(
     "text", [{}, {"format": "other"}, {"format": "imulab.blob"}, {"format": "imulab.blob", "sections": 3}]
 )

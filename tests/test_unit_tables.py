@@ -92,7 +92,7 @@ def changed(record, name, value=None, unit=None):
                 madeup.centrifuge(),
                 parameters={n: p for n, p in madeup.centrifuge().parameters.items() if n != "y_direction"},
             ),
-            "has no y_direction: it was reduced without table_angle",
+            "has no y_direction: it was made without table_angle",
         ),
         (replace(madeup.warmup(), sections={}), "lacks table"),
     ],

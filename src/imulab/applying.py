@@ -51,7 +51,12 @@ def loaded(record: Calibration | Blob) -> Loaded:
     """
     if isinstance(record, Blob):
         # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
-        sections = [(str(section["kind"]), section) for section in record.text["sections"] if section["kind"] in _APPLY]
+        sections = [
+            (str(section["kind"]), section) for section in record.text["sections"] if section["kind"] != "array"
+        ]
+        unknown = [kind for kind, _ in sections if kind not in _APPLY]
+        if unknown:
+            raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
         if not sections:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         return Loaded(Unit(record.data), tuple(sections))
