@@ -42,7 +42,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(STAMP)
+bench: $(STAMP) $(VENV)/.bench
 	$(BIN)/python benchmarks/run.py
 
 docs: $(STAMP) $(VENV)/.docs
@@ -62,6 +62,10 @@ $(STAMP): pyproject.toml CMakeLists.txt $(C_SOURCES)
 
 $(VENV)/.release: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[release]'
+	touch $@
+
+$(VENV)/.bench: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	touch $@
 
 $(VENV)/.docs: $(STAMP)
