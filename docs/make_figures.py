@@ -12,6 +12,7 @@ from pathlib import Path
 import imulab as il
 from imulab.centrifuge.manifest import make_manifest
 from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Truth
+from imulab.cli import main as commands
 from imulab.demo import run
 from imulab.exhibit import BAD, GOOD, Exhibits, Figure
 from imulab.present import exhibits_of
@@ -96,7 +97,7 @@ def main() -> None:
     FIGURES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
-        run(folder)
+        run(folder, commands)
         screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 930)
         first_figure(folder, "array.json", "gyro_array")
         first_figure(folder, "warmup.json", "warmup")
