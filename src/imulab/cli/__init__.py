@@ -11,6 +11,8 @@ _INTERRUPTED_PIPE = 141  # 128 + SIGPIPE, as a shell reports it
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``imulab`` with the given arguments (those of the process by default) and return the exit status."""
+    # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from typer.exceptions import TyperException
 
     from imulab.cli.app import command
