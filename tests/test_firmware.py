@@ -9,6 +9,7 @@ import pytest
 import madeup
 from conftest import REPOSITORY
 from imulab.exporters import export
+from imulab.exporters.c import _header
 from imulab.runtime import ArraySettings, Stream, Unit, array_table
 from imulab.tables import METHODS, MODELS, pack, tables_of
 
@@ -239,6 +240,39 @@ def test_the_self_test_notices_a_wrong_number(exported, tmp_path, compiler):
     assert code != 0
     assert "FAIL" in line
     assert worst(line) > 1e-6
+
+
+@pytest.mark.parametrize("define", [[], ["-DIMULAB_REAL=float"]])
+def test_the_code_in_the_readme_compiles_and_runs(define, exported, tmp_path, compiler):
+    blocks = (exported / "README.md").read_text(encoding="utf-8").split("```")[1::2]
+    assert [block.startswith("c\n") for block in blocks] == [True, True]
+    # What the README shows is made static here: a real project has a header for it.
+    code = "\n".join(block[2:] for block in blocks)
+    declared = [line.removesuffix(" {") + ";" for line in code.splitlines() if line.endswith(") {") and line[0] != " "]
+    steps = """
+int main(void) {
+    il_real accel[3] = {100, 200, 4000}, gyro[3] = {1, 2, 3};
+    if (!compensation_start((il_real)25, (il_real)0.005)) return 1;
+    if (correct_accelerometers(accel) != 0) return 2;
+    if (correct_gyroscopes(gyro, accel) != 0) return 3;
+    if (remove_drift(accel, gyro) != 0) return 4;
+    remove_warmup(1000, gyro);
+    if (numbers_from_flash((const uint8_t *)"no table, for certain", 21)) return 5;
+    return gyro[0] == gyro[0] && accel[2] > 5 ? 0 : 6;
+}
+"""
+    source = tmp_path / "project.c"
+    source.write_text("\n".join(['#include "unit.h"', *declared, code, steps]), encoding="utf-8")
+    files = [source, exported / "imulab.c", exported / "unit.c"]
+    command = [compiler, *STRICT, *define, f"-I{exported}", *files, "-o", tmp_path / "project", "-lm"]
+    subprocess.run(command, check=True)
+    assert subprocess.run([tmp_path / "project"], check=False).returncode == 0
+
+
+def test_a_large_array_has_room_in_the_header():
+    small, large = (array_table(ArraySettings("mean", n)) for n in (6, 48))
+    assert "#define IL_ARRAY_ELEMENTS 32\n" in _header([small])
+    assert "#define IL_ARRAY_ELEMENTS 48\n" in _header([large])
 
 
 def test_the_header_compiles_as_c_plus_plus(exported, tmp_path, compiler):

@@ -20,6 +20,7 @@ from imulab.files import replacing
 from imulab.tables import KINDS, Field, Table
 
 _CORE = ("tumble.c", "centrifuge.c", "warmup.c", "array.c", "robust.c", "table.c")
+_ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
 _OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array)\.h"\n', re.MULTILINE)
 
 
@@ -36,7 +37,7 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     tables = tables_of_all(records)
     blob = make_blob(records, tables)
     contents = {
-        "imulab.h": _source("imulab.h"),
+        "imulab.h": _header(tables),
         "imulab.c": _amalgamation(),
         "unit.h": _unit_h(records, tables),
         "unit.c": _unit_c(records, tables),
@@ -67,6 +68,18 @@ def _source(name: str) -> str:
 
 def _firmware(name: str) -> str:
     return (files("imulab.exporters") / "firmware" / name).read_text(encoding="utf-8")
+
+
+def _most_elements(tables: Sequence[Table]) -> int:
+    """Gyros per axis that the exported header has room for: its default, or what the unit has."""
+    return max([_ELEMENTS, *(int(table.columns["elements"]) for table in tables if table.kind == "array")])
+
+
+def _header(tables: Sequence[Table]) -> str:
+    """imulab.h, with room for the unit's array, so that no -D is needed."""
+    text, default = _source("imulab.h"), f"#define IL_ARRAY_ELEMENTS {_ELEMENTS}\n"
+    assert default in text
+    return text.replace(default, f"#define IL_ARRAY_ELEMENTS {_most_elements(tables)}\n")
 
 
 def _amalgamation() -> str:
@@ -200,8 +213,12 @@ def _readme(records: Sequence[Calibration], tables: Sequence[Table], blob_size: 
 
     # The output is Markdown and C, not HTML: nothing is escaped.
     environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
-    kinds = {kind: next((t.columns for t in tables if t.kind == kind), None) for kind in KINDS}
     text: str = environment.from_string(_firmware("README.md.j2")).render(
-        serial=_who(records), software=records[0].software, blob_size=blob_size, **kinds
+        serial=_who(records),
+        software=records[0].software,
+        blob_size=blob_size,
+        kinds={table.kind: table.columns for table in tables},
+        first=tables[0].kind,
+        most_elements=_most_elements(tables),
     )
     return text + "\n"
