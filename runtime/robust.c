@@ -436,7 +436,8 @@ il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, co
         p.used[i] = p.learns[i] = 1;
     }
     trust_all(a, s, &p);
-    if (closer || !all_inside(a, s, &p)) used = choose(a, s, z, &p);
+    int closely = closer || !all_inside(a, s, &p);
+    if (closely) used = choose(a, s, z, &p);
     if (used == 0) {
         report(a, s, &p, used);
         for (int32_t i = 0; i < a->elements; i++) s->weight[i] = IL_C(0.0);
@@ -447,8 +448,10 @@ il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, co
         rate += p.used[i] ? s->weight[i] * p.r[i] : IL_C(0.0);
         pupils += p.learns[i];
     }
-    report(a, s, &p, used);
-    if (used < a->elements) teach_fresh(a, s, &p, rate);
+    if (closely) { /* else all are used and there is nothing to tell */
+        report(a, s, &p, used);
+        if (used < a->elements) teach_fresh(a, s, &p, rate);
+    }
     if (pupils >= 2) learn(a, s, &p, pupils);
     return rate;
 }
