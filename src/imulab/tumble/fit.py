@@ -108,7 +108,7 @@ def fit_tumble(
     RecordError
         The prior lacks a parameter, or has outputs in another unit.
     """
-    _check_options(order, method, loss)
+    check_options(order, method, loss)
     local = _gravity(gravity)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
@@ -163,7 +163,14 @@ def fit_tumble(
     )
 
 
-def _check_options(order: int | str, method: str, loss: str) -> None:
+def check_options(order: int | str, method: str, loss: str) -> None:
+    """Check what can be checked before there is data.
+
+    Raises
+    ------
+    OptionError
+        An option has an unknown value, or does not go with another.
+    """
     known = ("auto", *range(1, HIGHEST_ORDER + 1))
     if order not in known or isinstance(order, bool):
         raise OptionError(f"order {order!r}: expected one of {' '.join(map(str, known))}")
