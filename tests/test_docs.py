@@ -1,4 +1,4 @@
-"""What the documentation shows is run: marked blocks of every page, in order, in a folder of their own; docstrings too."""
+"""What the documentation shows is run: marked blocks of every page, in order, in an empty folder; docstrings too."""
 
 import doctest
 import importlib

@@ -8,9 +8,10 @@ from imulab import report
 from imulab.calibration import Calibration
 from imulab.errors import RecordError
 from imulab.exhibit import Exhibits
+from imulab.gyro_array import figures as gyro_array
 from imulab.tumble import figures as tumble
 
-_EXHIBITS = {"tumble": tumble.exhibits}
+_EXHIBITS = {"tumble": tumble.exhibits, "gyro_array": gyro_array.exhibits}
 
 
 def exhibits_of(record: Calibration) -> Exhibits:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import convert, export, records, tumble
+from imulab.cli import allan, array, convert, export, records, tumble
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -23,9 +23,11 @@ def command() -> Any:
     app.add_typer(
         tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
     )
+    app.add_typer(array.commands(_SETTINGS), name="array", help="Fuse several gyroscopes on one axis into one rate.")
     records.add_commands(app)
     app.command("convert")(convert.convert)
     app.command("export")(export.export)
+    app.command("allan")(allan.allan)
     return typer.main.get_command(app)
 
 

@@ -88,7 +88,8 @@ def _array(table: Table, rng: np.random.Generator) -> dict[str, Any]:
     reading[_SAMPLES // 2, :, 0] += 5.0
     reading[_SAMPLES // 3 : _SAMPLES // 3 + 5, :, elements - 1] = np.nan
     flat = reading.reshape(_SAMPLES, axes * elements)
-    return {"": _SAMPLES, "scale": 5.0, "reading": flat, "rate": fuse_table(table, flat)}
+    rate = fuse_table(table, flat)
+    return {"": _SAMPLES, "scale": float(np.nanmax(np.abs(rate))), "reading": flat, "rate": rate}
 
 
 _MAKE = {"tumble": _tumble, "gyro": _gyro, "centrifuge": _centrifuge, "warmup": _warmup, "array": _array}

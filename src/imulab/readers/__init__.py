@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from imulab.readers.layout import Layout, load_layout
 from imulab.readers.selection import Selection, windowed
 from imulab.readers.text import TextFile
 from imulab.recording import Recording, Source
+
+_LIVE_BYTES = 1 << 16
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
@@ -83,14 +85,16 @@ def read_blocks(
     topic: str | None = None,
     instance: int | None = None,
     window: tuple[float | None, float | None] | None = None,
+    live: bool = False,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
-    Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
+    Parameters and errors are those of `read`; every block has the metadata, and knows its first row. With `live`, whole
+    lines of standard input are a block as soon as they are there.
     """
     selection = Selection(topic, instance, window)
     name = _name(file)
-    yield from windowed(_blocks(file, name, _layout(layout), selection, None), window, name)
+    yield from windowed(_blocks(file, name, _layout(layout), selection, None, live=live), window, name)
 
 
 class _Hash:
@@ -117,7 +121,13 @@ class _Hash:
 
 
 def _blocks(
-    file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
+    file: str | Path,
+    name: str,
+    layout: Layout | None,
+    selection: Selection,
+    hashed: _Hash | None,
+    *,
+    live: bool = False,
 ) -> Iterator[Recording]:
     """Yield the blocks of a file by what its first bytes say it is."""
     if str(file) != "-" and Path(file).is_dir():
@@ -137,6 +147,8 @@ def _blocks(
         return
     selection.refuse(name, "a text file")
     with _open(file) as stream:
+        if live:
+            stream = cast(BinaryIO, _Live(stream))
         text = TextFile(stream, name, layout, hashed=hashed is not None)
         if hashed is not None:
             hashed.text = text
@@ -160,6 +172,16 @@ def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording
 
 
 _FAMILIES = {kind.module: _family(kind.module, by_layout=kind.layout != "none") for kind in FORMATS}
+
+
+class _Live:
+    """A stream whose `read` returns what is there instead of waiting for all that was asked for."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+
+    def read(self, size: int) -> bytes:
+        return bytes(self._stream.read1(min(size, _LIVE_BYTES)))  # type: ignore[attr-defined]
 
 
 def _name(file: str | Path) -> str:

@@ -59,9 +59,18 @@ FORMATS = (
     Format("ROS 2 MCAP", ".mcap, a folder", "rosbag", lambda h: h.startswith(b"\x89MCAP"), "lz4", "ros"),
     Format("ROS 2 sqlite", ".db3, a folder", "rosbag", lambda h: h.startswith(b"SQLite format 3\0")),
     Format("PX4 ULog", ".ulg", "ulog", lambda h: h.startswith(b"ULog")),
+    Format("MIMU4444 log", ".bin", "mimu", lambda h: _is_mimu(h)),
     Format("ArduPilot DataFlash", ".bin", "dataflash", lambda h: h.startswith(b"\xa3\x95")),
 )
 TEXT = Format("text", ".csv, any", "text", lambda _: True, layout="possible", writes=True)
+
+
+def _is_mimu(head: bytes) -> bool:
+    if b"\xaa" not in head:
+        return False
+    from imulab.readers.mimu import is_mimu
+
+    return is_mimu(head)
 
 
 def recognised(head: bytes) -> Format:

@@ -52,6 +52,8 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             raise ReadError(
                 f"{where}: expected numbers, found {'a struct' if hasattr(array, 'dtype') else type(array).__name__}"
             )
+        if array.dtype.kind not in "iufb":
+            raise ReadError(f"{where}: expected real numbers, found {array.dtype}")
         lengths[column], rows = sliced(array.shape, number, False, where)
         take[column] = partial(_floats, rows, array, where)
     yield from recordings(take, lengths, layout, name)

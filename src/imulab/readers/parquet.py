@@ -32,11 +32,13 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
 
     row = 1
     try:
-        with parquet.ParquetFile(path, memory_map=False) as file:
+        with parquet.ParquetFile(path, memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout)
-            metadata = {**_metadata(file.metadata.metadata), **((layout and layout.metadata) or {})}
-            for batch in file.iter_batches(batch_size=ROWS, columns=list(dict.fromkeys(columns.values()))):
+            metadata = {**_metadata(file.schema_arrow.metadata), **((layout and layout.metadata) or {})}
+            for batch in file.iter_batches(
+                batch_size=ROWS, columns=list(dict.fromkeys(columns.values())), use_threads=False
+            ):
                 if batch.num_rows == 0:
                     continue
                 values = {key: _floats(arrow, batch.column(title), title, name) for key, title in columns.items()}

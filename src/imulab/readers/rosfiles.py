@@ -26,6 +26,7 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 _BAG_LINE = b"#ROSBAG V2.0\n"
 _FOOTER = 29
 _LARGEST_CHUNK = 1 << 31
+_AT_ONCE = 1 << 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,7 +291,7 @@ class Sqlite:
             connection = sqlite3.connect(f"{self._path.resolve().as_uri()}?immutable=1", uri=True)
             try:
                 cursor = connection.execute(text)
-                while rows := cursor.fetchmany(1 << 13):
+                while rows := cursor.fetchmany(_AT_ONCE):
                     yield rows
             finally:
                 connection.close()

@@ -7,9 +7,16 @@ The numbers are read by the C module `_text` in blocks of whole lines.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+import stat
 from codecs import BOM_UTF8
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 from typing import BinaryIO
 
 import numpy as np
@@ -18,19 +25,79 @@ from imulab.errors import ReadError
 from imulab.readers import _text
 from imulab.readers.layout import Layout
 from imulab.recording import Recording, parse_column_title
+from imulab.tens import powers_of_five
 
-_BLOCK_BYTES = 1 << 24
+_BLOCK_BYTES = 1 << 22
+_WORTH_SHARING = 1 << 19
+_AHEAD = 2
+_MOST_THREADS = 8
+
+_text.prepare(powers_of_five())
 _LONGEST_LINE = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A block that is being parsed: its bytes, first row, rows, numbers, and each part's first line and answer."""
+
+    block: bytes
+    row: int
+    rows: int
+    out: np.ndarray
+    answers: list[tuple[int, Callable[[], tuple[int, int, int]]]]
+
+
+class _Crew:
+    """Threads to parse with, as many as there are processors; started when there is work for them."""
+
+    def __init__(self) -> None:
+        self.size = min(_MOST_THREADS, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
+        self._pool: ThreadPoolExecutor | None = None
+
+    def begin(self, job: Callable[[], tuple[int, int, int]]) -> Callable[[], tuple[int, int, int]]:
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.size)
+        return self._pool.submit(job).result
+
+    def __enter__(self) -> _Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+
+class _Hash:
+    """SHA-256 of what is read, taken in a thread of its own where there is much of it."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+        self._pool: ThreadPoolExecutor | None = None
+
+    def update(self, data: bytes) -> None:
+        if self._pool is None and len(data) < _WORTH_SHARING:
+            self._hash.update(data)
+            return
+        self._pool = self._pool or ThreadPoolExecutor(1)
+        self._pool.submit(self._hash.update, data)
+
+    def stop(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def hexdigest(self) -> str:
+        return self._hash.hexdigest()
 
 
 class TextFile:
     """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
 
     def __init__(self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True) -> None:
-        self._stream = stream
+        self._live = _is_pipe(stream)
+        self._read = getattr(stream, "read1", stream.read) if self._live else stream.read
         self._name = name
         self._layout = layout
-        self._hash = hashlib.sha256() if hashed else None
+        self._hash = _Hash() if hashed else None
         self._rest = b""
         self._ended = False
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
@@ -51,7 +118,10 @@ class TextFile:
 
     def sha256(self) -> str:
         """Return the SHA-256 of the bytes read so far, hexadecimal."""
-        return self._hash.hexdigest() if self._hash else ""
+        if self._hash is None:
+            return ""
+        self._hash.stop()
+        return self._hash.hexdigest()
 
     def drain(self) -> None:
         """Read on to the end, so that the hash is that of the whole file."""
@@ -62,27 +132,35 @@ class TextFile:
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
         row = 1
-        while True:
-            block = self._next_lines()
-            if block is None:
-                break
-            recording = self._parse(block, row)
-            row += len(recording)
-            yield recording
+        waiting: deque[_Task] = deque()
+        with _Crew() as crew:
+            while True:
+                block = self._next_lines()
+                if block is not None:
+                    waiting.append(self._begin(block, row, crew))
+                    row += waiting[-1].rows
+                # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
+                while waiting and (block is None or self._live or len(waiting) > _AHEAD):
+                    yield self._finish(waiting.popleft())
+                if block is None:
+                    break
         if row == 1:
             raise ReadError(f"{self._name}: no rows of data below the header")
 
     # --- bytes -------------------------------------------------------------------------------------------------
 
     def _read_more(self) -> None:
+        self._rest += self._next_bytes()
+
+    def _next_bytes(self) -> bytes:
         try:
-            data = self._stream.read(_BLOCK_BYTES)
+            data = self._read(_BLOCK_BYTES)
         except OSError as error:
             raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
         self._ended = not data
         if self._hash:
             self._hash.update(data)
-        self._rest += data
+        return data
 
     def _next_lines(self) -> bytes | None:
         """Return whole lines of about a block's size, without blank lines at the end of the file."""
@@ -96,7 +174,16 @@ class TextFile:
                     self._rest = lines[len(kept) :].partition(b"\n")[2] + self._rest
                     return kept
                 self._rest = lines + self._rest
-            self._read_more()
+                self._read_more()
+                continue
+            data = self._next_bytes()
+            end = data.rfind(b"\n")
+            if data[max(end - 2, 0) : max(end, 0)].strip(self._blanks) and data[end - 1] not in b" \t\n":
+                # As almost always: the last whole line is none of blanks, and nothing need be moved but the lines.
+                lines = b"".join((self._rest, memoryview(data)[:end]))
+                self._rest = data[end + 1 :]
+                return lines
+            self._rest += data
         lines, self._rest = self._rest.rstrip(self._blanks), b""
         return lines or None
 
@@ -189,13 +276,30 @@ class TextFile:
 
     # --- rows --------------------------------------------------------------------------------------------------
 
-    def _parse(self, block: bytes, row: int) -> Recording:
-        capacity = block.count(b"\n") + 1
-        out = np.empty((len(self._titles), capacity))
-        rows, problem, field = _text.parse(block, self._delimiter, self._slots, out, capacity)
-        if problem:
-            self._refuse(block, row, rows, problem, field)
-        columns = dict(zip(self._titles, out, strict=True))
+    def _begin(self, block: bytes, row: int, crew: _Crew) -> _Task:
+        """Begin to parse a block of whole lines, in as many parts as there are threads."""
+        parts = crew.size if len(block) >= _WORTH_SHARING else 1
+        cuts = [0, *(block.find(b"\n", len(block) * part // parts) + 1 for part in range(1, parts)), len(block)]
+        cuts = sorted(set(cuts))
+        lines = [block.count(b"\n", start, stop) for start, stop in pairwise(cuts)]
+        lines[-1] += 1
+        total = sum(lines)
+        out = np.empty((len(self._titles), total))
+        answers, first = [], 0
+        for count, (start, stop) in zip(lines, pairwise(cuts), strict=True):
+            job = partial(_text.parse, block, self._delimiter, self._slots, out, total, start, stop, first)
+            answers.append((first, crew.begin(job) if parts > 1 else job))
+            first += count
+        return _Task(block, row, total, out, answers)
+
+    def _finish(self, task: _Task) -> Recording:
+        """Wait for a block and return its rows."""
+        row, rows = task.row, task.rows
+        for first, answer in task.answers:
+            done, problem, field = answer()
+            if problem:
+                self._refuse(task.block, row, first + done, problem, field)
+        columns = dict(zip(self._titles, task.out, strict=True))
         units = dict(self._units)
         layout = self._layout
         if layout is not None and layout.sample_rate is not None:
@@ -228,6 +332,14 @@ class TextFile:
 def _fields(line: str, delimiter: str) -> list[str]:
     """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
     return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
+
+
+def _is_pipe(stream: BinaryIO) -> bool:
+    """Whether lines come as they are made, so that none may be held back."""
+    try:
+        return not stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def _is_number(text: str) -> bool:

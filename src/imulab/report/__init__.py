@@ -13,7 +13,7 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure
 from imulab.files import write_text
 
-_TITLES = {"tumble": "Tumble calibration"}
+_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array"}
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:

@@ -1,0 +1,288 @@
+"""``imulab array``: simulate, calibrate, fuse and compare."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from imulab.cli.options import (
+    AsJson,
+    LayoutFile,
+    OutputFile,
+    RecordingFile,
+    ReportFile,
+    check_outputs,
+    progress_bar,
+    quantity,
+    warn,
+    whole_number,
+)
+from imulab.errors import OptionError
+
+if TYPE_CHECKING:
+    from imulab.calibration import Calibration
+    from imulab.gyro_array.fuse import FuseOptions, Fuser
+    from imulab.gyro_array.simulate import Fault
+    from imulab.recording import Recording
+
+CalibrationFile = Annotated[
+    str | None, typer.Option("--calibration", metavar="RECORD", help="Record of array calibrate, taken off first.")
+]
+
+
+def commands(settings: dict[str, Any]) -> typer.Typer:
+    """Return the group of commands."""
+    group = typer.Typer(**settings)
+    for function in (simulate, calibrate, fuse, compare):
+        group.command(function.__name__)(function)
+    return group
+
+
+def simulate(
+    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.csv", help="Recording to write.")],
+    experiment: Annotated[str, typer.Option(help="static, dynamic (the source's set-ups) or moving.")] = "dynamic",
+    elements: Annotated[str, typer.Option(help="Gyros on each axis.")] = "6",
+    axes: Annotated[str, typer.Option(help="1 or 3.")] = "1",
+    rate: Annotated[str | None, typer.Option(help="Sampling rate; that of the experiment if not given.")] = None,
+    duration: Annotated[str | None, typer.Option(help="That of the experiment if not given.")] = None,
+    white: Annotated[str, typer.Option(help="White noise of a sample, before a factor for each gyro.")] = "0.05 deg/s",
+    spread: Annotated[str, typer.Option(help="Range of that factor.")] = "0.6,1.6",
+    gauss_markov: Annotated[str, typer.Option(help="Standard deviation of the correlated noise.")] = "0.003 deg/s",
+    correlation_time: Annotated[str, typer.Option(help="Of the correlated noise.")] = "200 s",
+    walk: Annotated[str, typer.Option(help="Rate random walk, per square root of a second.")] = "0.0002 deg/s",
+    turn_on: Annotated[str, typer.Option(help="Standard deviation of the turn-on biases.")] = "0.02 deg/s",
+    scale_spread: Annotated[str, typer.Option(help="Standard deviation of the scale factors.")] = "0",
+    misalignment: Annotated[str, typer.Option(help="Standard deviation of the misalignments.")] = "0 deg",
+    mounting: Annotated[str, typer.Option(help="same, or alternate: even elements upside down.")] = "same",
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND:GYRO[:START[:DURATION[:SIZE]]]", help="dead stuck spikes jump nan saturation; s, deg/s."
+        ),
+    ] = None,
+    unit: Annotated[str, typer.Option(help="Unit of the outputs: rad/s deg/s deg/h.")] = "deg/s",
+    session: Annotated[str, typer.Option(help="Another recording of the same array.")] = "0",
+    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+) -> None:
+    """Simulate an array's recording, with its truth in the columns truth_rate."""
+    from imulab.gyro_array.simulate import NoiseModel, simulate_array
+    from imulab.writers import write_csv
+
+    check_outputs([output], [])
+    low, _, high = spread.partition(",")
+    noise = NoiseModel(
+        white=quantity(white, "--white", "rate", "deg/s"),
+        spread=(quantity(low, "--spread", "number", "1"), quantity(high or low, "--spread", "number", "1")),
+        gauss_markov=quantity(gauss_markov, "--gauss-markov", "rate", "deg/s"),
+        correlation_time=quantity(correlation_time, "--correlation-time", "time", "s"),
+        walk=quantity(walk, "--walk", "rate", "deg/s"),
+        turn_on=quantity(turn_on, "--turn-on", "rate", "deg/s"),
+    )
+    recording = simulate_array(
+        experiment=experiment,
+        elements=whole_number(elements, "--elements"),
+        axes=whole_number(axes, "--axes"),
+        sample_rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
+        duration=None if duration is None else quantity(duration, "--duration", "time", "s"),
+        noise=noise,
+        scale_spread=quantity(scale_spread, "--scale-spread", "number", "1"),
+        misalignment=quantity(misalignment, "--misalignment", "angle", "deg"),
+        mounting=mounting,
+        faults=tuple(_fault(text) for text in fault or []),
+        unit=unit,
+        session=whole_number(session, "--session"),
+        seed=whole_number(seed, "--seed"),
+    )
+    write_csv(recording, output)
+    print(f"{output}: {len(recording)} samples, {elements} gyros on each axis, serial {recording.metadata['serial']}")
+
+
+def _fault(text: str) -> Fault:
+    from imulab.gyro_array.simulate import Fault
+
+    kind, *rest = text.split(":")
+    if not 1 <= len(rest) <= 4:
+        raise OptionError(f"--fault {text!r}: expected KIND:GYRO[:START[:DURATION[:SIZE]]], such as stuck:3:40:20")
+    found = {"gyro": whole_number(rest[0], "--fault")}
+    values = {
+        name: quantity(part, "--fault", of, unit)
+        for (name, of, unit), part in zip(
+            (("start", "time", "s"), ("duration", "time", "s"), ("size", "rate", "deg/s")), rest[1:], strict=False
+        )
+        if part
+    }
+    return Fault(kind, **found, **values)  # type: ignore[arg-type]
+
+
+def calibrate(
+    still: Annotated[str, typer.Argument(metavar="STILL", help="Recording at rest.")],
+    moving: Annotated[
+        str | None, typer.Option("--moving", metavar="FILE", help="Recording in motion, for alignment and scale.")
+    ] = None,
+    interval: Annotated[
+        str | None, typer.Option("--interval", metavar="START,STOP", help="Use STILL from START to STOP, s.")
+    ] = None,
+    averaging: Annotated[str, typer.Option(help="Averaging time of the covariance matrix.")] = "1 s",
+    layout: LayoutFile = None,
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
+    from imulab.cli.tumble import finish
+    from imulab.gyro_array.fit import calibrate_array
+    from imulab.readers import read
+
+    check_outputs([output, report], [name for name in (still, moving, layout) if name])
+    at_rest = _between(read(still, layout), interval)
+    in_motion = None if moving is None else read(moving, layout)
+    result = calibrate_array(at_rest, in_motion, averaging_time=quantity(averaging, "--averaging", "time", "s"))
+    finish(result.calibration, output, report, json=json)
+
+
+def _between(recording: Recording, interval: str | None) -> Recording:
+    """Cut a recording to an interval of its time."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    if interval is None:
+        return recording
+    ends = [quantity(part, "--interval", "time", "s") for part in interval.split(",")]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise OptionError(f"--interval {interval!r}: expected START,STOP, such as 468,496")
+    if "time" not in recording:
+        raise OptionError(f"{recording.name}: --interval needs a column time")
+    inside = np.flatnonzero((recording.si("time") >= ends[0]) & (recording.si("time") < ends[1]))
+    if not inside.size:
+        raise OptionError(f"{recording.name}: --interval {interval}: no samples there")
+    columns = {name: values[inside] for name, values in recording.columns.items()}
+    return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
+
+
+def fuse(
+    file: RecordingFile,
+    method: Annotated[
+        str, typer.Option(help="mean support least-squares feedback robust covariance kalman.")
+    ] = "robust",
+    memory: Annotated[str, typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1.")] = "growing",
+    initial_bias: Annotated[
+        str, typer.Option("--initial-bias", metavar="first|zero|RECORD", help="Biases to start from.")
+    ] = "first",
+    calibration: CalibrationFile = None,
+    rate: Annotated[str | None, typer.Option(help="Sampling rate; from the first samples if not given.")] = None,
+    interval: Annotated[
+        str | None, typer.Option("--still", metavar="START,STOP", help="The unit is known to be at rest then, s.")
+    ] = None,
+    layout: LayoutFile = None,
+    output: OutputFile = None,
+) -> None:
+    """Fuse an array into one rate; native CSV to OUT or standard output; FILE - fuses line by line as lines come."""
+    from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording, parse_memory
+    from imulab.readers import read_blocks
+    from imulab.writers import write_csv, write_csv_to
+
+    records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
+    check_outputs([output], [name for name in (file, layout, *records) if name])
+    gain, start = parse_memory(memory)
+    options = FuseOptions(
+        method=method,
+        memory=gain,
+        start=start,
+        initial_bias=initial_bias if initial_bias in ("first", "zero") else _load(initial_bias, "--initial-bias"),
+        calibration=None if calibration is None else _load(calibration, "--calibration"),
+        rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
+        still=None if interval is None else _interval(interval, "--still"),
+    )
+    fuser = Fuser(options)
+    blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout, live=file == "-")))
+    if output:
+        write_csv(blocks, output)
+    else:
+        first = next(blocks)  # fused before anything is written, so that a refusal leaves no head behind
+        write_csv_to(_flushed(first, blocks), sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+    _say(fuser, options)
+
+
+def _load(name: str, option: str) -> Calibration:
+    from pathlib import Path
+
+    from imulab.calibration import load
+
+    if option == "--initial-bias" and not Path(name).exists():
+        raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
+    return load(name)
+
+
+def _interval(text: str, option: str) -> tuple[float, float]:
+    ends = [quantity(part, option, "time", "s") for part in text.split(",")]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise OptionError(f"{option} {text!r}: expected START,STOP, such as 0,10")
+    return ends[0], ends[1]
+
+
+def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]:
+    """Pass blocks on; each is out before the next is read."""
+    yield first
+    sys.stdout.buffer.flush()
+    for block in rest:
+        yield block
+        sys.stdout.buffer.flush()
+
+
+def _say(fuser: Fuser, options: FuseOptions) -> None:
+    for line in fuser.notes():
+        warn(line)
+    if fuser.health is not None:
+        for line in fuser.health.lines():
+            warn(line)
+
+
+def compare(
+    file: Annotated[str | None, typer.Argument(metavar="FILE", help="Recording, with or without truth_rate.")] = None,
+    calibration: CalibrationFile = None,
+    experiment: Annotated[
+        str | None, typer.Option(metavar="static|dynamic", help="Run the source's set-up instead of a FILE.")
+    ] = None,
+    seeds: Annotated[str, typer.Option(help="Runs of the experiment.")] = "20",
+    layout: LayoutFile = None,
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Run every method over one recording, or over the source's experiments, and say what fusing buys."""
+    from imulab.cli import arraytext
+
+    if (file is None) == (experiment is None):
+        raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
+    check_outputs([output, report], [name for name in (file, calibration, layout) if name])
+    if experiment is not None:
+        if output or report:
+            raise OptionError("array compare: -o and --report need a FILE")
+        from imulab.gyro_array.experiments import run_experiment
+
+        count = whole_number(seeds, "--seeds")
+        with progress_bar("seeds", count) as progress:
+            rows = run_experiment(experiment, seeds=count, progress=progress)
+        print(
+            arraytext.experiment_json(experiment, count, rows)
+            if json
+            else arraytext.experiment(experiment, count, rows)
+        )
+        return
+    from imulab.gyro_array.compare import compare_methods
+    from imulab.readers import read
+
+    record = None if calibration is None else _load(calibration, "--calibration")
+    comparison = compare_methods(read(str(file), layout), calibration=record)
+    arraytext.write(comparison.record, output, report)
+    print(comparison.record.to_json().rstrip("\n") if json else arraytext.comparison(comparison))
+    for name, what in ((output, "record"), (report, "report")):
+        if name and not json:
+            print(f"{what}: {name}")
+    for message in comparison.warnings:
+        warn(message)

@@ -1,0 +1,317 @@
+"""Calibration of an array's elements: biases and noise at rest, alignment in motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imulab.calibration import Calibration, Covariance, Parameter
+from imulab.errors import DataError, OptionError, UnitError
+from imulab.gyro_array.align import Alignment, align
+from imulab.gyro_array.model import Elements, find_elements, fixed_weights
+from imulab.noise import COEFFICIENTS, AllanCurve, NoiseCoefficients, allan_deviation, read_coefficients, sampling_rate
+from imulab.recording import Array, Recording, check_finite
+from imulab.units import parse_unit, to_si
+
+_FEWEST_SAMPLES = 200
+_FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
+_MOVES = 10.0
+_OVERLAP = 8
+_CLIPPED_RUN = 3
+_SHARED = 0.5
+
+
+@dataclass(frozen=True)
+class ArrayFit:
+    """A calibration of an array, with the Allan curves behind it, axis by axis."""
+
+    calibration: Calibration
+    curves: tuple[tuple[AllanCurve, ...], ...]
+
+
+@dataclass(frozen=True)
+class _AtRest:
+    """What the recording at rest says: curves and coefficients per axis and element; rad/s."""
+
+    bias: Array
+    curves: tuple[tuple[AllanCurve, ...], ...]
+    noise: tuple[tuple[NoiseCoefficients, ...], ...]
+    white: Array
+    duration: float
+    rate: float
+
+
+def calibrate_array(
+    still: Recording, moving: Recording | None = None, *, averaging_time: float = 1.0, serial: str | None = None
+) -> ArrayFit:
+    """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
+
+    At rest: each element's bias is its plain mean, the common part included, with ``u^2 = N^2/T + (2 ln 2/pi) B^2 +
+    K^2 T/3``;
+    N, B, K come from its Allan curve; the covariance matrix at `averaging_time` from half the products of successive
+    differences of means (the Allan covariance; Vaccaro and Zaki 2017). In motion: `align`.
+
+    Parameters
+    ----------
+    still, moving
+        Recordings with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h.
+    averaging_time
+        Of the covariance matrix, s.
+
+    Raises
+    ------
+    DataError
+        Samples that are not finite, a dead element, too few samples, an array that moves while it should be at rest.
+    UnitError
+        The elements have different units, or none of rate.
+    ObservabilityError
+        The motion does not excite every axis.
+    """
+    elements = find_elements(still)
+    for unit in elements.units:
+        if parse_unit(unit).quantity != "rate":
+            raise UnitError(f"{still.name}: array calibrate needs rates, rad/s deg/s deg/h; found {unit}")
+    if elements.count < 2:
+        raise DataError(f"{still.name}: {elements.count} element on each axis; expected 2 or more")
+    if not averaging_time > 0:
+        raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
+    rest = _at_rest(still, elements)
+    warnings = list(still.notes)
+    _, notes = sampling_rate(still)
+    warnings += notes
+    aligned = None
+    if moving is not None:
+        aligned, more = _in_motion(moving, elements, rest)
+        warnings += more
+    readings = _si(still, elements) - rest.bias
+    if aligned is not None:
+        readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
+    covariance, used, count = _covariance(readings, rest.rate, averaging_time)
+    if used < averaging_time * 0.999:
+        warnings.append(
+            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} "
+            f"s: taken at "
+            f"{used:.3g} s"
+        )
+    _check_at_rest(still, readings, rest, elements)
+    record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
+    if serial is not None:
+        record = Calibration(**{**record.__dict__, "sensor": {**record.sensor, "serial": serial}})
+    return ArrayFit(record, rest.curves)
+
+
+def _si(recording: Recording, elements: Elements) -> Array:
+    readings = elements.readings(recording)
+    for axis, unit in enumerate(elements.units):
+        readings[:, axis] = to_si(readings[:, axis], unit)
+    return readings
+
+
+def _at_rest(still: Recording, elements: Elements) -> _AtRest:
+    rate, _ = sampling_rate(still)
+    if len(still) < _FEWEST_SAMPLES:
+        raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
+    names = [name for row in elements.names for name in row]
+    check_finite(still, names)
+    for name in names:
+        if np.ptp(still.columns[name]) == 0:
+            raise DataError(f"{still.name}: column {name}: all samples are {still.columns[name][0]:g}: a dead gyro")
+    readings = _si(still, elements)
+    curves = tuple(
+        tuple(allan_deviation(readings[:, a, i], rate) for i in range(elements.count))
+        for a in range(len(elements.axes))
+    )
+    noise = tuple(tuple(read_coefficients(curve) for curve in row) for row in curves)
+    white = np.array([[curve.deviation[0] for curve in row] for row in curves])
+    return _AtRest(readings.mean(axis=0), curves, noise, white, len(still) / rate, rate)
+
+
+def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Alignment, list[str]]:
+    its = find_elements(moving)
+    if its.names != elements.names:
+        raise DataError(
+            f"{moving.name}: {its.count} elements on {len(its.axes)} axes; expected {elements.count} on "
+            f"{len(elements.axes)} as at rest"
+        )
+    check_finite(moving, [name for row in its.names for name in row])
+    readings = _si(moving, its)
+    clipped = _clipped(readings)
+    notes = []
+    if clipped.any():
+        notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
+    truth = its.truth(moving)
+    if truth is not None:
+        truth = np.column_stack([to_si(truth[:, a], unit) for a, unit in enumerate(its.units)])[~clipped]
+    kept = readings[~clipped] - rest.bias
+    if len(kept) < _FEWEST_SAMPLES:
+        raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
+    return align(kept, rest.white, truth), notes
+
+
+def _clipped(readings: Array) -> np.ndarray:
+    """Rows in which a gyro stands at its largest or smallest value, if it stood there for several samples in a row."""
+    flat = readings.reshape(len(readings), -1)
+    rows = np.zeros(len(flat), dtype=bool)
+    for column in flat.T:
+        for extreme in (column.min(), column.max()):
+            at = column == extreme
+            runs = np.convolve(at, np.ones(_CLIPPED_RUN), mode="valid")
+            if (runs >= _CLIPPED_RUN).any():
+                rows |= at
+    return rows
+
+
+def _covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Array, float, int]:
+    """Allan covariance of each axis, shape (axes, n, n), the averaging time used, and the degrees of freedom."""
+    m, axes, n = readings.shape
+    size = max(1, min(round(averaging_time * rate), m // (_FEWEST_DIFFERENCES * n + 1)))
+    total = np.concatenate([np.zeros((1, axes, n)), np.cumsum(readings, axis=0)])
+    starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
+    first, middle, last = total[starts], total[starts + size], total[starts + 2 * size]
+    difference = (last - 2 * middle + first) / size
+    # Equivalent number of independent differences under white noise: NIST SP 1065, table 5.
+    freedom = max(2, round(1.5 * m / size))
+    return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, freedom
+
+
+def _check_at_rest(still: Recording, readings: Array, rest: _AtRest, elements: Elements) -> None:
+    """Refuse an array that moves while it should be at rest."""
+    size = max(1, round(rest.rate))
+    blocks = len(readings) // size
+    means = readings[: blocks * size].reshape(blocks, size, len(elements.axes), elements.count).mean(axis=1)
+    for a, axis in enumerate(elements.axes):
+        common = means[:, a].mean(axis=1)
+        apart = (means[:, a] - common[:, None]).std()
+        if blocks > 4 and common.std() > _MOVES * max(apart, 1e-300):
+            where = f" about {axis}" if axis else ""
+            raise DataError(
+                f"{still.name}: the array moves{where}: its elements go together by "
+                f"{math.degrees(common.std()):.3g} deg/s, "
+                f"{common.std() / apart:.0f} times what they differ; expected a recording at rest"
+            )
+
+
+def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
+    return {"value": value, "standard_uncertainty": uncertainty, "unit": unit}
+
+
+def _record(
+    still: Recording,
+    moving: Recording | None,
+    elements: Elements,
+    rest: _AtRest,
+    aligned: Alignment | None,
+    covariance: Array,
+    averaging_time: float,
+    differences: int,
+    warnings: list[str],
+) -> Calibration:
+    axes, n = len(elements.axes), elements.count
+    time = np.array([rest.duration])
+    spread = np.array([[math.sqrt(c.variance(time)[0]) for c in row] for row in rest.noise])
+    one = axes == 1
+
+    def scalar(values: Array) -> Any:
+        """A number for one axis, a list over x, y, z for three."""
+        return float(values[0]) if one else values.tolist()
+
+    listed = []
+    parameters: dict[str, Parameter] = {}
+    for i in range(n):
+        entry: dict[str, Any] = {
+            "name": elements.names[0][i] if one else str(i + 1),
+            "bias": _with_unit(scalar(rest.bias[:, i]), scalar(spread[:, i]), "rad/s"),
+        }
+        for a, axis in enumerate(elements.axes):
+            label = f"{axis}_{i + 1}" if axis else f"{i + 1}"
+            parameters[f"bias_{label}"] = Parameter(float(rest.bias[a, i]), float(spread[a, i]), "rad/s")
+        if aligned is not None:
+            inverse = np.linalg.inv(aligned.sensing[i])
+            carried = np.sqrt((inverse**2) @ aligned.standard_uncertainty[i] ** 2 @ (inverse**2))
+            if one:
+                value, u = float(aligned.sensing[i, 0, 0]), float(aligned.standard_uncertainty[i, 0, 0])
+                entry["scale_factor"] = _with_unit(value, u, "1")
+                parameters[f"scale_factor_{i + 1}"] = Parameter(value, u, "1")
+            else:
+                entry["matrix"] = _with_unit(inverse.tolist(), carried.tolist(), "1")
+            entry["residual"] = {"value": scalar(aligned.residual[i]), "unit": "rad/s"}
+        for name, unit in zip(COEFFICIENTS, ("rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)"), strict=True):
+            found = [getattr(rest.noise[a][i], name) for a in range(axes)]
+            entry[name] = _with_unit(
+                scalar(np.array([c.value for c in found])),
+                scalar(np.array([c.standard_uncertainty for c in found])),
+                unit,
+            )
+        listed.append(entry)
+    fixed = [fixed_weights(matrix) for matrix in covariance]
+    sigma = np.sqrt(np.einsum("aii->ai", covariance))
+    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
+    uncertainty = (1 - correlation**2) / math.sqrt(differences)
+    shared = _shared(correlation)
+    if shared > _SHARED:
+        warnings = [
+            *warnings,
+            f"the elements' noise is shared (mean correlation {shared:.2f}): was the array at rest? Fusion "
+            f"cannot remove it",
+        ]
+    sources = tuple(r.source for r in (still, moving) if r is not None and r.source is not None)
+    return Calibration(
+        procedure="gyro_array",
+        parameters=parameters,
+        covariance=Covariance((), ()),
+        model={
+            "kind": "calibration",
+            "elements": n,
+            "axes": list(elements.axes),
+            "aligned": aligned is not None,
+            "gauge": aligned.gauge if aligned is not None else None,
+            "unit": elements.units[0],
+            **_temperature(still),
+        },
+        fit={
+            "duration": {"value": rest.duration, "unit": "s"},
+            "sample_rate": {"value": rest.rate, "unit": "Hz"},
+            "samples": len(still),
+            "samples_in_motion": 0 if moving is None else len(moving),
+        },
+        options={"averaging_time": averaging_time},
+        data={
+            "allan": [
+                [
+                    {"tau": c.tau.tolist(), "deviation": c.deviation.tolist(), "u": c.standard_uncertainty.tolist()}
+                    for c in row
+                ]
+                for row in rest.curves
+            ]
+        },
+        sensor={key: still.metadata[key] for key in ("serial", "model") if key in still.metadata},
+        sources=sources,
+        warnings=tuple(warnings),
+        sections={
+            "elements": listed,
+            "correlation": {
+                "averaging_time": {"value": averaging_time, "unit": "s"},
+                "axes": list(elements.axes),
+                "matrix": correlation.tolist(),
+                "standard_uncertainty": uncertainty.tolist(),
+                "covariance": covariance.tolist(),
+                "unit": "(rad/s)^2",
+                "weights": [weights.tolist() for weights, _ in fixed],
+                "limit": [{"value": limit, "unit": "rad/s"} for _, limit in fixed],
+            },
+        },
+    )
+
+
+def _shared(correlation: Array) -> float:
+    n = correlation.shape[1]
+    off = ~np.eye(n, dtype=bool)
+    return float(np.mean(correlation[:, off]))
+
+
+def _temperature(still: Recording) -> dict[str, Any]:
+    temperature = still.mean_temperature()
+    return {} if temperature is None else {"temperature": {"value": temperature, "unit": "degC"}}

@@ -1,0 +1,205 @@
+"""What a gyro array is: which columns of a recording are its elements, and what a record says of them.
+
+One axis: columns ``gyro_1 .. gyro_n``. Three axes: ``gyro_x_1 .. gyro_z_n``. ``z_i = A_i w + b_i``: reading z of
+element i,
+body rate w, bias b; the record holds ``M_i = A_i^-1`` so that ``w = M_i (z_i - b_i)``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imulab.calibration import Calibration
+from imulab.errors import DataError, RecordError, UnitError
+from imulab.recording import Array, Recording
+from imulab.units import conversion_factor, from_si, parse_unit
+
+METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")
+FEWEST_ROBUST = 3
+MOST_ELEMENTS = 64
+_ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9]\d*)")
+
+
+@dataclass(frozen=True)
+class Elements:
+    """The elements of an array in a recording.
+
+    Attributes
+    ----------
+    names
+        Column names, axis by axis, each of n elements.
+    units
+        Unit of each axis.
+    axes
+        ``("",)`` for one axis, ``("x", "y", "z")`` for three.
+    """
+
+    names: tuple[tuple[str, ...], ...]
+    units: tuple[str, ...]
+    axes: tuple[str, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of elements on each axis."""
+        return len(self.names[0])
+
+    def rate_names(self) -> list[str]:
+        """Return the names of the fused columns: ``rate``, or ``rate_x rate_y rate_z``."""
+        return [f"rate_{axis}" if axis else "rate" for axis in self.axes]
+
+    def readings(self, recording: Recording) -> Array:
+        """Return the readings as logged, shape (m, axes, n), C-contiguous."""
+        out = np.empty((len(recording), len(self.axes), self.count))
+        for a, row in enumerate(self.names):
+            for i, name in enumerate(row):
+                out[:, a, i] = recording.columns[name]
+        return out
+
+    def truth(self, recording: Recording) -> Array | None:
+        """Return the columns ``truth_rate`` (or ``truth_rate_x`` ..) in the unit of the readings, shape (m, axes).
+
+        Raises
+        ------
+        UnitError
+            The truth has a unit that cannot be converted to the readings'.
+        """
+        names = [f"truth_{name}" for name in self.rate_names()]
+        if not all(name in recording for name in names):
+            return None
+        columns = []
+        for name, unit in zip(names, self.units, strict=True):
+            try:
+                factor = conversion_factor(recording.units[name], unit)
+            except UnitError as error:
+                raise UnitError(f"{recording.name}: column {name}: {error}") from None
+            columns.append(recording.columns[name] * factor)
+        return np.column_stack(columns)
+
+
+def find_elements(recording: Recording) -> Elements:
+    """Find the elements of a recording by their column names.
+
+    Raises
+    ------
+    DataError
+        There are none, numbers are missing, or the axes have different numbers of elements.
+    UnitError
+        The elements of an axis have different units.
+    """
+    found: dict[str, dict[int, str]] = {}
+    for name in recording.columns:
+        match = _ELEMENT.fullmatch(name)
+        if match:
+            found.setdefault(match[1] or "", {})[int(match[2])] = name
+    if not found:
+        raise DataError(
+            f"{recording.name}: no columns gyro_1 gyro_2 .. (one axis) or gyro_x_1 .. gyro_z_n (three); "
+            f"found {' '.join(recording.columns)}"
+        )
+    if "" in found and len(found) > 1:
+        raise DataError(f"{recording.name}: both {found[''][min(found[''])]} and columns by axis; expected one form")
+    axes = ("",) if "" in found else ("x", "y", "z")
+    stem = {axis: f"gyro_{axis}_" if axis else "gyro_" for axis in axes}
+    count = max(max(numbers) for numbers in found.values())
+    if count > MOST_ELEMENTS:
+        raise DataError(f"{recording.name}: {count} elements; expected {MOST_ELEMENTS} at most")
+    for axis in axes:
+        for number in range(1, count + 1):
+            if number not in found.get(axis, {}):
+                raise DataError(
+                    f"{recording.name}: no column {stem[axis]}{number}; expected {count} elements on each axis, "
+                    "numbered from 1"
+                )
+    names = tuple(tuple(found[axis][i] for i in range(1, count + 1)) for axis in axes)
+    units = []
+    for row in names:
+        of_column = {name: parse_unit(recording.units[name]).symbol for name in row}
+        if len(set(of_column.values())) > 1:
+            listed = ", ".join(f"{name} [{unit}]" for name, unit in of_column.items())
+            raise UnitError(f"{recording.name}: the elements of an axis must share one unit, found {listed}")
+        units.append(of_column[row[0]])
+    return Elements(names, tuple(units), axes)
+
+
+@dataclass(frozen=True)
+class ArrayCalibration:
+    """What a record says of an array, in the unit of the readings.
+
+    Attributes
+    ----------
+    bias
+        Plain means at rest, the common part included, shape (axes, n).
+    matrices
+        Shape (n, axes, axes), or None where no moving recording was calibrated from.
+    weights
+        Fixed weights ``C^-1 1 / (1' C^-1 1)``, shape (axes, n).
+    white, walk
+        Angle random walk, unit s^1/2, and rate random walk, unit s^-1/2, shape (axes, n).
+    """
+
+    bias: Array
+    matrices: Array | None
+    weights: Array
+    white: Array
+    walk: Array
+
+
+def array_calibration(record: Calibration, elements: Elements) -> ArrayCalibration:
+    """Return what a record says of these elements.
+
+    Raises
+    ------
+    RecordError
+        The record is of another procedure, or of another number of elements or axes.
+    UnitError
+        The readings are not rates.
+    """
+    if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
+        what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
+        raise RecordError(f"expected the record of an array calibration, found one of a {what}")
+    listed = record.sections.get("elements", [])
+    if len(listed) != elements.count or len(record.model["axes"]) != len(elements.axes):
+        raise RecordError(
+            f"the record holds {len(listed)} elements on {len(record.model['axes'])} axes, "
+            f"the recording {elements.count} on {len(elements.axes)}"
+        )
+    for name, unit in zip(elements.rate_names(), elements.units, strict=True):
+        if parse_unit(unit).quantity != "rate":
+            raise UnitError(f"{name}: the record's biases are in rad/s, the readings in {unit}")
+
+    def of(key: str) -> Array:
+        values = np.array([np.atleast_1d(element[key]["value"]) for element in listed]).T
+        return np.array([from_si(row, unit) for row, unit in zip(values, elements.units, strict=True)])
+
+    matrices = None
+    if record.model["aligned"]:
+        matrices = np.array([_matrix(element) for element in listed])
+        size = np.array([conversion_factor("rad/s", unit) for unit in elements.units])
+        matrices *= size[:, None] / size[None, :]
+    return ArrayCalibration(
+        bias=of("bias"),
+        matrices=matrices,
+        weights=np.array(record.sections["correlation"]["weights"]),
+        white=of("angle_random_walk"),
+        walk=of("rate_random_walk"),
+    )
+
+
+def _matrix(element: dict[str, Any]) -> Array:
+    if "matrix" in element:
+        return np.array(element["matrix"]["value"], dtype=np.float64)
+    return np.array([[1 / element["scale_factor"]["value"]]])
+
+
+def fixed_weights(covariance: Array) -> tuple[Array, float]:
+    """Return the weights ``C^-1 1 / (1' C^-1 1)`` and the limit ``(1' C^-1 1)^-1/2`` of a covariance, shape (n, n).
+
+    Source: Vaccaro and Zaki, Sensors 17 (2017).
+    """
+    ones = np.ones(len(covariance))
+    raw = np.linalg.solve(covariance, ones)
+    return raw / raw.sum(), float(raw.sum() ** -0.5)

@@ -1,0 +1,214 @@
+"""A simulated gyro array: the two experiments of the source, and a motion to calibrate elements by.
+
+Source of both set-ups: patent CN109443333B (6 gyros; 100 Hz, 2000 s at rest; 50 Hz, 100 s on a rate table).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import OptionError
+from imulab.recording import Array, Recording
+from imulab.units import conversion_factor, parse_unit
+
+EXPERIMENTS: Mapping[str, tuple[float, float]] = {
+    "static": (100.0, 2000.0),
+    "dynamic": (50.0, 100.0),
+    "moving": (100.0, 120.0),
+}
+"""Sampling rate, Hz, and duration, s, of each."""
+FAULTS = ("dead", "stuck", "spikes", "jump", "nan", "saturation")
+_DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Noise of one gyro, rad/s: white noise per sample, Gauss-Markov, rate random walk, turn-on bias.
+
+    Each gyro's white noise is `white` times a factor drawn evenly from `spread`.
+    """
+
+    white: float = 0.05 * _DEG
+    spread: tuple[float, float] = (0.6, 1.6)
+    gauss_markov: float = 0.003 * _DEG
+    correlation_time: float = 200.0
+    walk: float = 2e-4 * _DEG
+    turn_on: float = 0.02 * _DEG
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of gyro number `gyro` (from 1) on every axis: kind, begin, s, duration, s, and size, rad/s."""
+
+    kind: str
+    gyro: int
+    start: float = 0.0
+    duration: float = math.inf
+    size: float = 2.0 * _DEG
+
+
+def simulate_array(
+    *,
+    experiment: str = "dynamic",
+    elements: int = 6,
+    axes: int = 1,
+    sample_rate: float | None = None,
+    duration: float | None = None,
+    noise: NoiseModel | None = None,
+    scale_spread: float = 0.0,
+    misalignment: float = 0.0,
+    mounting: str = "same",
+    faults: tuple[Fault, ...] = (),
+    unit: str = "deg/s",
+    session: int = 0,
+    seed: int = 1,
+) -> Recording:
+    """Simulate an array's recording with columns time, gyro_1 .. (or gyro_x_1 ..) and truth_rate (or truth_rate_x ..).
+
+    ``z_i = A_i w + turn-on + Gauss-Markov + rate random walk + white``; w is 0 (`static`),
+    -12.5 cos(0.2 pi t - 0.2 pi) deg/s on every axis (`dynamic`), or turns by hand about all axes (`moving`).
+
+    Parameters
+    ----------
+    elements, axes
+        Gyros on each axis; 1 or 3 axes.
+    sample_rate, duration
+        Hz and s; by default those of the experiment.
+    scale_spread, misalignment
+        Standard deviations of the scale factors, and of the axes' misalignments, rad.
+    mounting
+        ``same``, or ``alternate``: even elements measure (-y, -x, -z), or -x on a single axis.
+    faults
+        Faults to put in.
+    session, seed
+        Of the random numbers. Biases and scale factors depend on `seed` alone: another experiment or session with one
+        seed is another recording of one array.
+
+    Raises
+    ------
+    OptionError
+        A value is out of range.
+    """
+    noise = noise or NoiseModel()
+    if experiment not in EXPERIMENTS:
+        raise OptionError(f"experiment {experiment!r}: expected one of {' '.join(EXPERIMENTS)}")
+    rate = sample_rate if sample_rate is not None else EXPERIMENTS[experiment][0]
+    length = duration if duration is not None else EXPERIMENTS[experiment][1]
+    _check(elements, axes, rate, length, mounting, unit, seed, faults)
+    count = round(length * rate)
+    time = np.arange(count) / rate
+    unit_rng = np.random.default_rng([seed, 1])
+    white = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
+    turn_on = noise.turn_on * unit_rng.standard_normal((axes, elements))
+    sensing = _sensing(elements, axes, scale_spread, misalignment, mounting, unit_rng)
+    rng = np.random.default_rng([seed, 2 + list(EXPERIMENTS).index(experiment), session])
+    truth = _motion(experiment, time, axes, rng)
+    readings = np.einsum("iab,tb->tai", sensing, truth)
+    readings += turn_on
+    readings += white * rng.standard_normal(readings.shape)
+    readings += noise.walk / math.sqrt(rate) * np.cumsum(rng.standard_normal(readings.shape), axis=0)
+    readings += _gauss_markov(readings.shape, noise, rate, rng)
+    for fault in faults:
+        _break(readings, fault, rate, rng)
+    factor = conversion_factor("rad/s", unit)
+    letters = ("",) if axes == 1 else ("x_", "y_", "z_")
+    columns: dict[str, Array] = {"time": time}
+    metadata = {"serial": f"ARRAY-{seed:04d}", "model": f"simulated array of {elements}", "experiment": experiment}
+    for a, letter in enumerate(letters):
+        for i in range(elements):
+            columns[f"gyro_{letter}{i + 1}"] = readings[:, a, i] * factor
+            metadata[f"truth_bias_{letter}{i + 1}"] = f"{float(turn_on[a, i])!r} rad/s"
+    for a, letter in enumerate(letters):
+        columns[f"truth_rate_{letter}".rstrip("_")] = truth[:, a] * factor
+    units = {name: "s" if name == "time" else unit for name in columns}
+    return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated {experiment} array")
+
+
+def _check(
+    elements: int, axes: int, rate: float, length: float, mounting: str, unit: str, seed: int, faults: tuple[Fault, ...]
+) -> None:
+    for name, value, low, high in (
+        ("elements", elements, 1, 64),
+        ("sample rate", rate, 1.0, 1e5),
+        ("duration", length, 0.1, 1e6),
+        ("seed", seed, 0, 2**63 - 1),
+    ):
+        if not low <= value <= high:
+            raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
+    if axes not in (1, 3):
+        raise OptionError(f"axes {axes}: expected 1 or 3")
+    if mounting not in ("same", "alternate"):
+        raise OptionError(f"mounting {mounting!r}: expected same or alternate")
+    if parse_unit(unit).quantity != "rate":
+        raise OptionError(f"unit {unit}: expected rad/s deg/s deg/h")
+    for fault in faults:
+        if fault.kind not in FAULTS:
+            raise OptionError(f"fault {fault.kind!r}: expected one of {' '.join(FAULTS)}")
+        if not 1 <= fault.gyro <= elements:
+            raise OptionError(f"fault of gyro {fault.gyro}: expected 1 to {elements}")
+
+
+def _sensing(
+    elements: int, axes: int, scale_spread: float, misalignment: float, mounting: str, rng: np.random.Generator
+) -> Array:
+    """What each element senses of the body rate, A_i, shape (n, axes, axes)."""
+    sensing = np.tile(np.eye(axes), (elements, 1, 1))
+    scale = scale_spread * rng.standard_normal((elements, axes))
+    tilt = misalignment * rng.standard_normal((elements, axes, axes))
+    for i in range(elements):
+        if axes == 3:
+            sensing[i] += tilt[i] * (1 - np.eye(3))
+        sensing[i] *= (1 + scale[i])[:, None]
+        if mounting == "alternate" and i % 2:
+            turned = np.array([[-1.0]]) if axes == 1 else np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+            sensing[i] = sensing[i] @ turned
+    return sensing
+
+
+def _motion(experiment: str, time: Array, axes: int, rng: np.random.Generator) -> Array:
+    """Body rate, rad/s, shape (m, axes)."""
+    if experiment == "static":
+        return np.zeros((len(time), axes))
+    if experiment == "dynamic":
+        table = -12.5 * _DEG * np.cos(0.2 * np.pi * time - 0.2 * np.pi)
+        return np.repeat(table[:, None], axes, axis=1)
+    motion = np.zeros((len(time), axes))
+    for frequency in (0.11, 0.23, 0.47, 0.81):
+        phase = rng.uniform(0, 2 * np.pi, axes)
+        motion += 30 * _DEG * np.sin(2 * np.pi * frequency * (1 + 0.1 * np.arange(axes)) * time[:, None] + phase)
+    return motion
+
+
+def _gauss_markov(shape: tuple[int, ...], noise: NoiseModel, rate: float, rng: np.random.Generator) -> Array:
+    """First-order Gauss-Markov process, started in its steady state."""
+    from scipy.signal import lfilter
+
+    decay = math.exp(-1 / (rate * noise.correlation_time))
+    driving = math.sqrt(1 - decay**2) * rng.standard_normal(shape)
+    driving[0] = rng.standard_normal(shape[1:])
+    filtered: Array = noise.gauss_markov * lfilter([1.0], [1.0, -decay], driving, axis=0)
+    return filtered
+
+
+def _break(readings: Array, fault: Fault, rate: float, rng: np.random.Generator) -> None:
+    start = round(fault.start * rate)
+    stop = len(readings) if math.isinf(fault.duration) else round((fault.start + fault.duration) * rate)
+    piece = readings[start:stop, :, fault.gyro - 1]
+    if not len(piece):
+        raise OptionError(f"fault {fault.kind} at {fault.start:g} s: expected a time within the recording")
+    if fault.kind == "dead":
+        piece[:] = 0.0
+    elif fault.kind == "stuck":
+        piece[:] = piece[0]
+    elif fault.kind == "spikes":
+        piece[rng.random(len(piece)) < 0.01] += fault.size
+    elif fault.kind == "jump":
+        piece += fault.size
+    elif fault.kind == "nan":
+        piece[:] = np.nan
+    else:
+        np.clip(piece, -fault.size, fault.size, out=piece)

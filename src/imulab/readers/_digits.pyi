@@ -1,0 +1,6 @@
+from typing import Any
+
+from numpy.typing import NDArray
+
+def rows(values: NDArray[Any], columns: int, out: bytearray) -> int: ...
+def prepare(tens: bytes) -> bool: ...

@@ -1,0 +1,124 @@
+"""MIMU4444: the log of an array of eight six-axis IMUs on one board.
+
+Frames of 106 bytes, big-endian: AA, u16 sequence, 64 (hexadecimal, the length of what follows but the sum), u32 time
+stamp of a 64 MHz clock, eight times three accelerometers and three gyroscopes i16, u16 sum of the bytes before it.
+A short acknowledgement may stand before the first frame. Source: the recordings of Self-Calibration-Inertial-Sensor-
+Arrays-BCD; GT Silicon, MIMU4444 interface description.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import ReadError
+from imulab.readers.selection import Selection
+from imulab.recording import Array, Recording, Source
+from imulab.units import STANDARD_GRAVITY
+
+_FRAME = np.dtype(
+    [("head", "u1"), ("sequence", ">u2"), ("size", "u1"), ("stamp", ">u4"), ("data", ">i2", (8, 6)), ("sum", ">u2")]
+)
+_HEAD, _SIZE = 0xAA, 0x64
+_SEARCH = 4096
+_CLOCK = 64e6  # Hz
+_ACCEL_STEP = STANDARD_GRAVITY / 2048  # m/s^2
+_GYRO_STEP = 1 / 16.4  # deg/s
+
+
+def is_mimu(start: bytes) -> bool:
+    """Return whether the first bytes of a file (two frames of them at least) hold a MIMU4444 frame with its sum."""
+    return _first_frame(start) is not None
+
+
+def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
+    """Yield the whole log, ten minutes of which are 25 MB."""
+    selection.refuse(name, "such a log")
+    with path.open("rb") as stream:
+        yield read_mimu(stream, name)
+
+
+def read_mimu(stream: BinaryIO, name: str) -> Recording:
+    """Read a MIMU4444 log: ``time [s]`` from 0 and unwrapped, ``gyro_x_1 .. gyro_z_8 [deg/s]``, ``accel_..`` [m/s^2].
+
+    Axes are as logged. Damaged bytes between frames are skipped, and a note says where.
+
+    Raises
+    ------
+    ReadError
+        No frame was found.
+    """
+    data = stream.read()
+    frames, skipped = _frames(data)
+    if not len(frames):
+        raise ReadError(f"{name}: no whole MIMU4444 frame of {_FRAME.itemsize} bytes was found")
+    stamp: NDArray[np.int64] = frames["stamp"].astype(np.int64)
+    sequence: NDArray[np.int64] = frames["sequence"].astype(np.int64)
+    ticks = np.mod(np.diff(stamp, prepend=stamp[0]), 1 << 32)
+    lost = np.mod(np.diff(sequence) - 1, 1 << 16)
+    columns: dict[str, Array] = {"time": np.cumsum(ticks) / _CLOCK}
+    units = {"time": "s"}
+    for sensor, first, step, unit in (("gyro", 3, _GYRO_STEP, "deg/s"), ("accel", 0, _ACCEL_STEP, "m/s^2")):
+        for axis, letter in enumerate("xyz"):
+            for element in range(8):
+                title = f"{sensor}_{letter}_{element + 1}"
+                columns[title] = step * frames["data"][:, element, first + axis].astype(np.float64)
+                units[title] = unit
+    notes = []
+    if skipped:
+        notes.append(f"{skipped} bytes between frames were skipped as damaged")
+    if lost.any():
+        index = int(np.flatnonzero(lost)[0])
+        notes.append(f"{int(lost.sum())} frames are missing from the log, the first after row {index + 1}")
+    return Recording(
+        columns=columns,
+        units=units,
+        metadata={"model": "MIMU4444"},
+        name=name,
+        source=Source(name, hashlib.sha256(data).hexdigest()),
+        notes=tuple(notes),
+    )
+
+
+def _first_frame(data: bytes) -> int | None:
+    """Return where the first frame with a right sum begins, or None."""
+    place = data.find(_HEAD)
+    while 0 <= place <= min(len(data) - _FRAME.itemsize, _SEARCH):
+        if data[place + 3] == _SIZE and _good(data[place : place + _FRAME.itemsize]).all():
+            return place
+        place = data.find(_HEAD, place + 1)
+    return None
+
+
+def _good(data: bytes) -> np.ndarray:
+    """Return for each frame whether head, size and sum are right."""
+    raw = np.frombuffer(data, dtype=np.uint8).reshape(-1, _FRAME.itemsize)
+    frames = raw.view(_FRAME)[:, 0]
+    total = raw[:, :-2].sum(axis=1, dtype=np.uint32) % (1 << 16)
+    good: np.ndarray = (frames["head"] == _HEAD) & (frames["size"] == _SIZE) & (total == frames["sum"])
+    return good
+
+
+def _frames(data: bytes) -> tuple[np.ndarray, int]:
+    """Return the good frames and the number of bytes skipped after the first of them."""
+    found, skipped, size = [], 0, _FRAME.itemsize
+    place = _first_frame(data)
+    while place is not None:
+        count = (len(data) - place) // size
+        run = data[place : place + count * size]
+        good = _good(run) if count else np.empty(0, dtype=bool)
+        length = count if good.all() else int(np.argmin(good))
+        found.append(np.frombuffer(run[: length * size], dtype=_FRAME))
+        place += length * size
+        step = _first_frame(data[place : place + _SEARCH + size])
+        if step is None:
+            skipped += min(len(data) - place, size) if len(data) - place >= size else 0
+            break
+        skipped += step
+        place += step
+    return (np.concatenate(found) if found else np.empty(0, dtype=_FRAME)), skipped

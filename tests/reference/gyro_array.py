@@ -1,0 +1,373 @@
+"""The gyro array's recursions, transcribed from the methods document in plain Python, one axis, one sample at a time.
+
+Nothing here imports imulab. Every method is a class with ``step(readings) -> rate``; ``weights`` and ``flags`` hold
+what was used in the last sample.
+"""
+
+import math
+
+NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET = 1, 2, 4, 8, 16, 32
+NAN = float("nan")
+
+
+def mean_of(values):
+    return sum(values) / len(values)
+
+
+def median_of(values):
+    ordered = sorted(values)
+    half = len(ordered) // 2
+    return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
+
+
+class Mean:
+    """The arithmetic mean of the finite readings."""
+
+    def __init__(self, elements):
+        self.n = elements
+
+    def step(self, z):
+        good = [i for i in range(self.n) if math.isfinite(z[i])]
+        self.weights = [1 / len(good) if i in good else 0.0 for i in range(self.n)]
+        return mean_of([z[i] for i in good]) if good else NAN
+
+
+class Feedback:
+    """The source's recursion; `memory` is None (growing) or a gain; samples count from `start`."""
+
+    def __init__(self, elements, initial_bias="first", memory=None, start=1):
+        self.n, self.initial, self.memory = elements, initial_bias, memory
+        self.k = start
+
+    def step(self, z):
+        n = self.n
+        if not hasattr(self, "b"):
+            zbar = mean_of(z)
+            if self.initial == "first":
+                self.b = [x - zbar for x in z]
+            elif self.initial == "zero":
+                self.b = [0.0] * n
+            else:
+                self.b = list(self.initial)
+            self.D = [0.0] * n
+            self.rate = mean_of([z[i] - self.b[i] for i in range(n)])
+            self.weights = [1 / n] * n
+            return self.rate
+        self.k += 1
+        g = 1 / self.k if self.memory is None else self.memory
+        inverse = []
+        y = []
+        for i in range(n):
+            self.b[i] = (1 - g) * self.b[i] + g * (z[i] - self.rate)
+            y.append(z[i] - self.b[i])
+            self.D[i] = (1 - g) * self.D[i] + g * (y[i] - self.rate) ** 2
+            inverse.append(1 / max(self.D[i], 1e-300))
+        total = sum(inverse)
+        self.weights = [x / total for x in inverse]
+        self.rate = sum(self.weights[i] * y[i] for i in range(n))
+        return self.rate
+
+
+class LeastSquares:
+    """Inverse-variance weights; the variance of each gyro about the array mean, its own mean removed."""
+
+    def __init__(self, elements, memory=None):
+        self.n, self.memory, self.k = elements, memory, 0
+        self.mean, self.var = [0.0] * elements, [0.0] * elements
+
+    def step(self, z):
+        self.k += 1
+        g = 1 / self.k if self.memory is None else (1.0 if self.k == 1 else self.memory)
+        zbar = mean_of(z)
+        for i in range(self.n):
+            e = z[i] - zbar - self.mean[i]
+            self.mean[i] += g * e
+            self.var[i] = (1 - g) * (self.var[i] + g * e * e)
+        inverse = [1.0] * self.n if self.k < 3 else [1 / max(v, 1e-300) for v in self.var]
+        total = sum(inverse)
+        self.weights = [x / total for x in inverse]
+        return sum(self.weights[i] * z[i] for i in range(self.n))
+
+
+class Support:
+    """Weights from the support of each pair, kernel of the distance over the rms distance so far."""
+
+    def __init__(self, elements, memory=None, kernel="gaussian"):
+        self.n, self.memory, self.kernel, self.k, self.h2 = elements, memory, kernel, 0, 0.0
+
+    def step(self, z):
+        n = self.n
+        self.k += 1
+        pairs = [(z[i] - z[j]) ** 2 for i in range(n) for j in range(i)]
+        g = 1 / self.k if self.memory is None else (1.0 if self.k == 1 else self.memory)
+        self.h2 = (1 - g) * self.h2 + g * mean_of(pairs)
+        support = []
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                if j != i:
+                    d2 = (z[i] - z[j]) ** 2 / self.h2 if self.h2 > 0 else 0.0
+                    total += math.exp(-d2 / 2) if self.kernel == "gaussian" else math.exp(-math.sqrt(d2))
+            support.append(total)
+        self.weights = [x / sum(support) for x in support]
+        return sum(self.weights[i] * z[i] for i in range(n))
+
+
+class Robust:
+    """Grubbs weights, gate, stuck counter, jumps and re-admission; `rate` in Hz turns times into samples.
+
+    `reliability` are start weights from a calibration, or None.
+    """
+
+    def __init__(
+        self,
+        elements,
+        rate=50.0,
+        memory=None,
+        gate=6.0,
+        spread_gate=4.0,
+        weight_cap=0.5,
+        floor=0.05,
+        cap_time=100.0,
+        stuck_time=0.5,
+        jump_time=0.5,
+        quiet_time=1.0,
+        motion=0.01,
+        reliability=None,
+    ):
+        n = self.n = elements
+        self.memory, self.gate, self.spread_gate = memory, gate, spread_gate
+        self.weight_cap, self.floor, self.motion = weight_cap, floor, motion
+        self.cap = max(100, round(cap_time * rate))
+        self.stuck_after = max(20, round(stuck_time * rate))
+        self.jump_after = max(10, round(jump_time * rate))
+        self.quiet_after = max(5, round(quiet_time * rate))
+        self.prior = 16.0 if reliability is None else 200.0
+        inverse = [1.0] * n if reliability is None else [1 / x for x in reliability]
+        self.ratio = [x / mean_of(inverse) for x in inverse]
+        self.b = [0.0] * n  # bias against the array's consensus
+        self.v = [0.0] * n  # running Grubbs variance
+        self.count = [0] * n  # samples learnt from
+        self.last = [NAN] * n  # last finite reading
+        self.repeats = [0] * n  # identical readings in a row, less one
+        self.compared = [0] * n  # pairs of successive readings seen
+        self.changed = [0] * n  # of these, pairs that differ
+        self.resolution = math.inf  # the smallest change ever seen
+        self.stuck = [False] * n
+        self.out = [False] * n  # not in use until it was quiet long enough
+        self.fresh = [False] * n  # out, and its bias is being estimated anew
+        self.jumped = [False] * n  # fresh because of a jump
+        self.bad = [0] * n  # samples in a row that were not usable or gated
+        self.calm = [0] * n  # good samples in a row while out
+        self.away = [0] * n  # gated samples in a row, with their mean and sum of squares
+        self.away_mean = [0.0] * n
+        self.away_square = [0.0] * n
+        self.fast = [0.0] * n  # mean residual of the last second or so
+
+    def step(self, z):
+        n = self.n
+        flags = [0] * n
+        # 1. non-finite, repeats, stuck
+        usable = [math.isfinite(x) for x in z]
+        for i in range(n):
+            if not usable[i]:
+                flags[i] |= NON_FINITE
+                continue
+            if math.isfinite(self.last[i]):
+                self.compared[i] += 1
+                if z[i] == self.last[i]:
+                    self.repeats[i] += 1
+                else:
+                    self.repeats[i] = 0
+                    self.changed[i] += 1
+                    self.resolution = min(self.resolution, abs(z[i] - self.last[i]))
+            self.last[i] = z[i]
+        alive = [j for j in range(n) if usable[j] and self.repeats[j] < self.stuck_after]
+        usual = median_of([self.changed[j] / max(self.compared[j], 1) for j in alive]) if alive else 0.0
+        for i in range(n):
+            if not usable[i]:
+                continue
+            share = self.changed[i] / self.compared[i] if self.changed[i] else usual
+            stuck = bool(alive) and self.repeats[i] >= self.stuck_after and self.repeats[i] * share >= 20
+            if stuck:
+                flags[i] |= STUCK
+                usable[i] = False
+                if not self.stuck[i] and 2 * self.repeats[i] >= self.count[i]:
+                    self._forget(i)
+            self.stuck[i] = stuck
+        # 2. who is there: gyros in use so far; newcomers and all others wait
+        learnt = max(self.count)
+        for i in range(n):
+            if usable[i] and self.count[i] == 0 and learnt > 2 and not self.fresh[i]:
+                self.out[i] = self.fresh[i] = True
+                self.calm[i] = 0
+        core = [i for i in range(n) if usable[i] and not self.out[i]]
+        waived = not core
+        if waived:
+            core = [i for i in range(n) if usable[i]]
+        # 3. the gates about the median
+        r = [z[i] - self.b[i] for i in range(n)]
+        middle = median_of([r[i] for i in core]) if core else NAN
+        spread = 1.4826 * median_of([abs(r[i] - middle) for i in core]) if core else 0.0
+        vbar = self._vbar()
+        inside = [False] * n
+        learn = [False] * n
+        half = [0.0] * n
+        for i in range(n):
+            if not usable[i]:
+                continue
+            if len(core) < 3:
+                inside[i] = learn[i] = True
+                continue
+            if learnt < 2:
+                narrow = (30.0 if len(core) > 3 else 100.0) * spread
+            else:
+                sigma = math.sqrt(self._variance(i, vbar) + 2 * vbar / len(core))
+                narrow = self.gate * (1 + 16 / max(self.count[i], 1)) * sigma
+            if self.resolution < math.inf:
+                narrow = max(narrow, 1.5 * self.resolution)
+            narrow = max(narrow, 1e-12 * max(abs(z[i]), abs(middle)))
+            half[i] = max(narrow, self.spread_gate * spread)
+            distance = abs(r[i] - middle)
+            learn[i] = distance <= narrow
+            inside[i] = distance <= half[i] or self.fresh[i]
+        # 4. what that does to each gyro
+        for i in range(n):
+            if not usable[i]:
+                self.bad[i] += 1
+                self.calm[i] = self.away[i] = 0
+                self.fast[i] = 0.0
+                if self.stuck[i] or self.bad[i] >= max(self.quiet_after // 5, 1):
+                    self.out[i] = True
+                if self.stuck[i]:
+                    self.jumped[i] = False
+            elif not inside[i]:
+                flags[i] |= GATED
+                self.bad[i] += 1
+                self.calm[i] = 0
+                if self.bad[i] >= max(self.quiet_after // 5, 1):
+                    self.out[i] = True
+                self._follow_away(i, r[i] - middle, middle, half[i])
+            else:
+                self.bad[i] = self.away[i] = 0
+                if self.out[i]:
+                    self.calm[i] += 1
+                    if self.calm[i] > self.quiet_after:
+                        if self.fresh[i]:
+                            self.v[i] = self.v[i] if self.count[i] else vbar
+                            self.count[i] = max(self.count[i], self.quiet_after)
+                        self.out[i] = self.fresh[i] = self.jumped[i] = False
+                        self.fast[i] = 0.0
+        # 5. the output
+        used = [i for i in core if inside[i] and usable[i] and (waived or not self.out[i])]
+        used += [i for i in range(n) if usable[i] and not waived and not self.out[i] and i not in core and inside[i]]
+        used.sort()
+        if not used and core:
+            used = [min(core, key=lambda i: abs(r[i] - middle))]
+        w = self._weigh(used, vbar)
+        rate = sum(w[i] * r[i] for i in used) if used else NAN
+        # 6. learning
+        for i in range(n):
+            if i not in used:
+                flags[i] |= EXCLUDED
+            if usable[i] and self.out[i]:
+                flags[i] |= QUIET
+                if self.fresh[i] and used and i not in used and self.calm[i]:
+                    self.b[i] += (r[i] - rate) / self.calm[i]
+            if self.jumped[i]:
+                flags[i] |= JUMPED
+        pupils = [i for i in used if learn[i]]
+        if len(pupils) >= 2:
+            self._learn(pupils, r, middle, vbar)
+        self.weights, self.flags = w, flags
+        return rate
+
+    def _learn(self, pupils, r, middle, vbar):
+        m = len(pupils)
+        centre = mean_of([r[i] for i in pupils])
+        e = {i: r[i] - centre for i in pupils}
+        squares = sum(x * x for x in e.values())
+        gain = {}
+        for i in pupils:
+            self.count[i] += 1
+            gain[i] = 1 / min(self.count[i], self.cap) if self.memory is None else max(self.memory, 1 / self.count[i])
+        shift = mean_of([gain[i] * e[i] for i in pupils])
+        for i in pupils:
+            g = gain[i]
+            self.b[i] += g * e[i] - shift
+            if m < 3:
+                continue
+            grubbs = m / (m - 2) * (e[i] ** 2 - squares / (m * (m - 1)))
+            self.v[i] = (1 - g) * (self.v[i] + g * grubbs)
+        if m < 3:
+            return
+        # A jump too small for the gate shows in the mean of a second, where the others' means agree.
+        f = 1 / self.quiet_after
+        for i in pupils:
+            self.fast[i] = (1 - f) * self.fast[i] + f * e[i]
+        usual = median_of([self.fast[i] for i in pupils])
+        scatter = 1.4826 * median_of([abs(self.fast[i] - usual) for i in pupils])
+        for i in pupils:
+            limit = max(8 * math.sqrt(f / 2), 1.0) * math.sqrt(self._variance(i, vbar))
+            limit = max(limit, 8 * scatter, self.motion * abs(middle))
+            if self.count[i] >= 5 * self.quiet_after and abs(self.fast[i] - usual) > limit:
+                self._jump(i)
+
+    def _follow_away(self, i, distance, middle, half):
+        self.away[i] += 1
+        if self.away[i] == 1:
+            self.away_mean[i] = distance
+            self.away_square[i] = 0.0
+        else:
+            step = distance - self.away_mean[i]
+            self.away_mean[i] += step / self.away[i]
+            self.away_square[i] += step * (distance - self.away_mean[i])
+        if self.away[i] >= self.jump_after:
+            scatter = math.sqrt(self.away_square[i] / (self.away[i] - 1))
+            if scatter <= half / 2 and abs(self.away_mean[i]) > self.motion * abs(middle):
+                if self.away[i] >= self.count[i]:
+                    self._forget(i)
+                self._jump(i)
+            self.away[i] = 0
+
+    def _jump(self, i):
+        self.out[i] = self.fresh[i] = self.jumped[i] = True
+        self.calm[i] = self.away[i] = 0
+        self.fast[i] = 0.0
+
+    def _forget(self, i):
+        """Most of what this gyro taught was wrong: the others settle among themselves, and it starts anew."""
+        others = [j for j in range(self.n) if j != i and self.count[j]]
+        if others:
+            mean = mean_of([self.b[j] for j in others])
+            for j in others:
+                self.b[j] -= mean
+        self.b[i] = self.v[i] = 0.0
+        self.count[i] = 0
+
+    def _vbar(self):
+        known = [self.v[i] for i in range(self.n) if self.count[i] > 1]
+        return max(mean_of(known), 0.0) if known else 0.0
+
+    def _variance(self, i, vbar):
+        count = min(self.count[i], self.cap) if self.memory is None else min(self.count[i], 1 / self.memory)
+        mixed = (self.prior * self.ratio[i] * vbar + count * self.v[i]) / (self.prior + count)
+        return max(mixed, self.floor * vbar, 1e-300)
+
+    def _weigh(self, used, vbar):
+        w = [0.0] * self.n
+        m = len(used)
+        if m <= 2:
+            for i in used:
+                w[i] = 1 / m
+            return w
+        inverse = {i: 1 / self._variance(i, vbar) for i in used}
+        total = sum(inverse.values())
+        top = max(used, key=lambda i: inverse[i])
+        for i in used:
+            w[i] = inverse[i] / total
+        if w[top] > self.weight_cap:
+            rest = 1 - w[top]
+            for i in used:
+                w[i] = self.weight_cap if i == top else w[i] / rest * (1 - self.weight_cap)
+        return w

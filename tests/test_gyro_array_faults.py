@@ -1,0 +1,201 @@
+"""Each fault of a gyro under `robust`: the output's error has a bound, stated here, and the gyro is named.
+
+Bounds are against the output of the healthy array on the same noise. w is the largest weight of the faulty gyro in use,
+sigma the largest noise of one gyro, 0.08 deg/s.
+"""
+
+import numpy as np
+import pytest
+
+from imulab.gyro_array.fuse import Fused, FuseOptions, fuse
+from imulab.gyro_array.health import EXCLUDED, JUMPED, NON_FINITE, STUCK
+from test_gyro_array_fuse import array_recording, dynamic
+
+SEEDS = (1, 2, 3, 4)
+SIGMA = 0.05 * 1.6
+RATE = 50
+NOISE = 3 * SIGMA  # what leaving one gyro out may move a sample by: its weight times its noise, with room
+FAULTY = 2
+
+
+def at_rest(seed: int) -> np.ndarray:
+    readings, truth, _ = dynamic(seed)
+    return readings - truth[:, None]
+
+
+def run(readings: np.ndarray) -> Fused:
+    return fuse(array_recording(readings), FuseOptions(rate=float(RATE)), weights=True)
+
+
+def moved(readings: np.ndarray, broken: np.ndarray) -> tuple[np.ndarray, Fused, Fused]:
+    healthy, fused = run(readings), run(broken)
+    others = [i for i in range(6) if i != FAULTY]
+    assert not (fused.flags[:, 0, others] & (STUCK | JUMPED)).any(), "a healthy gyro was blamed"
+    return np.abs(fused.rate - healthy.rate)[:, 0], fused, healthy
+
+
+def put(readings: np.ndarray, where: object, value: object) -> np.ndarray:
+    copy = readings.copy()
+    copy[where, FAULTY] = value
+    return copy
+
+
+def first(fused: Fused, bit: int) -> int:
+    held = (fused.flags[:, 0, FAULTY] & bit) > 0
+    assert held.any(), "the fault was not noticed"
+    return int(np.argmax(held))
+
+
+def says(fused: Fused, kind: str) -> bool:
+    return any(line.startswith(f"gyro_{FAULTY + 1}: ") and kind in line for line in fused.health.lines())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("still", [True, False])
+@pytest.mark.parametrize("value", [0.0, -3.5])
+def test_dead_from_the_start(seed, still, value):
+    # Until it is known to be stuck (0.5 s) it counts w <= 1/2 of its distance, which the first gate keeps small in motion;
+    # afterwards the output is that of the five others.
+    readings = at_rest(seed) if still else dynamic(seed)[0]
+    error, fused, _ = moved(readings, put(readings, slice(None), value))
+    assert first(fused, STUCK) <= RATE
+    assert says(fused, "stuck")
+    assert error[RATE:].max() < NOISE
+    assert error[RATE:].mean() < 0.03
+    assert error[:RATE].max() < NOISE + (abs(value) / 2 if still else 0.3)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("still", [True, False])
+def test_stuck_later(seed, still):
+    # At rest a stuck gyro is off by its own noise; in motion it leaves the gate within samples.
+    readings = at_rest(seed) if still else dynamic(seed)[0]
+    error, fused, _ = moved(readings, put(readings, slice(2000, 3000), readings[1999, FAULTY]))
+    assert 2000 < first(fused, STUCK) <= 2000 + RATE
+    assert says(fused, "stuck")
+    assert error.max() < NOISE
+    assert (fused.weights[2030:3000, 0, FAULTY] == 0).all()
+    assert (fused.weights[3000 + 2 * RATE :, 0, FAULTY] > 0).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_spikes(seed):
+    # A spike is left out in its own sample and nowhere else.
+    readings = dynamic(seed)[0]
+    where = np.arange(500, 5000, 97)
+    error, fused, _ = moved(readings, put(readings, where, readings[where, FAULTY] + 300))
+    assert error.max() < NOISE
+    assert (fused.flags[where, 0, FAULTY] & EXCLUDED).all()
+    assert np.count_nonzero(fused.flags[:, 0, FAULTY]) == len(where)
+    assert says(fused, "excluded")
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("elements", [3, 4, 6])
+def test_a_spike_in_the_very_first_sample_is_forgotten_within_1_s(seed, elements):
+    readings = dynamic(seed, elements=elements)[0]
+    broken = readings.copy()
+    broken[0, 0] += 300
+    error = np.abs(run(broken).rate - run(readings).rate)[:, 0]
+    assert error[RATE:].max() < NOISE
+    assert error[RATE:].mean() < 0.05
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("jump", [0.1, -0.25, 0.5, 2.0, -20.0])
+def test_a_bias_jump(seed, jump):
+    # Below the gate at most max(w, 1/n) |jump|, once estimated again at most |jump| / n; the noise of the gyro left out or
+    # brought back comes on top.
+    readings = dynamic(seed)[0]
+    error, fused, healthy = moved(readings, put(readings, slice(2500, None), readings[2500:, FAULTY] + jump))
+    assert 2500 <= first(fused, JUMPED) <= 2500 + 4 * RATE
+    if abs(jump) >= 2:
+        assert first(fused, JUMPED) <= 2500 + 2 * RATE
+    assert says(fused, "jumped")
+    weight = max(healthy.weights[2500:, 0, FAULTY].max(), 1 / 6)
+    in_gate = min(abs(jump), 8 * SIGMA)
+    assert error.max() < weight * in_gate + NOISE
+    late = fused.rate[3500:, 0].mean() - healthy.rate[3500:, 0].mean()
+    assert abs(late) < min(abs(jump), 0.3) / 6
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_bursts_that_are_no_numbers(seed, value):
+    readings = dynamic(seed)[0]
+    broken = put(readings, slice(2500, 2600), value)
+    broken[3000:3002, FAULTY] = value
+    error, fused, _ = moved(readings, broken)
+    assert np.isfinite(fused.rate).all()
+    assert error.max() < NOISE
+    assert (fused.flags[2500:2600, 0, FAULTY] & NON_FINITE).all()
+    assert not fused.flags[3002, 0, FAULTY], "two lost samples cost no quiet period"
+    assert says(fused, "non-finite")
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("left", [1, 2])
+def test_all_but_one_or_two_lost(seed, left):
+    # Two are averaged, one is passed through: the error is its own noise.
+    readings, truth, sigma = dynamic(seed)
+    broken = readings.copy()
+    broken[2000:3000, left:] = np.nan
+    fused = run(broken)
+    error = fused.rate[:, 0] - truth
+    expected = np.sqrt(np.sum(sigma[:left] ** 2)) / left
+    assert error[2000:3000].std() < 1.15 * expected
+    assert abs(error[2000:3000].mean()) < 0.05
+    np.testing.assert_allclose(fused.weights[2000:3000, 0, :left], 1 / left)
+    assert any("fewer than three gyros left in 1" in line for line in fused.health.lines())
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_all_lost_gives_nan_there_and_nowhere_else(seed):
+    readings = dynamic(seed)[0]
+    broken = readings.copy()
+    broken[2000:3000] = np.nan
+    broken[4000] = np.inf
+    healthy, fused = run(readings), run(broken)
+    lost = np.zeros(5000, dtype=bool)
+    lost[2000:3000] = lost[4000] = True
+    np.testing.assert_array_equal(np.isnan(fused.rate[:, 0]), lost)
+    assert np.abs(fused.rate - healthy.rate)[~lost].max() < NOISE
+    assert "no gyro left in 1001 samples: the output is nan there" in fused.health.lines()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_one_gyro_saturates(seed):
+    # In the first 0.5 s the end of its range may count as much as any gyro; later what it taught on the way in and out of
+    # it moves the others by less than sigma.
+    readings = dynamic(seed)[0]
+    error, fused, _ = moved(readings, put(readings, slice(None), np.clip(readings[:, FAULTY], -8, 8)))
+    assert error[RATE:].max() < 0.35 * 8 * SIGMA + NOISE
+    assert error[RATE:].mean() < SIGMA
+    assert error[:RATE].max() < 2.1 / 2
+    assert says(fused, "stuck")
+
+
+def test_every_gyro_saturates_at_once_and_recovers():
+    # Nothing can know the rate then; the output is the end of the range, and the array is itself again 2 s later.
+    readings, truth, _ = dynamic(1)
+    fused = run(np.clip(readings, -8, 8))
+    inside = np.abs(truth) < 7
+    since = np.zeros(len(truth))
+    for k in range(1, len(truth)):
+        since[k] = since[k - 1] + 1 if inside[k] else 0
+    assert np.abs(fused.rate[:, 0][since > RATE] - truth[since > RATE]).max() < 0.6
+    assert np.abs(fused.rate[:, 0]).max() < 8.3
+
+
+def test_a_healthy_array_raises_no_alarm():
+    for seed in range(10):
+        fused = run(dynamic(seed)[0])
+        assert not fused.flags.any()
+        assert fused.health.lines() == []
+
+
+def test_a_coarse_array_at_rest_is_not_called_stuck():
+    rng = np.random.default_rng(6)
+    coarse = np.round(0.4 * rng.standard_normal((20_000, 6)) + rng.uniform(-0.2, 0.2, 6))
+    fused = run(coarse)
+    assert not (fused.flags & STUCK).any()

@@ -1,0 +1,356 @@
+"""Fusion on the C core against the plain-Python transcription, the closed forms, and itself in pieces."""
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.gyro_array.fit import calibrate_array
+from imulab.gyro_array.fuse import Fuser, FuseOptions, fuse, parse_memory
+from imulab.gyro_array.model import METHODS
+from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
+from imulab.recording import Recording
+from reference import gyro_array as reference
+
+
+def array_recording(readings: np.ndarray, rate: float = 50.0, name: str = "a.csv") -> Recording:
+    """Readings (m, n) or (m, 3, n) as a recording in deg/s."""
+    columns = {"time": np.arange(len(readings)) / rate}
+    for i in range(readings.shape[-1]):
+        if readings.ndim == 2:
+            columns[f"gyro_{i + 1}"] = readings[:, i].copy()
+        else:
+            columns |= {f"gyro_{axis}_{i + 1}": readings[:, a, i].copy() for a, axis in enumerate("xyz")}
+    return Recording(columns, {c: "s" if c == "time" else "deg/s" for c in columns}, name=name, lines_before=1)
+
+
+def dynamic(seed: int = 1, count: int = 5000, elements: int = 6) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The source's dynamic case, made here: readings (m, n), truth (m,), and each gyro's white noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(count) / 50
+    truth = -12.5 * np.cos(0.2 * np.pi * time - 0.2 * np.pi)
+    sigma = 0.05 * rng.uniform(0.6, 1.6, elements)
+    walk = 2e-4 * np.sqrt(0.02) * np.cumsum(rng.standard_normal((count, elements)), axis=0)
+    bias = 0.02 * rng.standard_normal(elements)
+    return truth[:, None] + sigma * rng.standard_normal((count, elements)) + walk + bias, truth, sigma
+
+
+def faulty() -> np.ndarray:
+    readings = dynamic()[0]
+    readings[2000:3000, 0] = readings[1999, 0]
+    readings[2500:, 3] += 2
+    readings[500::97, 1] += 300
+    readings[1000:1200, 4] = np.nan
+    readings[0, 5] += 300
+    readings[4000:4050] = np.nan
+    return readings
+
+
+def transcribed(method: str, readings: np.ndarray, **settings: object) -> np.ndarray:
+    kind = {
+        "mean": reference.Mean,
+        "feedback": reference.Feedback,
+        "least-squares": reference.LeastSquares,
+        "support": reference.Support,
+        "robust": reference.Robust,
+    }[method]
+    recursion = kind(readings.shape[1], **settings)
+    return np.array([recursion.step(row) for row in readings.tolist()])
+
+
+@pytest.mark.parametrize("method", ["mean", "support", "least-squares", "feedback", "robust"])
+@pytest.mark.parametrize("memory", [None, 0.02])
+def test_each_method_agrees_with_its_transcription(method, memory):
+    readings = dynamic(count=1500)[0]
+    settings = {} if method == "mean" else {"memory": memory}
+    ours = fuse(array_recording(readings), FuseOptions(method=method, memory="growing" if memory is None else memory))
+    np.testing.assert_allclose(ours.rate[:, 0], transcribed(method, readings, **settings), rtol=0, atol=12.5e-12)
+
+
+@pytest.mark.parametrize(("initial", "start"), [("first", 1), ("zero", 1), ("first", 500), ("record", 1)])
+def test_feedback_agrees_with_its_transcription_from_every_start(initial, start, tmp_path):
+    readings = dynamic(count=1500)[0]
+    options = FuseOptions(method="feedback", initial_bias=initial if initial != "record" else "first", start=start)
+    expected_start: object = initial
+    if initial == "record":
+        still = array_recording(np.random.default_rng(3).standard_normal((1000, 6)) * 0.05 + np.arange(6) * 0.1)
+        record = calibrate_array(still).calibration
+        options = FuseOptions(method="feedback", initial_bias=record)
+        expected_start = [np.degrees(e["bias"]["value"]) for e in record.sections["elements"]]
+    ours = fuse(array_recording(readings), options)
+    theirs = transcribed("feedback", readings, initial_bias=expected_start, start=start)
+    np.testing.assert_allclose(ours.rate[:, 0], theirs, rtol=0, atol=12.5e-12)
+
+
+def test_robust_agrees_with_its_transcription_under_faults_flags_and_weights_included():
+    readings = faulty()
+    ours = fuse(array_recording(readings), FuseOptions(rate=50.0), weights=True)
+    recursion = reference.Robust(6, rate=50.0)
+    for k, row in enumerate(readings.tolist()):
+        rate = recursion.step(row)
+        assert ours.rate[k, 0] == pytest.approx(rate, abs=1e-11, nan_ok=True), k
+        assert (ours.flags[k, 0] & 63).tolist() == recursion.flags, k
+        np.testing.assert_allclose(ours.weights[k, 0], recursion.weights, atol=1e-12)
+
+
+# ---- closed forms of the source's recursion -------------------------------------------------------------------------
+
+
+def noise_free(count: int = 800) -> np.ndarray:
+    time = np.arange(count) / 50
+    return 7.0 * np.sin(0.9 * time) + 0.2 * time
+
+
+@pytest.mark.parametrize("gain", [0.01, 0.3])
+def test_feedback_with_a_fixed_gain_has_a_scale_factor_error_of_exactly_the_gain(gain):
+    # Zr = (1 - g) zbar(k) + g zbar(1) - c, on noise-free motion with biases that `first` takes up: c = 0.
+    zbar = noise_free()
+    readings = zbar[:, None] + np.array([-0.3, 0.1, 0.2, 0.0])
+    ours = fuse(array_recording(readings), FuseOptions(method="feedback", memory=gain))
+    np.testing.assert_allclose(ours.rate[:, 0], (1 - gain) * zbar + gain * zbar[0], atol=1e-12)
+
+
+def test_feedback_with_growing_memory_freezes_early_motion_into_its_output():
+    # Zr = zbar(k) - c - sum_{j >= 2} (zbar(j) - zbar(j - 1)) / j
+    zbar = noise_free()
+    readings = zbar[:, None] + np.array([-0.3, 0.1, 0.2, 0.0])
+    ours = fuse(array_recording(readings), FuseOptions(method="feedback"))
+    frozen = np.concatenate([[0.0], np.cumsum(np.diff(zbar) / np.arange(2, len(zbar) + 1))])
+    np.testing.assert_allclose(ours.rate[:, 0], zbar - frozen, atol=1e-11)
+    step = np.where(np.arange(400) >= 1, 20.0, 0.0)[:, None] + np.zeros(4)
+    assert fuse(array_recording(step), FuseOptions(method="feedback")).rate[-1, 0] == pytest.approx(10.0, abs=1e-12)
+
+
+def test_feedback_with_a_start_subtracts_its_mean_for_good():
+    zbar = np.zeros(500)
+    readings = zbar[:, None] + np.array([0.2, 0.4, 0.0, 0.6])
+    zero = fuse(array_recording(readings), FuseOptions(method="feedback", initial_bias="zero"))
+    assert zero.rate[-1, 0] == pytest.approx(0.3, abs=1e-12)  # c = 0: the common bias stays
+
+
+# ---- robust: no motion leak, best weights ---------------------------------------------------------------------------
+
+
+def test_robust_lets_no_motion_leak():
+    motion = noise_free(3000)
+    readings = motion[:, None] + np.linspace(-0.5, 0.5, 6)
+    ours = fuse(array_recording(readings)).rate[:, 0]
+    gain = np.polyfit(readings.mean(axis=1), ours, 1)[0]
+    assert abs(gain - 1) < 1e-9
+    np.testing.assert_allclose(ours, readings.mean(axis=1), atol=1e-9)
+    assert not fuse(array_recording(readings)).flags.any()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_robust_comes_within_2_percent_of_the_best_fixed_weights(seed):
+    readings, truth, sigma = dynamic(seed)
+    best = readings @ (sigma**-2 / np.sum(sigma**-2)) - truth
+    ours = fuse(array_recording(readings)).rate[:, 0] - truth
+    assert ours.std() <= 1.02 * best.std()
+    assert ours.std() < 0.95 * (readings.mean(axis=1) - truth).std()
+
+
+# ---- kalman and covariance ------------------------------------------------------------------------------------------
+
+
+def test_the_gain_of_kalman_is_that_of_an_iterated_riccati_equation():
+    from imulab.gyro_array.kalman import steady_gain
+
+    white, walk, rate_walk, dt = np.array([0.04, 0.06, 0.08]), np.array([1e-3, 2e-3, 1e-3]), 0.3, 0.02
+    gain = steady_gain(white, walk, rate_walk, dt)
+    assert np.allclose(gain[1:].sum(axis=0), 0)
+    # Rate and biases relative to their mean, propagated until nothing changes.
+    n = 3
+    relative = np.eye(n) - 1 / n
+    h = np.column_stack([np.ones(n), relative])
+    q = np.zeros((n + 1, n + 1))
+    q[0, 0] = rate_walk**2 * dt
+    q[1:, 1:] = relative @ np.diag(walk**2 * dt) @ relative
+    p = np.eye(n + 1)
+    for _ in range(200_000):
+        ahead = p + q
+        k = ahead @ h.T @ np.linalg.inv(h @ ahead @ h.T + np.diag(white**2))
+        after = (np.eye(n + 1) - k @ h) @ ahead
+        if np.abs(after - p).max() < 1e-18:
+            break
+        p = after
+    np.testing.assert_allclose(gain, k, atol=1e-6)
+
+
+def test_kalman_runs_without_a_record_and_follows_the_motion_no_worse_than_the_mean():
+    for seed in (1, 2, 3):
+        readings, truth, _ = dynamic(seed)
+        ours = fuse(array_recording(readings), FuseOptions(method="kalman")).rate[:, 0] - truth
+        assert ours.std() <= (readings.mean(axis=1) - truth).std()
+
+
+@pytest.mark.parametrize("method", ["robust", "kalman", "least-squares"])
+def test_a_gyro_that_comes_back_has_its_full_weight_within_30_s(method):
+    readings = dynamic()[0]
+    gone = readings.copy()
+    gone[1000:1500, 2] = np.nan
+    whole, back = (
+        fuse(array_recording(r), FuseOptions(method=method, rate=50.0), weights=True) for r in (readings, gone)
+    )
+    after = 1500 + 30 * 50
+    np.testing.assert_allclose(back.weights[after, 0, 2], whole.weights[after, 0, 2], rtol=0.15)
+    assert np.abs(back.rate[after:] - whole.rate[after:]).max() < 0.01
+
+
+def test_covariance_uses_the_full_matrix_of_a_record():
+    rng = np.random.default_rng(8)
+    shared = 0.2 * rng.standard_normal(40_000)
+    noise = 0.1 * rng.standard_normal((40_000, 4))
+    noise[:, 0] += shared
+    noise[:, 1] += shared
+    record = calibrate_array(array_recording(noise), averaging_time=0.1).calibration
+    truth = np.diag([0.05, 0.05, 0.01, 0.01])
+    truth[0, 1] = truth[1, 0] = 0.04
+    best = np.linalg.solve(truth, np.ones(4))
+    weights = np.array(record.sections["correlation"]["weights"][0])
+    np.testing.assert_allclose(weights, best / best.sum(), atol=0.02)
+    ours = fuse(array_recording(noise), FuseOptions(method="covariance", calibration=record))
+    bias = np.degrees([e["bias"]["value"] for e in record.sections["elements"]])
+    np.testing.assert_allclose(ours.rate[:, 0], (noise - bias) @ weights, atol=1e-12)
+
+
+# ---- pieces, clocks, gaps -------------------------------------------------------------------------------------------
+
+
+def pieces(recording: Recording, cuts: list[int]) -> list[Recording]:
+    ends = [0, *cuts, len(recording)]
+    return [
+        Recording({n: c[a:b] for n, c in recording.columns.items()}, recording.units, name="a.csv", first_row=a + 1)
+        for a, b in zip(ends, ends[1:], strict=False)
+    ]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_pieces_give_the_whole_to_the_last_bit(method):
+    recording = array_recording(np.delete(faulty(), [700, 701, 702], axis=0))
+    record = None
+    if method in ("covariance", "kalman"):  # without a record the noise for kalman is that of the first piece
+        record = calibrate_array(array_recording(np.random.default_rng(1).standard_normal((2000, 6)))).calibration
+    options = FuseOptions(method=method, calibration=record)
+    whole = fuse(recording, options, weights=True)
+    for cuts in ([17, 18, 19, 2500], [64, 65, 4000], [3000]):
+        parts = list(Fuser(options, weights=True).fuse(pieces(recording, cuts)))
+        np.testing.assert_array_equal(np.concatenate([p.rate for p in parts]), whole.rate)
+        np.testing.assert_array_equal(np.concatenate([p.flags for p in parts]), whole.flags)
+
+
+def test_single_lines_from_the_first_on_give_the_whole_to_the_last_bit():
+    recording = array_recording(dynamic(count=300)[0])
+    whole = fuse(recording)
+    parts = list(Fuser(FuseOptions()).fuse(pieces(recording, list(range(1, 300)))))
+    assert [len(p.rate) for p in parts] == [1] * 300
+    np.testing.assert_array_equal(np.concatenate([p.rate for p in parts]), whole.rate)
+
+
+def test_three_axes_are_three_times_one():
+    readings = np.stack([dynamic(seed)[0] for seed in (1, 2, 3)], axis=1)
+    together = fuse(array_recording(readings))
+    for a in range(3):
+        np.testing.assert_array_equal(together.rate[:, a], fuse(array_recording(readings[:, a])).rate[:, 0])
+
+
+def test_gaps_are_reported_with_place_and_length_and_fusion_goes_on():
+    readings = dynamic(count=1000)[0]
+    recording = array_recording(readings)
+    time = recording.columns["time"] + np.where(np.arange(1000) >= 400, 3.0, 0.0)
+    ours = fuse(recording.with_columns({"time": time}, {}))
+    assert ours.notes == ("a.csv: a gap of 3.02 s before row 401 (line 402) at 11 s",)
+    np.testing.assert_array_equal(ours.rate, fuse(recording).rate)
+
+
+def test_elements_on_clocks_of_their_own_are_brought_to_one():
+    time = np.arange(3000) / 50
+    rng = np.random.default_rng(4)
+    shift = np.array([0.0, 0.004, -0.007, 0.0023])
+    motion = lambda t: 20 * np.sin(1.3 * t)  # noqa: E731
+    readings = np.column_stack([motion(time + d) for d in shift]) + 0.01 * rng.standard_normal((3000, 4))
+    recording = array_recording(readings)
+    clocks = {f"time_{i + 1}": time + d for i, d in enumerate(shift)}
+    own = recording.with_columns(clocks, dict.fromkeys(clocks, "s"))
+    naive, right = fuse(recording, FuseOptions(method="mean")), fuse(own, FuseOptions(method="mean"))
+    inside = len(right.time)
+    assert 2995 < inside < 3000
+    error = right.rate[:, 0] - motion(right.time)
+    assert error.std() < 0.007
+    assert np.abs(naive.rate[:, 0] - motion(time)).max() > 2 * np.abs(error).max() / 3
+    parts = list(Fuser(FuseOptions(method="mean")).fuse(pieces(own, [1, 2, 3, 50, 51, 1700])))
+    np.testing.assert_array_equal(np.concatenate([p.time for p in parts]), right.time)
+    np.testing.assert_array_equal(np.concatenate([p.rate for p in parts]), right.rate)
+
+
+def test_zero_rate_updates_take_the_common_bias_off():
+    recording = simulate_array(experiment="static", duration=120.0, noise=NoiseModel(turn_on=np.radians(0.5)), seed=4)
+    plain = fuse(recording)
+    updated = fuse(recording, FuseOptions(still=(0.0, 30.0)))
+    after = recording.time > 30
+    assert abs(updated.rate[after].mean()) < 0.15 * abs(plain.rate[after].mean())
+
+
+def test_a_calibrated_start_ends_nearer_after_2000_s():
+    still = simulate_array(experiment="static", duration=60.0, session=1, seed=5)
+    run = simulate_array(experiment="static", seed=5)
+    record = calibrate_array(still).calibration
+    angles = [
+        abs(fuse(run, options, flags=False).rate.sum() / 100)
+        for options in (FuseOptions(), FuseOptions(calibration=record), FuseOptions(initial_bias=record))
+    ]
+    assert angles[1] < 0.5 * angles[0]
+    assert angles[2] == pytest.approx(angles[1], rel=0.2)
+
+
+# ---- real array -----------------------------------------------------------------------------------------------------
+
+
+def test_the_real_array_reaches_its_split_half_figures(real_data, capsys):
+    recording = il.read(real_data / "mimu4444" / "exp_1.bin")
+    columns = recording.columns
+    aligned = np.empty((len(recording), 3, 8))
+    for i in range(8):
+        x, y, z = (columns[f"gyro_{a}_{i + 1}"] for a in "xyz")
+        aligned[:, :, i] = np.column_stack([-y, -x, -z] if i % 2 else [x, y, z])
+    quiet = (recording.time > 468.2) & (recording.time < 496.0)
+    found = {}
+    for method in ("mean", "least-squares", "feedback", "robust"):
+        odd, even = (
+            fuse(array_recording(aligned[:, :, k::2], rate=62.5), FuseOptions(method=method), flags=False).rate[quiet]
+            for k in (0, 1)
+        )
+        found[method] = (odd - even).std(axis=0)
+        with capsys.disabled():
+            print(f"\n  split half, deg/s, {method}: {np.round(found[method], 4).tolist()}", end="")
+    assert (found["robust"] <= [0.138, 0.138, 0.097]).all()
+    assert (found["robust"] < 0.92 * found["mean"]).all()
+    assert (found["robust"] < found["least-squares"]).all()
+    np.testing.assert_allclose(found["mean"], [0.197, 0.174, 0.103], atol=0.002)
+
+
+# ---- options --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "memory"),
+    [("growing", ("growing", 1)), ("growing:250", ("growing", 250)), ("0.01", (0.01, 1)), ("1e-3", (0.001, 1))],
+)
+def test_memory_is_growing_or_a_gain(text, memory):
+    assert parse_memory(text) == memory
+
+
+@pytest.mark.parametrize("text", ["0", "1", "-0.1", "nan", "inf", "growing:0", "growing:x", "fading", ""])
+def test_other_memories_are_refused(text):
+    from imulab.errors import OptionError
+
+    with pytest.raises(OptionError, match="expected growing, growing:COUNT, or a gain between 0 and 1"):
+        parse_memory(text)
+
+
+def test_faults_of_the_simulator_are_where_they_should_be():
+    plain = simulate_array(duration=20.0)
+    broken = simulate_array(duration=20.0, faults=(Fault("stuck", 2, 5.0, 5.0), Fault("jump", 3, 10.0, size=0.1)))
+    stuck = broken.columns["gyro_2"][250:500]
+    assert np.ptp(stuck) == 0
+    np.testing.assert_array_equal(broken.columns["gyro_2"][500:], plain.columns["gyro_2"][500:])
+    assert np.allclose(broken.columns["gyro_3"][500:] - plain.columns["gyro_3"][500:], np.degrees(0.1))

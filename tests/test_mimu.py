@@ -1,0 +1,78 @@
+"""MIMU4444 logs: made here frame by frame, and the real one."""
+
+import struct
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import ReadError
+from imulab.readers.mimu import is_mimu
+
+ACKNOWLEDGED = bytes.fromhex("a02800c8")
+
+
+def frame(sequence: int, stamp: int, data: list[int]) -> bytes:
+    body = struct.pack(">BHBI48h", 0xAA, sequence % 65536, 0x64, stamp % (1 << 32), *data)
+    return body + struct.pack(">H", sum(body) % 65536)
+
+
+def values(k: int) -> list[int]:
+    return [(-1) ** j * (100 * k + j) for j in range(48)]
+
+
+def log(count: int, first_stamp: int = (1 << 32) - 3_000_000) -> list[bytes]:
+    return [frame(65530 + k, first_stamp + 1_024_000 * k, values(k)) for k in range(count)]
+
+
+def test_scale_axes_and_the_wrapped_clock(tmp_path):
+    (tmp_path / "log.bin").write_bytes(ACKNOWLEDGED + b"".join(log(20)))
+    recording = il.read(tmp_path / "log.bin")
+    assert len(recording) == 20
+    np.testing.assert_allclose(recording.time, 0.016 * np.arange(20), atol=1e-12)
+    # Element i, accelerometer 6 i .. 6 i + 2, gyro 6 i + 3 .. 6 i + 5; value j of frame k is (-1)^j (100 k + j).
+    np.testing.assert_allclose(recording.columns["gyro_y_3"], [(100 * k + 16) / 16.4 for k in range(20)])
+    np.testing.assert_allclose(recording.columns["accel_z_8"], [(100 * k + 44) * 9.80665 / 2048 for k in range(20)])
+    assert recording.units["gyro_x_1"] == "deg/s"
+    assert recording.units["accel_x_1"] == "m/s^2"
+    assert recording.notes == ()
+    (block,) = il.read_blocks(tmp_path / "log.bin")
+    assert len(block) == 20
+
+
+def test_damage_is_skipped_and_said(tmp_path):
+    frames = log(30)
+    frames[7] = frames[7][:50] + bytes([frames[7][50] ^ 1]) + frames[7][51:]
+    del frames[20:23]
+    (tmp_path / "log.bin").write_bytes(ACKNOWLEDGED + b"".join(frames) + frames[0][:40])
+    recording = il.read(tmp_path / "log.bin")
+    assert len(recording) == 26
+    assert recording.notes[0] == "106 bytes between frames were skipped as damaged"
+    assert recording.notes[1] == "4 frames are missing from the log, the first after row 7"
+    assert np.diff(recording.time).min() > 0
+
+
+def test_it_is_recognised_by_content_alone(tmp_path):
+    assert is_mimu(ACKNOWLEDGED + b"".join(log(2)))
+    assert not is_mimu(ACKNOWLEDGED + log(1)[0][:100])
+    assert not is_mimu(b"time [s],gyro_x [deg/s]\n" * 20)
+    broken = bytearray(log(1)[0])
+    broken[30] ^= 4
+    assert not is_mimu(bytes(broken))
+    (tmp_path / "no.bin").write_bytes(bytes(broken))
+    with pytest.raises(ReadError, match="binary data"):
+        il.read(tmp_path / "no.bin")
+
+
+def test_the_real_log(real_data, imulab):
+    file = real_data / "mimu4444" / "exp_1.bin"
+    recording = il.read(file)
+    assert len(recording) == 37_439
+    assert recording.notes == ()
+    assert recording.time[-1] == pytest.approx(599.0, abs=0.1)
+    x1, y2 = recording.columns["gyro_x_1"], recording.columns["gyro_y_2"]
+    assert np.corrcoef(x1, -y2)[0, 1] > 0.999
+    shown = imulab("show", file)
+    assert shown.returncode == 0
+    assert "37439 samples" in shown.stdout
+    assert "gaps 0" in shown.stdout

@@ -1,0 +1,128 @@
+"""Allan deviation against allantools, and coefficients against the noise that was put in."""
+
+import json
+
+import allantools
+import numpy as np
+import pytest
+
+from imulab.errors import DataError, OptionError
+from imulab.noise import allan_deviation, analyse, read_coefficients
+from imulab.recording import Recording
+
+
+@pytest.mark.parametrize("count", [5, 57, 1000, 65_537])
+@pytest.mark.parametrize("taus", ["octave", "all"])
+def test_it_equals_allantools(count, taus):
+    if taus == "all" and count > 2000:
+        pytest.skip("quadratic")
+    samples = np.random.default_rng(count).standard_normal(count) + 300.0
+    peer_taus, peer, _, _ = allantools.oadev(samples, rate=62.5, data_type="freq", taus=taus)
+    mine = allan_deviation(samples, 62.5, "octave" if taus == "octave" else peer_taus)
+    np.testing.assert_allclose(mine.tau, peer_taus[: len(mine.tau)], rtol=1e-15)
+    np.testing.assert_allclose(mine.deviation, peer[: len(mine.tau)], rtol=1e-12)
+    assert len(peer_taus) - len(mine.tau) <= 1
+
+
+def test_dense_taus_are_24_a_decade_and_contain_those_of_allantools():
+    samples = np.random.default_rng(1).standard_normal(20_000)
+    dense = allan_deviation(samples, 10.0, "dense")
+    assert np.count_nonzero((dense.tau >= 10) & (dense.tau < 100)) == 24
+    _, peer, _, _ = allantools.oadev(samples, rate=10.0, data_type="freq", taus=dense.tau)
+    np.testing.assert_allclose(dense.deviation, peer, rtol=1e-12)
+
+
+def test_the_deviation_of_white_noise_and_its_uncertainty():
+    rng = np.random.default_rng(2)
+    curves = [allan_deviation(rng.standard_normal(4096), 1.0) for _ in range(300)]
+    variance = np.array([c.deviation**2 for c in curves])
+    np.testing.assert_allclose(variance.mean(axis=0)[:8] * curves[0].tau[:8], 1.0, rtol=0.05)
+    stated = np.median([c.standard_uncertainty for c in curves], axis=0)
+    np.testing.assert_allclose(np.std([c.deviation for c in curves], axis=0)[:8], stated[:8], rtol=0.15)
+
+
+@pytest.mark.parametrize(("walk", "low"), [(0.0, 0.9), (3e-3, 0.8)])
+def test_coefficients_cover_what_was_put_in(walk, low):
+    rng = np.random.default_rng(3)
+    white, rate, covered = 0.2, 50.0, []
+    for _ in range(60):
+        n = 40_000
+        wander = np.cumsum(rng.standard_normal(n))
+        samples = white * np.sqrt(rate) * rng.standard_normal(n) + walk / np.sqrt(rate) * wander
+        found = read_coefficients(allan_deviation(samples, rate))
+        covered.append(
+            [
+                abs(c.value - truth) <= 2 * c.standard_uncertainty
+                for c, truth in ((found.angle_random_walk, white), (found.rate_random_walk, walk))
+            ]
+        )
+    assert np.mean(covered, axis=0).min() >= low
+
+
+def test_flicker_noise_is_read_as_bias_instability():
+    rng = np.random.default_rng(4)
+    n, size = 1 << 17, 0.5
+    spectrum = rng.standard_normal(n // 2) + 1j * rng.standard_normal(n // 2)
+    frequency = np.arange(1, n // 2 + 1) / n
+    # Density B^2 / (2 pi f), two-sided (IEEE Std 952), so B^2 / (pi f) one-sided; a line k of irfft adds 2 |X|^2 / n^2.
+    lines = np.concatenate([[0], spectrum * size * np.sqrt(n / (4 * np.pi * frequency))])
+    found = read_coefficients(allan_deviation(np.fft.irfft(lines, n), 1.0))
+    assert found.bias_instability.value == pytest.approx(size, rel=0.15)
+
+
+def test_a_constant_has_no_noise():
+    found = read_coefficients(allan_deviation(np.full(1000, 4.2), 10.0))
+    assert max(found.angle_random_walk.value, found.bias_instability.value, found.rate_random_walk.value) < 1e-20
+
+
+@pytest.mark.parametrize(
+    ("samples", "rate", "taus", "error", "text"),
+    [
+        (np.zeros(2), 1.0, "octave", DataError, "at least 3 samples"),
+        (np.array([0.0, np.nan, 1.0, 2.0]), 1.0, "octave", DataError, "finite"),
+        (np.zeros(10), 0.0, "octave", OptionError, "sampling rate 0"),
+        (np.zeros(10), 1.0, "decade", OptionError, "expected octave or dense"),
+        (np.zeros(10), 1.0, np.array([99.0]), OptionError, "expected averaging times from 1 s to 4 s"),
+    ],
+)
+def test_what_cannot_be_analysed_is_refused(samples, rate, taus, error, text):
+    with pytest.raises(error, match=text):
+        allan_deviation(samples, rate, taus)
+
+
+def _recording(**columns):
+    n = len(next(iter(columns.values())))
+    units = {name: "deg/s" if name.startswith("gyro") else "s" if name == "time" else "g" for name in columns}
+    return Recording(columns={"time": np.arange(n) / 10, **columns}, units={"time": "s", **units}, name="r.csv")
+
+
+def test_analysis_of_a_recording_is_in_si():
+    rng = np.random.default_rng(5)
+    found = analyse(_recording(gyro_x=rng.standard_normal(5000), accel_x=rng.standard_normal(5000)))
+    assert json.loads(json.dumps(found)) == found
+    gyro = found["columns"]["gyro_x"]
+    assert gyro["angle_random_walk"]["unit"] == "rad/s/sqrt(Hz)"
+    assert gyro["angle_random_walk"]["value"] == pytest.approx(np.radians(1) / np.sqrt(10), rel=0.05)
+    assert found["columns"]["accel_x"]["angle_random_walk"]["value"] == pytest.approx(9.80665 / np.sqrt(10), rel=0.05)
+
+
+def test_the_command_prints_tables_and_json_and_refuses_in_one_line(imulab, tmp_path):
+    import imulab as il
+
+    rng = np.random.default_rng(6)
+    good = _recording(gyro_x=rng.standard_normal(2000))
+    il.write_csv(good, tmp_path / "r.csv")
+    done = imulab("allan", "r.csv")
+    assert done.returncode == 0, done.stderr
+    assert "angle random walk" in done.stdout
+    assert "deg/sqrt(h)" in done.stdout
+    assert json.loads(imulab("allan", "r.csv", "--json", "--taus", "dense").stdout)["columns"]["gyro_x"]["tau"]
+    time = good.columns["time"] + np.where(np.arange(2000) >= 1000, 5.0, 0.0)
+    il.write_csv(good.with_columns({"time": time}, {}), tmp_path / "gap.csv")
+    assert "1 gap in time, the longest 5.1 s after row 1000 (line" in imulab("allan", "gap.csv").stderr
+    (tmp_path / "notime.csv").write_text("gyro_x [deg/s]\n1\n2\n3\n4\n")
+    (tmp_path / "nosensor.csv").write_text("time [s],foo\n1,1\n2,2\n3,1\n4,2\n")
+    for file, text in (("notime.csv", "no column time"), ("nosensor.csv", "no sensor column")):
+        refused = imulab("allan", file)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+        assert text in refused.stderr
