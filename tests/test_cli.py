@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -145,10 +146,16 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     assert done.returncode == 0, done.stderr
     names = {p.name for p in (tmp_path / "here").iterdir()}
     assert {"tumble.csv", "tumble.json", "tumble.html", "tumble_corrected.csv"} <= names
-    assert "order 2 chosen" in done.stdout
+    for name in ("tumble", "array", "warmup", "centrifuge"):
+        assert {f"{name}.json", f"{name}.html"} <= names
+    assert {"imulab.c", "imulab.h", "unit.c", "README.md"} <= {
+        p.name for p in (tmp_path / "here" / "firmware").iterdir()
+    }
+    assert il.load(tmp_path / "here" / "tumble.json").model["order"] == 2
     assert "±" in done.stdout
     assert "down-weighted" in done.stdout
-    assert done.stdout.rstrip().splitlines()[-1].startswith("open here")
+    assert "self-test: pass" in done.stdout
+    assert done.stdout.rstrip().splitlines()[-1] == f"open {Path('here') / 'index.html'}"
     record = il.load(tmp_path / "here" / "tumble.json")
     truth = il.read(tmp_path / "here" / "tumble.csv").metadata
     for name, parameter in record.parameters.items():

@@ -334,3 +334,8 @@ def test_a_damaged_dataflash_log_is_refused(file, samples, case):
     change, message = DATAFLASH_DAMAGE[case]
     with pytest.raises(ImulabError, match=message):
         il.read(file(change(ardupilot_log(samples)), "bad.bin"))
+
+
+def test_a_text_log_of_ardupilot_asks_for_the_binary_one(file):
+    with pytest.raises(ReadError, match=r"an ArduPilot log as text; expected the binary log \(\.bin\)"):
+        il.read(file(b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n", "log.log"))

@@ -54,8 +54,8 @@ def says(fused: Fused, kind: str) -> bool:
 @pytest.mark.parametrize("still", [True, False])
 @pytest.mark.parametrize("value", [0.0, -3.5])
 def test_dead_from_the_start(seed, still, value):
-    # Until it is known to be stuck (0.5 s) it counts w <= 1/2 of its distance, which the first gate keeps small in motion;
-    # afterwards the output is that of the five others.
+    # Until it is known to be stuck (0.5 s) it counts w <= 1/2 of its distance, which the first gate keeps small in
+    # motion; afterwards the output is that of the five others.
     readings = at_rest(seed) if still else dynamic(seed)[0]
     error, fused, _ = moved(readings, put(readings, slice(None), value))
     assert first(fused, STUCK) <= RATE
@@ -104,8 +104,8 @@ def test_a_spike_in_the_very_first_sample_is_forgotten_within_1_s(seed, elements
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("jump", [0.1, -0.25, 0.5, 2.0, -20.0])
 def test_a_bias_jump(seed, jump):
-    # Below the gate at most max(w, 1/n) |jump|, once estimated again at most |jump| / n; the noise of the gyro left out or
-    # brought back comes on top.
+    # Below the gate at most max(w, 1/n) |jump|, once estimated again at most |jump| / n; the noise of the gyro left
+    # out or brought back comes on top.
     readings = dynamic(seed)[0]
     error, fused, healthy = moved(readings, put(readings, slice(2500, None), readings[2500:, FAULTY] + jump))
     assert 2500 <= first(fused, JUMPED) <= 2500 + 4 * RATE
@@ -165,8 +165,8 @@ def test_all_lost_gives_nan_there_and_nowhere_else(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_one_gyro_saturates(seed):
-    # In the first 0.5 s the end of its range may count as much as any gyro; later what it taught on the way in and out of
-    # it moves the others by less than sigma.
+    # In the first 0.5 s the end of its range may count as much as any gyro; later what it taught on the way in and
+    # out of it moves the others by less than sigma.
     readings = dynamic(seed)[0]
     error, fused, _ = moved(readings, put(readings, slice(None), np.clip(readings[:, FAULTY], -8, 8)))
     assert error[RATE:].max() < 0.35 * 8 * SIGMA + NOISE

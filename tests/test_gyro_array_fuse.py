@@ -1,11 +1,13 @@
 """Fusion on the C core against the plain-Python transcription, the closed forms, and itself in pieces."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 import imulab as il
 from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import Fuser, FuseOptions, fuse, parse_memory
+from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, parse_memory
 from imulab.gyro_array.model import METHODS
 from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording
@@ -220,7 +222,7 @@ def pieces(recording: Recording, cuts: list[int]) -> list[Recording]:
     ends = [0, *cuts, len(recording)]
     return [
         Recording({n: c[a:b] for n, c in recording.columns.items()}, recording.units, name="a.csv", first_row=a + 1)
-        for a, b in zip(ends, ends[1:], strict=False)
+        for a, b in pairwise(ends)
     ]
 
 
@@ -354,3 +356,24 @@ def test_faults_of_the_simulator_are_where_they_should_be():
     assert np.ptp(stuck) == 0
     np.testing.assert_array_equal(broken.columns["gyro_2"][500:], plain.columns["gyro_2"][500:])
     assert np.allclose(broken.columns["gyro_3"][500:] - plain.columns["gyro_3"][500:], np.degrees(0.1))
+
+
+def test_a_blob_fuses_as_the_unit_does(imulab, tmp_path):
+    array = {"seed": 6, "scale_spread": 0.01, "mounting": "alternate"}
+    still = simulate_array(experiment="static", duration=60.0, **array)
+    record = calibrate_array(still, simulate_array(experiment="moving", **array)).calibration
+    run = simulate_array(duration=20.0, sample_rate=100.0, **array)
+    record.save(tmp_path / "a.json")
+    il.write_csv(run, tmp_path / "run.csv")
+    assert imulab("export", "--to", "blob", "a.json", "-o", "unit").returncode == 0
+    (blob,) = (tmp_path / "unit").glob("*.blob")
+    done = imulab("array", "fuse", "run.csv", "--calibration", blob, "-o", "blob.csv")
+    assert done.returncode == 0, done.stderr
+    desk = fuse(run, FuseOptions(calibration=record))
+    unit = il.read(tmp_path / "blob.csv").columns["rate"]
+    np.testing.assert_allclose(unit, desk.rate[:, 0], atol=2e-5)
+    refused = imulab("array", "fuse", "run.csv", "--calibration", blob, "--method", "mean")
+    assert refused.returncode == 2
+    assert "a blob fuses by robust with growing memory, and by nothing else" in refused.stderr
+    il.write_csv(simulate_array(duration=2.0, elements=4), tmp_path / "four.csv")
+    assert "holds 6 elements on 1 axes" in imulab("array", "fuse", "four.csv", "--calibration", blob).stderr

@@ -32,8 +32,21 @@ if TYPE_CHECKING:
     from imulab.attitudes import Attitudes as Attitudes
     from imulab.calibration import Calibration as Calibration
     from imulab.calibration import load as load
+    from imulab.centrifuge.fit import CentrifugeFit as CentrifugeFit
+    from imulab.centrifuge.fit import fit_centrifuge as fit_centrifuge
+    from imulab.centrifuge.manifest import load_manifest as load_manifest
+    from imulab.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.errors import ImulabError as ImulabError
+    from imulab.exporters import export as export
     from imulab.gravity import normal_gravity as normal_gravity
+    from imulab.gyro_array.compare import compare_methods as compare_methods
+    from imulab.gyro_array.fit import ArrayFit as ArrayFit
+    from imulab.gyro_array.fit import calibrate_array as calibrate_array
+    from imulab.gyro_array.fuse import Fused as Fused
+    from imulab.gyro_array.fuse import FuseOptions as FuseOptions
+    from imulab.gyro_array.fuse import fuse as fuse
+    from imulab.gyro_array.simulate import simulate_array as simulate_array
+    from imulab.noise import allan_deviation as allan_deviation
     from imulab.present import write_report as write_report
     from imulab.readers import read as read
     from imulab.readers import read_blocks as read_blocks
@@ -46,18 +59,31 @@ if TYPE_CHECKING:
     from imulab.writers import write_csv as write_csv
 
 _HOME = {
+    "ArrayFit": "gyro_array.fit",
+    "FuseOptions": "gyro_array.fuse",
+    "Fused": "gyro_array.fuse",
+    "allan_deviation": "noise",
+    "calibrate_array": "gyro_array.fit",
+    "compare_methods": "gyro_array.compare",
+    "fuse": "gyro_array.fuse",
+    "simulate_array": "gyro_array.simulate",
     "Attitudes": "attitudes",
     "Calibration": "calibration",
+    "CentrifugeFit": "centrifuge.fit",
     "ImulabError": "errors",
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
     "apply": "applying",
+    "export": "exporters",
     "find_attitudes": "segment",
+    "fit_centrifuge": "centrifuge.fit",
     "fit_tumble": "tumble.fit",
     "load": "calibration",
+    "load_manifest": "centrifuge.manifest",
     "normal_gravity": "gravity",
     "read": "readers",
     "read_blocks": "readers",
+    "simulate_centrifuge": "centrifuge.simulate",
     "simulate_tumble": "tumble.simulate",
     "write": "writers",
     "write_csv": "writers",

@@ -12,17 +12,19 @@ from typing import Any
 
 from imulab.blob import Blob
 from imulab.calibration import Calibration
+from imulab.centrifuge.apply import apply_centrifuge, beyond_levels, highest_force
 from imulab.errors import RecordError
 from imulab.recording import Recording
 from imulab.runtime import Unit
 from imulab.tables import tables_of
 from imulab.tumble.apply import apply_gyro, apply_tumble, beyond_test
+from imulab.units import from_si
 
 _FAR_IN_TEMPERATURE = 20.0
 
 _Correct = Callable[[Unit, Mapping[str, Any], Recording], Recording]
-_APPLY: dict[str, _Correct] = {"tumble": apply_tumble, "gyro": apply_gyro}
-_PROCEDURES = ("tumble",)
+_APPLY: dict[str, _Correct] = {"tumble": apply_tumble, "gyro": apply_gyro, "centrifuge": apply_centrifuge}
+_BEYOND = {"tumble": beyond_test, "centrifuge": beyond_levels}
 
 
 @dataclass(frozen=True)
@@ -42,14 +44,13 @@ def loaded(record: Calibration | Blob) -> Loaded:
         There is nothing to apply in it, or it lacks a parameter.
     """
     if isinstance(record, Blob):
-        sections = [(str(section["kind"]), section) for section in record.text["sections"]]
-        unknown = [kind for kind, _ in sections if kind not in _APPLY]
-        if unknown:
-            raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
+        # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
+        sections = [(str(section["kind"]), section) for section in record.text["sections"] if section["kind"] in _APPLY]
+        if not sections:
+            raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         return Loaded(Unit(record.data), tuple(sections))
-    if record.procedure not in _PROCEDURES:
-        known = " ".join(_PROCEDURES)
-        raise RecordError(f"a {record.procedure} record cannot be applied; known procedures: {known}")
+    if record.procedure == "gyro_array":
+        raise RecordError("a gyro_array record cannot be applied: 'imulab array fuse --calibration' takes it")
     tables = tables_of(record)
     return Loaded(Unit.of(*tables), tuple((table.kind, table.columns) for table in tables))
 
@@ -106,6 +107,18 @@ def identity(record: Calibration | Blob) -> str:
 
 def beyond_test_of(record: Calibration | Blob, recording: Recording) -> tuple[int, float]:
     """Return how many samples lie far beyond what the record was made at, and the largest, m/s^2."""
-    if isinstance(record, Blob) or record.procedure != "tumble":
+    if isinstance(record, Blob):
         return 0, 0.0
-    return beyond_test(record, recording)
+    beyond = _BEYOND.get(record.procedure)
+    return (0, 0.0) if beyond is None else beyond(record, recording)
+
+
+def beyond_message(record: Calibration | Blob, count: int, largest: float) -> str:
+    """Say that `count` samples, up to `largest`, m/s^2, lie beyond what the record was made at."""
+    most = f"{from_si(largest, 'g'):.1f} g"
+    if isinstance(record, Calibration) and record.procedure == "centrifuge":
+        return (
+            f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {most}), the highest level "
+            "of the record's test: K(a) is extrapolated there"
+        )
+    return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"

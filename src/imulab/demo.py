@@ -1,24 +1,96 @@
-"""The demonstration, as a user would script it."""
+"""The demonstration: the four procedures on simulated instruments, by the commands that a user would type."""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-import imulab as il
-from imulab.errors import OptionError
+from imulab.calibration import load
+from imulab.errors import ImulabError, OptionError
+from imulab.exhibit import Figure
+from imulab.files import write_text
 from imulab.present import exhibits_of
-from imulab.recording import Recording
-from imulab.tumble.engineering import engineering_rows
-from imulab.units import from_si
+from imulab.report import Card, render_index
 
-_GRAVITY = 9.81362  # m/s^2, the simulated laboratory
-_KNOCKED = 7
+
+@dataclass(frozen=True)
+class Scenario:
+    """A question, the commands that answer it, and the record that they write."""
+
+    name: str
+    question: str
+    commands: str
+    record: str
+
+    @property
+    def lines(self) -> list[str]:
+        """The commands, one a line."""
+        return [line for line in self.commands.strip().splitlines() if line.strip()]
+
+
+SCENARIOS = (
+    Scenario(
+        "tumble",
+        "What are the errors of this accelerometer triad, with gravity as the only reference?",
+        """
+imulab tumble simulate --order 2 --gravity 9.81362 --knock 7 --seed 4 -o tumble.csv
+imulab tumble fit tumble.csv --gravity 9.81362 --loss huber -o tumble.json --report tumble.html
+imulab apply tumble.json tumble.csv -o tumble_corrected.csv
+""",
+        "tumble.json",
+    ),
+    Scenario(
+        "gyro array",
+        "What does fusing six cheap gyroscopes really buy?",
+        """
+imulab array simulate --experiment static --duration "400 s" -o array_still.csv
+imulab array simulate --experiment dynamic --session 1 -o array.csv
+imulab array simulate --experiment dynamic --session 1 --fault stuck:3:40:20 -o array_fault.csv
+imulab array calibrate array_still.csv -o array_calibration.json --report array_calibration.html
+imulab array fuse array_fault.csv --calibration array_calibration.json -o array_rate.csv
+imulab array compare array.csv --calibration array_calibration.json -o array.json --report array.html
+""",
+        "array.json",
+    ),
+    Scenario(
+        "warm-up",
+        "How large is the bias of the minutes after power-on, and what is left with a table in the unit?",
+        """
+imulab warmup simulate -o warmup
+imulab warmup fit warmup/*.csv --model auto -o warmup.json --report warmup.html
+""",
+        "warmup.json",
+    ),
+    Scenario(
+        "centrifuge",
+        "How does the g-sensitive drift of a flexible gyroscope change with g?",
+        """
+imulab centrifuge simulate --levels 1,5,10,20 --duration "3 min" --both-senses -o centrifuge
+imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report centrifuge.html
+""",
+        "centrifuge.json",
+    ),
+    Scenario(
+        "firmware",
+        "Does the unit compute what the desk has validated?",
+        """
+imulab export --to c tumble.json -o firmware
+make -C firmware test
+""",
+        "",
+    ),
+)
 
 
 def run(folder: str | Path = "demo") -> str:
-    """Simulate, fit, apply and report into `folder`; return what was found, as text.
+    """Run the scenarios in `folder`, with an index page; return what was found, as text.
 
     Raises
     ------
@@ -30,47 +102,62 @@ def run(folder: str | Path = "demo") -> str:
         home.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OptionError(f"{home}: the folder cannot be made: {error.strerror}") from None
-    return _tumble(home)
+    lines: list[str] = []
+    cards: list[Card] = []
+    with _inside(home):
+        for scenario in SCENARIOS:
+            said = ""
+            lines.append(f"{scenario.name}: {scenario.question}")
+            for line in scenario.lines:
+                lines.append(f"  $ {line}")
+                said = _done(line)
+            answer, figure = (said, None) if not scenario.record else _found(scenario)
+            lines += [f"  {answer}", ""]
+            link = scenario.record.replace(".json", ".html")
+            cards.append(Card(scenario.question, answer, scenario.lines, figure, link))
+        lead = "Four procedures on simulated instruments: the question, the answer, and the commands that found it."
+        write_text("index.html", render_index("imulab demonstration", lead, cards))
+    return "\n".join([*lines, f"firmware: {home / 'firmware'}", f"open {home / 'index.html'}"])
 
 
-def _tumble(home: Path) -> str:
-    """A MEMS triad turned by hand through 24 attitudes, one of them knocked."""
-    recording_file, record_file, report_file = home / "tumble.csv", home / "tumble.json", home / "tumble.html"
-    corrected_file = home / "tumble_corrected.csv"
-    il.write_csv(il.simulate_tumble(order=2, gravity=_GRAVITY, knock=_KNOCKED, seed=4), recording_file)
-
-    recording = il.read(recording_file)
-    attitudes = il.find_attitudes(recording)
-    fit = il.fit_tumble(attitudes, order="auto", gravity=_GRAVITY, loss="huber")
-    fit.calibration.save(record_file)
-    il.write_report(fit.calibration, report_file)
-    corrected = il.apply(il.load(record_file), recording)
-    il.write_csv(corrected, corrected_file)
-
-    lines = [
-        f"tumble: {len(recording)} samples, {len(attitudes)} attitudes (the knocked one, before and after, "
-        f"counts twice), order {fit.calibration.model['order']} chosen",
-        f"  {exhibits_of(fit.calibration).headline}",
-        f"  Against the simulated truth the median attitude was {_error(recording, attitudes.pieces) / 1e3:.1f} mg "
-        f"off, and is {_error(corrected, attitudes.pieces) / 1e3:.3f} mg off after correction.",
-    ]
-    for row in engineering_rows(fit.calibration):
-        value, uncertainty = row.text()
-        lines.append(f"  {row.name:<22} {value:>10} ± {uncertainty:<6} {row.unit}")
-    lines += [f"  note: {message}" for message in fit.calibration.warnings]
-    lines += [
-        f"  recording {recording_file}, record {record_file}, corrected data {corrected_file}",
-        "  the same by hand:",
-        f"    imulab tumble fit {recording_file} --gravity {_GRAVITY} --loss huber "
-        f"-o {record_file} --report {report_file}",
-        f"    imulab apply {record_file} {recording_file} -o {corrected_file}",
-        f"open {report_file}",
-    ]
-    return "\n".join(lines)
+@contextlib.contextmanager
+def _inside(folder: Path) -> Iterator[None]:
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
 
 
-def _error(recording: Recording, pieces: np.ndarray | None) -> float:
-    """Length of the error of an attitude's mean against the simulated truth, median over the attitudes, µg."""
-    error = recording.triad("accel") - recording.triad("truth_accel")
-    means = [error[start:stop].mean(axis=0) for start, stop, _ in (pieces if pieces is not None else [])]
-    return from_si(float(np.median(np.linalg.norm(means, axis=1))), "ug")
+def _done(line: str) -> str:
+    """Run a command; return the last line that it printed.
+
+    Raises
+    ------
+    ImulabError
+        It failed, with what it said.
+    """
+    from imulab.cli import main
+
+    words = shlex.split(line)
+    if words[0] == "make":
+        if shutil.which("make") is None or (shutil.which("cc") is None and "CC" not in os.environ):
+            return "not run: no make or no C compiler here"
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise ImulabError(f"{line}: {' '.join(done.stderr.split())}")
+        return next(text for text in done.stdout.splitlines() if "self-test" in text)
+    spread = [name for word in words[1:] for name in (sorted(map(str, Path().glob(word))) if "*" in word else [word])]
+    printed, complained = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complained):
+        status = main(spread)
+    if status:
+        raise ImulabError(f"{line}: {' '.join(complained.getvalue().split())}")
+    return next((text for text in reversed(printed.getvalue().splitlines()) if text.strip()), "")
+
+
+def _found(scenario: Scenario) -> tuple[str, Figure | None]:
+    exhibits = exhibits_of(load(scenario.record))
+    figures = [item for item in exhibits.items if isinstance(item, Figure)]
+    return exhibits.headline, figures[0] if figures else None

@@ -6,7 +6,10 @@ found. The command line prints the message alone and exits with 2.
 
 
 class ImulabError(Exception):
-    """Base of all errors that name a mistake in the input rather than in imulab."""
+    """Base of all errors that name a mistake in the input rather than in imulab; the message is one line."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(" ".join(message.splitlines()))  # names out of damaged files may hold ends of lines
 
 
 class ReadError(ImulabError):

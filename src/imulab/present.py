@@ -6,12 +6,13 @@ from pathlib import Path
 
 from imulab import report
 from imulab.calibration import Calibration
+from imulab.centrifuge import figures as centrifuge
 from imulab.errors import RecordError
 from imulab.exhibit import Exhibits
 from imulab.gyro_array import figures as gyro_array
 from imulab.tumble import figures as tumble
 
-_EXHIBITS = {"tumble": tumble.exhibits, "gyro_array": gyro_array.exhibits}
+_EXHIBITS = {"tumble": tumble.exhibits, "gyro_array": gyro_array.exhibits, "centrifuge": centrifuge.exhibits}
 
 
 def exhibits_of(record: Calibration) -> Exhibits:

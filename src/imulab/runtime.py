@@ -118,6 +118,24 @@ class Stream:
             raise OptionError(f"{settings.method}: {error}") from None
         self.settings = settings
 
+    @classmethod
+    def of_blob(cls, blob: bytes, settings: ArraySettings) -> Stream:
+        """Return the stream of an exported blob, as the unit runs it; `settings` repeat its method, elements and axes.
+
+        Raises
+        ------
+        RecordError
+            The blob cannot be used, or holds no array.
+        """
+        stream = cls.__new__(cls)
+        try:
+            stream._unit = _runtime.load(blob)
+            stream._state = _runtime.array_start(stream._unit)
+        except ValueError as error:
+            raise RecordError(f"the blob cannot fuse an array: {error}") from None
+        stream.settings = settings
+        return stream
+
     @property
     def rate(self) -> float:
         """Samples per second, which turns the times in the settings into samples; may change on the way."""

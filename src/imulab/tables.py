@@ -165,10 +165,17 @@ def monotone_range(nonlinearity: Array) -> tuple[float, float]:
 # ---- centrifuge ----------------------------------------------------------------------------------------------------
 
 
+_CURVE_UNITS = {"K0": "rad/s/(m/s^2)", "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2", "direction": "rad"}
+
+
 def _centrifuge(record: Calibration) -> tuple[Table, ...]:
     axes = [axis for axis in "xy" if f"{axis}_K0" in record.parameters]
     if not axes:
         raise RecordError("the record lacks x_K0")
+    for name, parameter in record.parameters.items():
+        expected = _CURVE_UNITS.get(name.rpartition("_")[2])
+        if expected is not None and parameter.unit != expected:
+            raise RecordError(f"the record has {name} in {parameter.unit!r}, expected {expected!r}")
     for axis in axes:
         if f"{axis}_direction" not in record.parameters:
             raise RecordError(

@@ -6,12 +6,15 @@ procedure is one entry of `TASKS` and one module-level pair of functions: texts 
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, ReadError
+from imulab.recording import Source
 from imulab.texts import chosen, quantity, whole_number
 
 if TYPE_CHECKING:
@@ -31,6 +34,15 @@ class Files(Protocol):
 
     def record(self, name: str) -> Calibration:
         """Return a calibration record."""
+
+    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+        """Return a recording in blocks; options as for `imulab.read_blocks`."""
+
+    def path(self, name: str) -> Path:
+        """Return where a file lies on this machine."""
+
+    def beside(self, name: str, file: str) -> str:
+        """Return the name of a file that file `name` names relative to itself."""
 
 
 def _silent(_: int) -> None:
@@ -194,6 +206,47 @@ def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
     return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
 
 
+# ---- centrifuge ----------------------------------------------------------------------------------------------------
+
+
+def _centrifuge_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.centrifuge.fit import check_options
+
+    method, curve = texts.get("method", "least-squares"), texts.get("curve", "auto")
+    check_options(method, curve)
+    return {"method": method, "curve": curve, "layout": texts.get("layout")}
+
+
+def _centrifuge_fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.centrifuge.fit import fit_centrifuge
+    from imulab.centrifuge.manifest import load_manifest
+
+    (manifest,) = files
+    test = load_manifest(access.path(manifest), manifest)
+    names = {run.file: access.beside(manifest, run.file) for run in test.runs}
+    for index, run in enumerate(test.runs):  # what is missing is said before hours of data are read
+        if not access.path(names[run.file]).is_file():
+            raise ReadError(f"{test.place(index)}: no such file")
+
+    def sources() -> list[Source]:
+        found = []
+        for name, path in [(manifest, manifest), *((run.file, names[run.file]) for run in test.runs)]:
+            with access.path(path).open("rb") as stream:
+                found.append(Source(name, hashlib.file_digest(stream, "sha256").hexdigest()))
+        return found
+
+    return fit_centrifuge(
+        test,
+        lambda run: access.blocks(names[run.file], values["layout"]),
+        method=values["method"],
+        curve=values["curve"],
+        sources=sources,
+        progress=progress,
+    ).calibration
+
+
 TASKS: dict[str, Task] = {
     "tumble": Task(
         procedure="tumble",
@@ -225,5 +278,14 @@ TASKS: dict[str, Task] = {
         paths=("layout",),
         values=_array_values,
         fit=_array_fit,
+    ),
+    "centrifuge": Task(
+        procedure="centrifuge",
+        files="the manifest of one test",
+        count=(1, 1),
+        options=("method", "curve", "layout"),
+        paths=("layout",),
+        values=_centrifuge_values,
+        fit=_centrifuge_fit,
     ),
 }

@@ -24,6 +24,7 @@ from imulab.cli.options import (
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
+    from imulab.blob import Blob
     from imulab.calibration import Calibration
     from imulab.gyro_array.fuse import FuseOptions, Fuser
     from imulab.gyro_array.simulate import Fault
@@ -172,12 +173,12 @@ def fuse(
         memory=gain,
         start=start,
         initial_bias=initial_bias if initial_bias in ("first", "zero") else _load(initial_bias, "--initial-bias"),
-        calibration=None if calibration is None else _load(calibration, "--calibration"),
+        calibration=None if calibration is None else _load_any(calibration),
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
         still=None if interval is None else _interval(interval, "--still"),
     )
     fuser = Fuser(options)
-    blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout, live=file == "-")))
+    blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout)))
     if output:
         write_csv(blocks, output)
     else:
@@ -195,6 +196,12 @@ def _load(name: str, option: str) -> Calibration:
     if option == "--initial-bias" and not Path(name).exists():
         raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
     return load(name)
+
+
+def _load_any(name: str) -> Calibration | Blob:
+    from imulab.blob import load_any
+
+    return load_any(name)
 
 
 def _interval(text: str, option: str) -> tuple[float, float]:

@@ -57,7 +57,7 @@ def comparison(found: Comparison) -> str:
         for method, rows in found.figures.items():
             if isinstance(rows, str):
                 body.append([method, *["–"] * (len(titles) - 1)])
-                reasons.append(f"{method} cannot run: {rows}")
+                reasons.append(f"({method} cannot run: {rows})")
                 continue
             row = rows[a]
             values = [
@@ -69,7 +69,7 @@ def comparison(found: Comparison) -> str:
             body.append([method, *(plain_number(v, 4) for v in values), *tail])
         lines += ["", *([f"axis {axis}"] if axis else []), *aligned(titles, body), *reasons]
         lines.append(
-            f"mean single gyro {plain_number(data['single'][a], 4)} {unit}; limit of one sample "
+            f"single gyro, mean of all: {plain_number(data['single'][a], 4)} {unit}; limit of one sample "
             f"{plain_number(data['limit'][a], 4)} {unit}"
         )
     lines.append(

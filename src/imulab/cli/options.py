@@ -72,6 +72,20 @@ class GivenFiles:
 
         return load(name)
 
+    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+        """Read a recording in blocks."""
+        from imulab.readers import read_blocks
+
+        return read_blocks(name, layout)
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file."""
+        return Path(name)
+
+    def beside(self, name: str, file: str) -> str:
+        """Return the name of a file that is named relative to another."""
+        return str(Path(name).parent / file)
+
 
 def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
     """Check before the work that each output has a folder to go to, and is no input nor another output.

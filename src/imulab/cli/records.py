@@ -23,7 +23,7 @@ from imulab.cli.options import (
     is_json,
     warn,
 )
-from imulab.errors import OptionError
+from imulab.errors import ImulabError, OptionError
 
 if TYPE_CHECKING:
     from imulab.blob import Blob
@@ -62,10 +62,9 @@ def apply(
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say at the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.applying import beyond_test_of, identity, warnings_of
-    from imulab.units import from_si
+    from imulab.applying import beyond_message, beyond_test_of, identity, warnings_of
 
-    count, largest, name = 0, 0.0, ""
+    counts, largest, name = [0] * len(records), [0.0] * len(records), ""
     for number, block in enumerate(blocks):
         if number == 0:
             messages = [message for record in records for message in warnings_of(record, block)]
@@ -73,14 +72,16 @@ def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> I
                 messages.append("the same record is applied twice")
             for message in dict.fromkeys(messages):
                 warn(message)
-        here, most = beyond_test_of(records[0], block)
-        count, largest, name = count + here, max(largest, most), block.name
+        for index, record in enumerate(records):
+            try:
+                here, most = beyond_test_of(record, block)
+            except ImulabError:  # what only an earlier record of the chain makes usable; apply itself refuses the rest
+                continue
+            counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
         yield block
-    if count:
-        warn(
-            f"{name}: {count} samples beyond 2 g (up to {from_si(largest, 'g'):.1f} g): "
-            "the record's nonlinearity was measured within 1 g"
-        )
+    for record, count, most in zip(records, counts, largest, strict=True):
+        if count:
+            warn(f"{name}: {beyond_message(record, count, most)}")
 
 
 def show(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 import queue
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from typing import Any, Protocol
 
 from imulab._version import VERSION
@@ -65,7 +67,8 @@ def _local(units: Sequence[Unit], job: Job, workers: int) -> Iterator[Outcome]:
     with parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1):
         parallel = Parallel(return_as="generator_unordered", pre_dispatch="3 * n_jobs")
         try:
-            yield from parallel(delayed(work)(unit, job) for unit in units)
+            mine = replace(job, driver=os.getpid())
+            yield from parallel(delayed(work)(unit, mine) for unit in units)
         except BrokenProcessPool as error:
             raise WorkersLostError(str(error)) from None
 

@@ -152,6 +152,7 @@ class _Keeper:
         self._over: dict[str, Outcome] = {}
         self._new: list[Summary] = []
         self._flushed = time.monotonic()
+        self._before = {path.stem for path in store.folder.glob("*.json")}
 
     def take(self, outcome: Outcome) -> None:
         """Take one outcome in."""
@@ -165,7 +166,8 @@ class _Keeper:
             write_text(self.store.record(unit.serial), outcome.text)
         if outcome.status == FAILED and self.store.reason(unit.serial) is None:
             self.store.fail(unit, outcome.reason)
-        self.kept += outcome.status == KEPT
+        # A record that was not there before was made by a process that ended before it could say so.
+        self.kept += outcome.status == KEPT and unit.serial in self._before
         self._over[unit.serial] = replace(outcome, text=None)
         if outcome.summary is not None:
             self._new.append(outcome.summary)

@@ -16,6 +16,7 @@ from imulab.errors import ImulabError, ReadError
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
+    from imulab.readers import Layout
     from imulab.recording import Recording
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[A-Za-z][A-Za-z0-9+.-]*)*://")
@@ -140,14 +141,35 @@ class UnitFiles:
         """Return the SHA-256 of a file by its name."""
         return sha256_of(self.path(name), name)
 
+    def _layout(self, name: str | None) -> Layout | None:
+        if name is None:
+            return None
+        from imulab.readers import load_layout
+
+        self.inputs[name] = self.sha256(name)
+        return load_layout(self.path(name), name)
+
+    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+        """Read a recording in blocks."""
+        from imulab.readers import read_blocks
+
+        self.inputs[name] = self.sha256(name)
+        return read_blocks(self.path(name), self._layout(layout), name=name)
+
+    def beside(self, name: str, file: str) -> str:
+        """Return the name of a file that file `name` names relative to itself, and note `name` as used."""
+        if name not in self.inputs:
+            self.inputs[name] = self.sha256(name)
+        if is_url(file) or (not is_url(name) and Path(file).is_absolute()):
+            return file
+        folder, slash, _ = name.rpartition("/")
+        return f"{folder}{slash}{file}"
+
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Read a recording as a whole; messages and the record call it as the manifest does."""
-        from imulab.readers import load_layout, read
+        from imulab.readers import read
 
-        known = None
-        if layout is not None:
-            known = load_layout(self.path(layout), layout)
-            self.inputs[layout] = self.sha256(layout)
+        known = self._layout(layout)
         recording = read(self.path(name), known, name=name, **part)
         if recording.source is not None:
             self.inputs[name] = recording.source.sha256

@@ -17,6 +17,7 @@ from imulab.recording import Array
 
 _BLOCKS = 20
 _WORST = 0.05
+_VISIBLE = 25.0  # variance of the motion over that of the noise, in the direction where it is least
 _NEAR_PERMUTATION = 0.35  # rad
 
 
@@ -51,7 +52,7 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
     Parameters
     ----------
     readings
-        In motion, biases removed, shape (m, axes, n), rad/s.
+        In motion, shape (m, axes, n), rad/s; their means are taken off.
     white
         Standard deviation of a sample at rest, shape (axes, n).
     truth
@@ -64,6 +65,9 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
     """
     m, axes, n = readings.shape
     stacked = np.moveaxis(readings, 2, 1).reshape(m, n * axes)  # element by element
+    # Biases may have changed since the array was at rest: what does not vary says nothing here.
+    stacked = stacked - stacked.mean(axis=0)
+    truth = None if truth is None else truth - truth.mean(axis=0)
     sigma = white.T.reshape(n * axes)
     edges = np.linspace(0, m, min(_BLOCKS, m // 4) + 1).astype(int)
     moments = [_moments(stacked[a:b], truth if truth is None else truth[a:b]) for a, b in pairwise(edges)]
@@ -72,8 +76,11 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
     without = np.array([_solve(total - part, sigma, axes, n, known=truth is not None) for part in moments])
     blocks = len(moments)
     uncertainty = np.sqrt((blocks - 1) / blocks * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-    if not np.isfinite(uncertainty).all() or uncertainty.max() > _WORST:
-        worst = int(np.argmax(np.nan_to_num(uncertainty, nan=np.inf).max(axis=(0, 1))))
+    size = n * axes
+    weakest = np.linalg.eigvalsh(total[:size, :size] / np.outer(sigma, sigma))[-axes] / m
+    if not np.isfinite(uncertainty).all() or uncertainty.max() > _WORST or weakest < _VISIBLE:
+        # Its own first element is nearest to the frame: the axis about which it moves least against its noise.
+        worst = int(np.argmin(readings[:, :, 0].std(axis=0) / white[:, 0]))
         axis = f" about {'xyz'[worst]}" if axes == 3 else ""
         raise ObservabilityError(
             f"the motion does not fix the elements' scale factors and alignment{axis} to {100 * _WORST:.0f} %; "

@@ -106,8 +106,8 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
         try:
             options = FuseOptions(method=method, calibration=calibration, rate=rate)
             fused = fuse(recording, options, weights=method == "robust", flags=method == "robust")
-            halves = _halves(recording, elements, options, start, stop)
-            bandwidth = _bandwidth(recording, elements, options, rate)
+            halves = _halves(recording, elements, options, calibration, start, stop)
+            bandwidth = _bandwidth(recording, elements, options, calibration, rate)
         except ImulabError as problem:
             figures[method] = str(problem)
             continue
@@ -239,39 +239,26 @@ def _moving(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
 
 
 def _halves(
-    recording: Recording, elements: Elements, options: FuseOptions, start: int, stop: int
+    recording: Recording, elements: Elements, options: FuseOptions, record: Calibration | None, start: int, stop: int
 ) -> list[float] | None:
     """Standard deviation of the difference of the two halves of the array (odd and even elements), each axis."""
-    if elements.count < _HALVES:
+    if elements.count < _HALVES or options.method == "covariance":
         return None
+    readings, _ = _corrected(recording, elements, record)
+    plain = replace(options, calibration=None)
     rates = []
     for first in (0, 1):
-        chosen = range(first, elements.count, 2)
-        names = [[row[i] for i in chosen] for row in elements.names]
-        half = replace(elements, names=tuple(tuple(row) for row in names))
-        stream = (
-            open_stream(
-                replace(options, calibration=None, initial_bias="first"),
-                half,
-                options.rate or 1.0,
-                _part(recording, elements, options, chosen)[:10_000],
-            )
-            if options.method != "covariance"
-            else None
-        )
-        if stream is None:
-            return None
-        rates.append(stream.process(_part(recording, elements, options, chosen)).rate[start:stop])
+        half = replace(elements, names=tuple(row[first::2] for row in elements.names))
+        part = np.ascontiguousarray(readings[:, :, first::2])
+        stream = open_stream(plain, half, options.rate or 1.0, part[:10_000])
+        rates.append(stream.process(part, flags=False).rate[start:stop])
     apart: Array = rates[0] - rates[1]
     return [float(np.nanstd(difference)) for difference in apart.T]
 
 
-def _part(recording: Recording, elements: Elements, options: FuseOptions, chosen: range) -> Array:
-    readings, _ = _corrected(recording, elements, options.calibration)
-    return np.ascontiguousarray(readings[:, :, list(chosen)])
-
-
-def _bandwidth(recording: Recording, elements: Elements, options: FuseOptions, rate: float) -> list[float]:
+def _bandwidth(
+    recording: Recording, elements: Elements, options: FuseOptions, record: Calibration | None, rate: float
+) -> list[float]:
     """Frequency at -3 dB of each axis: response to a small white probe that all gyros see, by its cross-spectrum."""
     readings = elements.readings(recording)[:_PROBE_SAMPLES]
     rng = np.random.default_rng(0)
@@ -279,8 +266,8 @@ def _bandwidth(recording: Recording, elements: Elements, options: FuseOptions, r
     probe = rng.standard_normal(readings.shape[:2]) * np.where(size > 0, size, 1.0)
     # The probe is one rate for all: it must look the same through every element's matrix.
     seen = np.repeat(probe[:, :, None], elements.count, axis=2)
-    if options.calibration is not None:
-        matrices = array_calibration(options.calibration, elements).matrices
+    if record is not None:
+        matrices = array_calibration(record, elements).matrices
         if matrices is not None:
             seen = np.einsum("nab,mb->man", np.linalg.inv(matrices), probe)
     plain, shaken = (

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from imulab.blob import Blob
 from imulab.calibration import Calibration
-from imulab.errors import DataError, OptionError
+from imulab.errors import DataError, OptionError, RecordError
 from imulab.gyro_array.clocks import Clock, to_one_clock
 from imulab.gyro_array.health import Health
 from imulab.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
@@ -22,7 +23,7 @@ from imulab.gyro_array.model import (
     find_elements,
 )
 from imulab.recording import Array, Recording
-from imulab.units import from_si, parse_unit
+from imulab.units import conversion_factor, from_si, parse_unit
 
 _NEED_THREE = ("robust", "support", "least-squares")
 _FOR_NOISE = 10_000
@@ -44,7 +45,8 @@ class FuseOptions:
     initial_bias
         ``first``, ``zero``, or the record of an array calibration whose biases the recursion starts from.
     calibration
-        Record whose biases (and matrices, where it has them) are taken off first; its noise gives weights and gains.
+        Record whose biases (and matrices, where it has them) are taken off first; its noise gives weights and gains. Or
+        the blob of such a record: what the unit runs, `robust` with the unit's settings and float numbers.
     rate
         Sampling rate, Hz; from the recording's first steps of time where None.
     rate_walk
@@ -57,7 +59,7 @@ class FuseOptions:
     memory: str | float = "growing"
     start: int = 1
     initial_bias: str | Calibration = "first"
-    calibration: Calibration | None = None
+    calibration: Calibration | Blob | None = None
     rate: float | None = None
     rate_walk: float = RATE_WALK
     still: tuple[float, float] | None = None
@@ -76,6 +78,10 @@ class FuseOptions:
             raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record")
         if self.method == "covariance" and self.calibration is None:
             raise OptionError("method covariance needs --calibration RECORD: its weights come from a recording at rest")
+        if isinstance(self.calibration, Blob) and (self.method, self.memory, self.start) != ("robust", "growing", 1):
+            raise OptionError(
+                f"{self.calibration.name}: a blob fuses by robust with growing memory, and by nothing else"
+            )
         if self.rate is not None and not 0 < self.rate < 1e9:
             raise OptionError(f"rate {self.rate:g}: expected a positive number of Hz")
 
@@ -257,6 +263,8 @@ def open_stream(options: FuseOptions, elements: Elements, rate: float, first: Ar
     """
     from imulab.runtime import array_stream
 
+    if isinstance(options.calibration, Blob):
+        return _blob_stream(options.calibration, elements)
     calibration = None if options.calibration is None else _of(options.calibration, elements)
     initial: Any = options.initial_bias
     bias = None if calibration is None else calibration.bias
@@ -289,6 +297,36 @@ def open_stream(options: FuseOptions, elements: Elements, rate: float, first: Ar
     if options.method == "kalman":
         settings["gain"] = _gain(options, elements, rate, first, calibration)
     return array_stream(options.method, **settings)
+
+
+@dataclass(frozen=True)
+class _InUnits:
+    """A stream in rad/s behind readings in another unit."""
+
+    stream: Any
+    factor: Array
+
+    def process(self, readings: Array, **more: Any) -> Any:
+        out = self.stream.process(readings * self.factor[:, None], **more)
+        return replace(out, rate=out.rate / self.factor)
+
+
+def _blob_stream(blob: Blob, elements: Elements) -> _InUnits:
+    """Return the stream of an exported blob."""
+    from imulab.runtime import Stream
+    from imulab.tables import ArraySettings
+
+    section = next((s for s in blob.text["sections"] if s["kind"] == "array"), None)
+    if section is None:
+        raise RecordError(f"{blob.name}: the blob holds no array")
+    if (section["elements"], section["axes"]) != (elements.count, len(elements.axes)):
+        raise RecordError(
+            f"{blob.name}: the blob holds {section['elements']} elements on {section['axes']} axes, "
+            f"the recording {elements.count} on {len(elements.axes)}"
+        )
+    factor = np.array([conversion_factor(unit, "rad/s") for unit in elements.units])
+    settings = ArraySettings(section["method"], elements.count, len(elements.axes), rate=section["rate"])
+    return _InUnits(Stream.of_blob(blob.data, settings), factor)
 
 
 def _of(record: Calibration, elements: Elements) -> ArrayCalibration:

@@ -8,18 +8,17 @@ import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 
 from imulab.errors import ReadError
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import Layout, load_layout
 from imulab.readers.selection import Selection, windowed
 from imulab.readers.text import TextFile
-from imulab.recording import Recording, Source
-
-_LIVE_BYTES = 1 << 16
+from imulab.recording import Array, Recording, Source
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
@@ -68,9 +67,9 @@ def read(
     blocks = list(windowed(_blocks(file, name, known, selection, hashed), window, name))
     source = Source(name, hashed.of(file))
     first = blocks[0]
-    joined = {key: np.concatenate([block.columns[key] for block in blocks]) for key in first.columns}
+    joined = {key: _joined([block.columns[key] for block in blocks]) for key in first.columns}
     return Recording(
-        columns=joined if len(blocks) > 1 else first.columns,
+        columns=joined,
         units=first.units,
         metadata=first.metadata,
         name=first.name,
@@ -89,16 +88,27 @@ def read_blocks(
     instance: int | None = None,
     window: tuple[float | None, float | None] | None = None,
     name: str | None = None,
-    live: bool = False,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
-    Parameters and errors are those of `read`; every block has the metadata, and knows its first row. With `live`, whole
-    lines of standard input are a block as soon as they are there.
+    Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
     """
     selection = Selection(topic, instance, window)
     name = name or _name(file)
-    yield from windowed(_blocks(file, name, _layout(layout), selection, None, live=live), window, name)
+    yield from windowed(_blocks(file, name, _layout(layout), selection, None), window, name)
+
+
+def _joined(parts: list[Array]) -> Array:
+    """Join the parts of a column, without a copy where they lie one behind the other in memory."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    begins = [part.__array_interface__["data"][0] for part in parts]
+    follows = [begin + part.nbytes for begin, part in zip(begins, parts, strict=True)]
+    one = first.base is not None and all(part.base is first.base and part.strides == (8,) for part in parts)
+    if one and begins[1:] == follows[:-1]:
+        return as_strided(first, shape=(sum(map(len, parts)),), strides=(8,))
+    return np.concatenate(parts)
 
 
 class _Hash:
@@ -125,13 +135,7 @@ class _Hash:
 
 
 def _blocks(
-    file: str | Path,
-    name: str,
-    layout: Layout | None,
-    selection: Selection,
-    hashed: _Hash | None,
-    *,
-    live: bool = False,
+    file: str | Path, name: str, layout: Layout | None, selection: Selection, hashed: _Hash | None
 ) -> Iterator[Recording]:
     """Yield the blocks of a file by what its first bytes say it is."""
     if str(file) != "-" and Path(file).is_dir():
@@ -151,9 +155,7 @@ def _blocks(
         return
     selection.refuse(name, "a text file")
     with _open(file, name) as stream:
-        if live:
-            stream = cast(BinaryIO, _Live(stream))
-        text = TextFile(stream, name, layout, hashed=hashed is not None)
+        text = TextFile(stream, name, layout, hashed=hashed is not None, whole=hashed is not None)
         if hashed is not None:
             hashed.text = text
         yield from text.blocks()
@@ -176,16 +178,6 @@ def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording
 
 
 _FAMILIES = {kind.module: _family(kind.module, by_layout=kind.layout != "none") for kind in FORMATS}
-
-
-class _Live:
-    """A stream whose `read` returns what is there instead of waiting for all that was asked for."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-
-    def read(self, size: int) -> bytes:
-        return bytes(self._stream.read1(min(size, _LIVE_BYTES)))  # type: ignore[attr-defined]
 
 
 def _name(file: str | Path) -> str:

@@ -53,7 +53,7 @@ class Format:
 FORMATS = (
     Format("Parquet", ".parquet", "parquet", lambda h: h.startswith(b"PAR1"), "pyarrow", "tables", "possible", True),
     Format("MATLAB v7.3", ".mat", "hdf5", lambda h: h.startswith(_MAT73), "h5py", "hdf5", "needed"),
-    Format("MATLAB v5 to v7", ".mat", "mat", lambda h: h.startswith(_MAT), "scipy", "", "needed"),
+    Format("MATLAB v5 to v7", ".mat", "mat", lambda h: h.startswith(_MAT), layout="needed"),
     Format("HDF5", ".h5 .hdf5", "hdf5", lambda h: h.startswith(_HDF5) or h[512:520] == _HDF5, "h5py", "hdf5", "needed"),
     Format("ROS 1 bag", ".bag", "rosbag", lambda h: h.startswith(b"#ROSBAG V"), "lz4", "ros"),
     Format("ROS 2 MCAP", ".mcap, a folder", "rosbag", lambda h: h.startswith(b"\x89MCAP"), "lz4", "ros"),
@@ -105,7 +105,8 @@ def table() -> tuple[list[str], list[list[str]]]:
                 kind.endings,
                 "read, write" if kind.writes else "read",
                 {"none": "", "possible": "for foreign columns", "needed": "--layout"}[kind.layout],
-                needs or (f"{kind.library} is here" if optional else "nothing"),
+                (needs or (f"{kind.library} is here" if optional else "nothing"))
+                + (" (where compressed)" if kind.extra == "ros" else ""),
             ]
         )
     return ["format", "files", "", "layout", "needs"], rows

@@ -1,12 +1,19 @@
-"""MATLAB files of version 5 to 7 through a layout: ``from = "variable"``, ``"struct/field"``, ``"matrix[0]"``."""
+"""MATLAB files of version 5 to 7 through a layout: ``from = "variable"``, ``"struct/field"``, ``"matrix[0]"``.
+
+Read here and not by scipy.io, whose compiled reader ends the process on some damaged files. Source: MathWorks,
+"MAT-File Format" (version 5): a head of 128 bytes, then elements u32 type, u32 size, payload padded to 8 bytes; a
+matrix is an element that holds flags, dimensions, name and numbers.
+"""
 
 from __future__ import annotations
 
-import warnings
+import struct
+import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
+from math import prod
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +21,32 @@ from imulab.errors import ReadError
 from imulab.readers.arrays import origins, recordings, sliced, to_floats
 from imulab.readers.layout import Layout
 from imulab.recording import Array, Recording
+
+_HEAD = 128
+_MATRIX, _COMPRESSED = 14, 15
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_STRUCT, _FIRST_NUMBER, _LAST_NUMBER = 2, 6, 15
+_CLASSES = {1: "a cell", 2: "a struct", 3: "an object", 4: "text", 5: "a sparse matrix"}
+_COMPLEX = 0x0800
+_DEEPEST = 20
+
+
+class _DamagedError(Exception):
+    """What is there is no element of the format."""
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """A variable: name, dimensions, class, and either its numbers or its fields; both None for other classes."""
+
+    name: str
+    shape: tuple[int, ...]
+    kind: int
+    numbers: np.ndarray | None = None
+    fields: dict[str, _Variable] | None = None
+
+    def describe(self) -> str:
+        return f"{self.name} ({' x '.join(map(str, self.shape))})"
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
@@ -24,52 +57,134 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     ReadError
         The file is cut or damaged, there is no layout, or a variable is not there or no column.
     """
+    wanted = origins(layout, name, "MATLAB") if layout is not None else {}
+    roots = {variable.partition("/")[0] for variable, _ in wanted.values()}
+    try:
+        with path.open("rb") as stream:
+            variables = {found.name: found for found in _variables(stream.read(), roots)}
+    except (_DamagedError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
+        raise ReadError(f"{name}: truncated or damaged, not a whole MATLAB file: {error}") from None
     if layout is None:
-        found = ", ".join(f"{key} ({' x '.join(map(str, shape))})" for key, shape, _ in _call("whosmat", path, name))
-        raise ReadError(
-            f"{name}: say with --layout FILE.toml which variable is which column; variables found: {found or 'none'}"
-        )
-    wanted = origins(layout, name, "MATLAB")
-    roots = sorted({variable.partition("/")[0] for variable, _ in wanted.values()})
-    variables = _call("loadmat", path, name, variable_names=roots)
+        found = ", ".join(variable.describe() for variable in variables.values()) or "none"
+        raise ReadError(f"{name}: say with --layout FILE.toml which variable is which column; variables found: {found}")
     take: dict[str, Callable[[int, int], Array]] = {}
     lengths: dict[str, int] = {}
-    for column, (variable, number) in wanted.items():
-        where = f"{name}: {layout.name} takes {column} from {variable!r}"
-        root, *fields = variable.split("/")
-        if root not in variables:
-            found = " ".join(str(key) for key, *_ in _call("whosmat", path, name))
-            raise ReadError(f"{where}, found {found or 'no variables'}")
-        array: Any = variables[root]
-        for field in fields:
-            names = getattr(getattr(array, "dtype", None), "names", None)
-            if not names or field not in names:
-                raise ReadError(f"{where}, found {' '.join(names) if names else 'no struct'}")
-            array = array[field]
-            while isinstance(array, np.ndarray) and array.dtype == object and array.size == 1:
-                array = array.ravel()[0]
-        if not isinstance(array, np.ndarray) or array.dtype.names:
-            raise ReadError(
-                f"{where}: expected numbers, found {'a struct' if hasattr(array, 'dtype') else type(array).__name__}"
-            )
-        if array.dtype.kind not in "iufb":
-            raise ReadError(f"{where}: expected real numbers, found {array.dtype}")
+    for column, (path_there, number) in wanted.items():
+        where = f"{name}: {layout.name} takes {column} from {path_there!r}"
+        array = _numbers(variables, path_there, where)
         lengths[column], rows = sliced(array.shape, number, False, where)
         take[column] = partial(_floats, rows, array, where)
     yield from recordings(take, lengths, layout, name)
 
 
-def _floats(rows: Callable[[Any, int, int], Any], array: Any, where: str, start: int, stop: int) -> Array:
+def _floats(
+    rows: Callable[[np.ndarray, int, int], np.ndarray], array: np.ndarray, where: str, start: int, stop: int
+) -> Array:
     return to_floats(rows(array, start, stop), where)
 
 
-def _call(function: str, path: Path, name: str, **options: Any) -> Any:
-    import scipy.io
+def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarray:
+    """Return the numbers of ``variable`` or ``struct/field``."""
+    inside: dict[str, _Variable] | None = variables
+    for part in path.split("/"):
+        if inside is None:
+            raise ReadError(f"{where}, found no struct")
+        if part not in inside:
+            raise ReadError(f"{where}, found {' '.join(inside) or 'no variables'}")
+        variable = inside[part]
+        inside = variable.fields
+    if variable.numbers is None:
+        raise ReadError(f"{where}: expected numbers, found {_CLASSES.get(variable.kind, 'something else')}")
+    return variable.numbers
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return getattr(scipy.io, function)(path, appendmat=False, **options)
-    except (Exception, MemoryError) as error:  # scipy raises whatever the bytes lead it to
-        text = " ".join(str(error).split())[:160] or type(error).__name__
-        raise ReadError(f"{name}: not a whole MATLAB file: {text}") from None
+
+# --- the format ----------------------------------------------------------------------------------------------------
+
+
+def _variables(data: bytes, wanted: set[str]) -> Iterator[_Variable]:
+    """Yield the variables of a file, the numbers only of those that are wanted."""
+    if len(data) < _HEAD:
+        raise _DamagedError(f"the head has {len(data)} bytes, expected {_HEAD}")
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise _DamagedError("the head does not tell the order of bytes")
+    at = _HEAD
+    while at < len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at) if at + 8 <= len(data) else (0, len(data))
+        if size > len(data) - at - 8:
+            raise _DamagedError(f"no whole variable at byte {at}")
+        payload = data[at + 8 : at + 8 + size]
+        at += 8 + size
+        if kind == _COMPRESSED:
+            unpacker = zlib.decompressobj()
+            payload = unpacker.decompress(payload)
+            if not unpacker.eof:
+                raise _DamagedError(f"the variable before byte {at} does not unpack to its end")
+            elements = list(_elements(payload, order))
+            if len(elements) != 1:
+                raise _DamagedError(f"no single variable before byte {at}")
+            kind, payload = elements[0]
+        if kind != _MATRIX:
+            raise _DamagedError(f"an element of type {kind} before byte {at}, expected a variable")
+        yield _matrix(payload, order, wanted, 0)
+
+
+def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Yield type and payload of the elements within another; small ones have theirs in the tag."""
+    at = 0
+    while at < len(data):
+        if len(data) - at < 8:
+            raise _DamagedError("an element is cut")
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        small = kind >> 16
+        start = at + 4 if small else at + 8
+        kind, size = (kind & 0xFFFF, small) if small else (kind, size)
+        if size > (4 if small else len(data) - start):
+            raise _DamagedError(f"an element of {size} bytes in {len(data) - start}")
+        yield kind, data[start : start + size]
+        at = at + 8 if small else start + size + (-size % 8)
+
+
+def _matrix(data: bytes, order: str, wanted: set[str] | None, depth: int) -> _Variable:
+    """Take a matrix apart; `wanted` None: whatever its name."""
+    if not data:
+        return _Variable("", (0, 0), 0)  # an empty field
+    elements = _elements(data, order)
+    flags = struct.unpack_from(f"{order}I", _next(elements, (6,)))[0]
+    shape = tuple(int(n) for n in np.frombuffer(_next(elements, (5,)), f"{order}i4"))
+    if len(shape) < 2 or min(shape) < 0:
+        raise _DamagedError(f"dimensions {shape}")
+    name = _next(elements, (1, 2)).decode("utf-8")
+    kind = flags & 0xFF
+    if wanted is not None and name not in wanted:
+        return _Variable(name, shape, kind)
+    if kind == _STRUCT and prod(shape) == 1 and depth < _DEEPEST:
+        return _Variable(name, shape, kind, fields=_fields(elements, order, depth))
+    if not _FIRST_NUMBER <= kind <= _LAST_NUMBER or flags & _COMPLEX:
+        return _Variable(name, shape, kind)
+    stored, payload = next(elements, (0, b""))
+    if stored not in _STORED:
+        raise _DamagedError(f"numbers of type {stored} in {name!r}")
+    numbers = np.frombuffer(payload, order + _STORED[stored] if _STORED[stored][1] != "1" else _STORED[stored])
+    if numbers.size != prod(shape):
+        raise _DamagedError(f"{name!r} has {numbers.size} numbers, expected {' x '.join(map(str, shape))}")
+    return _Variable(name, shape, kind, numbers=numbers.reshape(shape, order="F"))
+
+
+def _fields(elements: Iterator[tuple[int, bytes]], order: str, depth: int) -> dict[str, _Variable]:
+    width = struct.unpack_from(f"{order}i", _next(elements, (5,)))[0]
+    names = _next(elements, (1, 2))
+    if width < 1 or len(names) % width:
+        raise _DamagedError(f"names of {width} in {len(names)} bytes")
+    fields = {}
+    for start in range(0, len(names), width):
+        name = names[start : start + width].partition(b"\0")[0].decode("utf-8")
+        fields[name] = _matrix(_next(elements, (_MATRIX,)), order, None, depth + 1)
+    return fields
+
+
+def _next(elements: Iterator[tuple[int, bytes]], kinds: tuple[int, ...]) -> bytes:
+    kind, payload = next(elements, (0, b""))
+    if kind not in kinds:
+        raise _DamagedError(f"an element of type {kind}, expected {kinds[0]}")
+    return payload

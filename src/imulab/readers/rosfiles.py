@@ -289,13 +289,14 @@ class Sqlite:
     def _query(self, text: str) -> Iterator[list[tuple[Any, ...]]]:
         try:
             connection = sqlite3.connect(f"{self._path.resolve().as_uri()}?immutable=1", uri=True)
+            connection.text_factory = lambda data: data.decode("utf-8", "replace")
             try:
                 cursor = connection.execute(text)
                 while rows := cursor.fetchmany(_AT_ONCE):
                     yield rows
             finally:
                 connection.close()
-        except (sqlite3.Error, OverflowError) as error:
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
             raise ReadError(f"{self._name}: not a ROS 2 bag, or damaged: {error}") from None
 
 

@@ -14,9 +14,7 @@ from codecs import BOM_UTF8
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import BinaryIO
 
 import numpy as np
@@ -27,24 +25,12 @@ from imulab.readers.layout import Layout
 from imulab.recording import Recording, parse_column_title
 from imulab.tens import powers_of_five
 
-_BLOCK_BYTES = 1 << 22
+_BLOCK_BYTES = 1 << 21
 _WORTH_SHARING = 1 << 19
-_AHEAD = 2
 _MOST_THREADS = 8
 
 _text.prepare(powers_of_five())
 _LONGEST_LINE = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """A block that is being parsed: its bytes, first row, rows, numbers, and each part's first line and answer."""
-
-    block: bytes
-    row: int
-    rows: int
-    out: np.ndarray
-    answers: list[tuple[int, Callable[[], tuple[int, int, int]]]]
 
 
 class _Crew:
@@ -97,7 +83,9 @@ class _Hash:
 class TextFile:
     """One pass over a text file; the head is read when it is opened, rows come from `blocks`."""
 
-    def __init__(self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True) -> None:
+    def __init__(
+        self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True, whole: bool = False
+    ) -> None:
         self._live = _is_pipe(stream)
         self._read = getattr(stream, "read1", stream.read) if self._live else stream.read
         self._name = name
@@ -105,6 +93,10 @@ class TextFile:
         self._hash = _Hash() if hashed else None
         self._rest = b""
         self._ended = False
+        self._taken = 0
+        self._size = os.fstat(stream.fileno()).st_size if whole and not self._live and _is_file(stream) else 0
+        self._room: np.ndarray | None = None
+        self._used = 0
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
         self._lines_before = 0
         self._read_more()
@@ -137,16 +129,17 @@ class TextFile:
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
         row = 1
-        waiting: deque[_Task] = deque()
+        waiting: deque[tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]] = deque()
         with _Crew() as crew:
             while True:
                 block = self._next_lines()
                 if block is not None:
-                    waiting.append(self._begin(block, row, crew))
-                    row += waiting[-1].rows
+                    waiting.append(self._begin(block, crew))
                 # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
-                while waiting and (block is None or self._live or len(waiting) > _AHEAD):
-                    yield self._finish(waiting.popleft())
+                while waiting and (block is None or self._live or len(waiting) > crew.size):
+                    recording = self._finish(*waiting.popleft(), row)
+                    row += len(recording)
+                    yield recording
                 if block is None:
                     break
         if row == 1:
@@ -163,6 +156,7 @@ class TextFile:
         except OSError as error:
             raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
         self._ended = not data
+        self._taken += len(data)
         if self._hash:
             self._hash.update(data)
         return data
@@ -230,6 +224,8 @@ class TextFile:
             raise ReadError(f"{self._name}: only comments; expected a line of titles 'name [unit]' and rows")
         if line.lstrip().startswith("{"):
             raise ReadError(f"{self._name}: expected a recording, found JSON (a calibration record?)")
+        if line.startswith("FMT,"):
+            raise ReadError(f"{self._name}: an ArduPilot log as text; expected the binary log (.bin) it was made from")
         if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
             raise ReadError(
                 f"{self._name}: line {self._lines_before}: expected titles such as 'time [s],accel_x [m/s^2]', "
@@ -281,30 +277,32 @@ class TextFile:
 
     # --- rows --------------------------------------------------------------------------------------------------
 
-    def _begin(self, block: bytes, row: int, crew: _Crew) -> _Task:
-        """Begin to parse a block of whole lines, in as many parts as there are threads."""
-        parts = crew.size if len(block) >= _WORTH_SHARING else 1
-        cuts = [0, *(block.find(b"\n", len(block) * part // parts) + 1 for part in range(1, parts)), len(block)]
-        cuts = sorted(set(cuts))
-        lines = [block.count(b"\n", start, stop) for start, stop in pairwise(cuts)]
-        lines[-1] += 1
-        total = sum(lines)
-        out = np.empty((len(self._titles), total))
-        answers, first = [], 0
-        for count, (start, stop) in zip(lines, pairwise(cuts), strict=True):
-            job = partial(_text.parse, block, self._delimiter, self._slots, out, total, start, stop, first)
-            answers.append((first, crew.begin(job) if parts > 1 else job))
-            first += count
-        return _Task(block, row, total, out, answers)
+    def _begin(self, block: bytes, crew: _Crew) -> tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]:
+        """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
+        capacity = block.count(b"\n") + 1
+        room, first = self._place_for(capacity, len(block))
+        job = partial(_text.parse, block, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
+        return block, room[:, first : first + capacity], crew.begin(job) if len(block) >= _WORTH_SHARING else job
 
-    def _finish(self, task: _Task) -> Recording:
-        """Wait for a block and return its rows."""
-        row, rows = task.row, task.rows
-        for first, answer in task.answers:
-            done, problem, field = answer()
-            if problem:
-                self._refuse(task.block, row, first + done, problem, field)
-        columns = dict(zip(self._titles, task.out, strict=True))
+    def _place_for(self, rows: int, size: int) -> tuple[np.ndarray, int]:
+        """Return an array of columns, and the row of it where a block of so many rows and bytes goes.
+
+        A file that is read as a whole goes into one array, made for as many rows as its first block foretells.
+        """
+        if self._size and self._room is None:
+            left = max(self._size - self._taken + len(self._rest), 0)
+            self._room = np.empty((len(self._titles), rows + int(1.02 * rows * left / size) + 16))
+        if self._room is None or self._used + rows > self._room.shape[1]:
+            return np.empty((len(self._titles), rows)), 0
+        first, self._used = self._used, self._used + rows
+        return self._room, first
+
+    def _finish(self, block: bytes, out: np.ndarray, answer: Callable[[], tuple[int, int, int]], row: int) -> Recording:
+        """Wait for a block and return its rows, which begin at row `row` of the file."""
+        rows, problem, field = answer()
+        if problem:
+            self._refuse(block, row, rows, problem, field)
+        columns = dict(zip(self._titles, out[:, :rows], strict=True))
         units = dict(self._units)
         layout = self._layout
         if layout is not None and layout.sample_rate is not None:
@@ -337,6 +335,14 @@ class TextFile:
 def _fields(line: str, delimiter: str) -> list[str]:
     """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
     return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
+
+
+def _is_file(stream: BinaryIO) -> bool:
+    """Whether the stream is an open file, whose size is known."""
+    try:
+        return stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def _is_pipe(stream: BinaryIO) -> bool:

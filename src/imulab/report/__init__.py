@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -13,21 +14,40 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure
 from imulab.files import write_text
 
-_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array"}
+_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array", "centrifuge": "Centrifuge test"}
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
     """Return the report of a record as HTML text."""
+    return render_page(
+        _TITLES.get(record.procedure, record.procedure.capitalize()),
+        record.sensor.get("serial", "unit without serial number"),
+        exhibits,
+        warnings=record.warnings,
+        provenance=_provenance(record),
+    )
+
+
+def render_page(
+    title: str,
+    subject: str,
+    exhibits: Exhibits,
+    *,
+    warnings: Sequence[str] = (),
+    provenance: Sequence[tuple[str, str]] = (),
+) -> str:
+    """Return exhibits as HTML text: subject, result, warnings, figures and tables, provenance."""
     plots = [item for item in exhibits.items if isinstance(item, Figure)]
     return str(
         _template("page.html.j2").render(
-            record=record,
-            title=_TITLES.get(record.procedure, record.procedure.capitalize()),
+            title=title,
+            subject=subject,
+            warnings=warnings,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
             plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
             plotly=_plotly(),
-            provenance=_provenance(record),
+            provenance=provenance,
         )
     )
 
@@ -38,6 +58,28 @@ def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicte
 
     shown = [{**item, "picture": Markup(item["picture"])} for item in attitudes]
     return str(_template("plan.html.j2").render(title=title, lead=lead, attitudes=shown, predicted=predicted))
+
+
+@dataclass(frozen=True)
+class Card:
+    """What an index shows of one piece of work: question, answer, commands, a figure and the report to open."""
+
+    question: str
+    answer: str
+    commands: list[str]
+    figure: Figure | None = None
+    link: str = ""
+
+
+def render_index(title: str, lead: str, cards: list[Card]) -> str:
+    """Return a page that leads to several reports as HTML text."""
+    figures = [card.figure for card in cards]
+    plots = [None if f is None else {"data": f.traces, "layout": f.layout, "height": f.height} for f in figures]
+    return str(
+        _template("index.html.j2").render(
+            title=title, lead=lead, cards=cards, plots=_json_for_script(plots), plotly=_plotly()
+        )
+    )
 
 
 def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:

@@ -1,0 +1,273 @@
+"""Runs to levels: the lines of all power cycles and both senses at one specific force, pooled with their covariance.
+
+A level's line is per unit of specific force: ``Z = (A + i B) / a``, rad/s/(m/s^2), one complex number for each axis.
+Without encoder its phase means nothing; then magnitudes are pooled, each corrected for noise (Rice: ``-sigma^2 / 2
+|Z|``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.centrifuge.manifest import SAME_LEVEL, Manifest
+from imulab.centrifuge.model import fog_share, real_covariance
+from imulab.centrifuge.regress import Complex
+from imulab.centrifuge.run import LoadedRun
+from imulab.errors import DataError
+from imulab.estimate import chi_square_limit, excess_variance
+from imulab.recording import Array
+
+
+@dataclass(frozen=True)
+class RunLine:
+    """The residual lines of a run per unit of specific force.
+
+    Attributes
+    ----------
+    line
+        Shape (p,) for p axes; real and positive where magnitudes are used.
+    noise
+        Covariance of (Re, Im) of each axis from noise, shape (2p, 2p).
+    rate
+        The same from the arm rate's uncertainty.
+    freedom
+        Of the noise.
+    """
+
+    source: LoadedRun
+    line: Complex
+    noise: Array
+    rate: Array
+    freedom: float
+
+    @property
+    def vector(self) -> Array:
+        """(Re, Im) of each axis, shape (2p,)."""
+        return as_vector(self.line)
+
+
+@dataclass(frozen=True)
+class Level:
+    """One specific force with the spin axis one way.
+
+    Attributes
+    ----------
+    number
+        From 1, by rising specific force, the reference being 1.
+    force
+        Mean over its runs, m/s^2.
+    line, covariance
+        Pooled, shapes (p,) and (2p, 2p), without the radius's uncertainty.
+    component_variance
+        Of the noise of one component, shape (p,), for the Rice correction.
+    freedom
+        Of the variance along each line, shape (p,).
+    runs
+        Numbers of its runs, counted from 0.
+    directed
+        Whether the lines are complex.
+    """
+
+    number: int
+    spin_axis: str
+    force: float
+    line: Complex
+    covariance: Array
+    component_variance: Array
+    freedom: Array
+    runs: tuple[int, ...]
+    directed: bool
+
+
+@dataclass(frozen=True)
+class Levels:
+    """All levels, spin axis up first, by rising force.
+
+    Attributes
+    ----------
+    items, lines
+        The levels, and the lines of each run by its number.
+    repeatability
+        Relative standard deviation between power cycles that was added to each run; 0 where noise explains the scatter.
+    chi_square, freedom
+        Of that scatter over the noise.
+    """
+
+    items: tuple[Level, ...]
+    lines: dict[int, RunLine]
+    repeatability: float
+    chi_square: float
+    freedom: int
+    warnings: tuple[str, ...]
+
+
+def as_vector(line: Complex) -> Array:
+    """Return (Re, Im) of each number, shape (2p,)."""
+    vector: Array = np.stack([line.real, line.imag], axis=1).ravel()
+    return vector
+
+
+def axis_lines(run: LoadedRun, method: str) -> tuple[Complex, Complex]:
+    """Return the lines of X - FOG and Y - i FOG, rad/s, and their covariance ``E[z z*]``, by one method."""
+    share = fog_share(len(run.channels) - 1)
+    if method == "fourier":
+        assert run.whole_periods is not None
+        line = share @ run.whole_periods.line
+    else:
+        line = share @ run.line
+    return line, share @ run.covariance @ share.conj().T
+
+
+def level_numbers(manifest: Manifest) -> dict[int, int]:
+    """Return the level of each loaded run, by index: numbers from 1 at the reference, 0 and less below it."""
+    loaded = sorted((run.arm_rate, index) for index, run in enumerate(manifest.runs) if run.role == "loaded")
+    clusters: list[list[int]] = []
+    first = 0.0
+    for rate, index in loaded:
+        if not clusters or rate > first * (1 + SAME_LEVEL):
+            clusters.append([])
+            first = rate
+        clusters[-1].append(index)
+    forces = [np.mean([manifest.force(manifest.runs[i]) for i in cluster]) for cluster in clusters]
+    reference = int(np.argmin([abs(force - manifest.reference) for force in forces]))
+    return {index: number - reference + 1 for number, cluster in enumerate(clusters) for index in cluster}
+
+
+def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> Levels:
+    """Pool runs into levels.
+
+    Raises
+    ------
+    DataError
+        Some runs have a Y axis and others do not.
+    """
+    with_y = {len(run.channels) == 3 for run in runs}
+    if len(with_y) > 1:
+        lacking = next(run for run in runs if len(run.channels) == 2)
+        raise DataError(f"{manifest.place(lacking.index)}: no column dtg_y, which other runs have")
+    numbers = level_numbers(manifest)
+    groups: dict[tuple[str, int], list[LoadedRun]] = {}
+    for run in runs:
+        if numbers[run.index] >= 1:
+            groups.setdefault((run.run.spin_axis, numbers[run.index]), []).append(run)
+    keys = sorted(groups, key=lambda key: (key[0] != "up", key[1]))
+    lines: dict[int, RunLine] = {}
+    warnings = []
+    undirected = []
+    for key in keys:
+        directed = all(run.encoder for run in groups[key])
+        senses = {run.run.sense for run in groups[key]}
+        if not directed and len(senses) == 2:
+            undirected.append(key[1])
+        for run in groups[key]:
+            lines[run.index] = _run_line(run, manifest, method, directed)
+    if undirected:
+        warnings.append(
+            f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes of "
+            f"the two "
+            "senses were averaged, so that flexure and tilt do not cancel"
+        )
+    members = [[lines[run.index] for run in groups[key]] for key in keys]
+    excess, chi_square, freedom = _repeatability(members)
+    items = [
+        _pooled(key[1], key[0], group, excess, freedom, all(line.source.encoder for line in group))
+        for key, group in zip(keys, members, strict=True)
+    ]
+    if excess:
+        warnings.append(
+            f"K differs between power cycles by {100 * np.sqrt(excess):.2g} % (one standard deviation) beyond the "
+            f"noise; "
+            "this was added to each run's uncertainty"
+        )
+    return Levels(tuple(items), lines, float(np.sqrt(excess)), chi_square, freedom, tuple(warnings))
+
+
+def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -> RunLine:
+    line, covariance = axis_lines(run, method)
+    line, covariance = line / run.force, covariance / run.force**2
+    if not directed:
+        size = np.maximum(np.abs(line), 1e-300)
+        unit = line.conj() / size
+        covariance = covariance * np.outer(unit, unit.conj())
+        if method == "least-squares":
+            size = size - np.diagonal(covariance).real / 4 / size
+        line = size.astype(np.complex128)
+    vector = as_vector(line)
+    relative = 2 * manifest.rate_uncertainty / run.run.arm_rate
+    # Amplitude lost to an uncertain table rate, (u T)^2 / 24: of second order, and small wherever the FOG's line is
+    # clear.
+    lost = 0.0 if run.rates.table_uncertainty is None else (run.rates.table_uncertainty * run.duration) ** 2 / 24
+    rate = (relative**2 + lost**2) * np.outer(vector, vector)
+    return RunLine(run, line, real_covariance(covariance), rate, run.freedom)
+
+
+def _weights(group: list[RunLine], axis: int, excess: float) -> Array:
+    """Inverse-variance weights of a level's runs for one axis; half for each sense where there are both."""
+    variance = np.array([_radial(line, axis, excess) for line in group])
+    weights: Array = 1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300)
+    senses = np.array([line.source.run.sense for line in group])
+    for sense in np.unique(senses):
+        weights[senses == sense] /= weights[senses == sense].sum() * len(np.unique(senses))
+    return weights
+
+
+def _radial(line: RunLine, axis: int, excess: float) -> float:
+    """Variance along the line of one axis."""
+    pair = slice(2 * axis, 2 * axis + 2)
+    noise = float(np.trace(line.noise[pair, pair])) / 2
+    return noise + float(np.trace(line.rate[pair, pair])) + excess * float(abs(line.line[axis])) ** 2
+
+
+def _pooled(number: int, spin_axis: str, group: list[RunLine], excess: float, freedom: int, directed: bool) -> Level:
+    axes = len(group[0].line)
+    weights = np.array([_weights(group, axis, excess) for axis in range(axes)])
+    line = np.einsum("ar,ra->a", weights, np.array([member.line for member in group]))
+    spread = np.repeat(weights, 2, axis=0)
+    covariance = np.zeros((2 * axes, 2 * axes))
+    for r, member in enumerate(group):
+        total = member.noise + member.rate + excess * np.outer(member.vector, member.vector)
+        covariance += spread[:, r, None] * total * spread[None, :, r]
+    component = np.zeros(axes)
+    dof = np.zeros(axes)
+    for axis in range(axes):
+        pair = slice(2 * axis, 2 * axis + 2)
+        noise = weights[axis] ** 2 * [float(np.trace(member.noise[pair, pair])) / 2 for member in group]
+        component[axis] = noise.sum()
+        between = float((weights[axis] ** 2 * excess * np.abs([m.line[axis] for m in group]) ** 2).sum())
+        known = float((weights[axis] ** 2 * [float(np.trace(m.rate[pair, pair])) for m in group]).sum())
+        spent = (noise**2 / [member.freedom for member in group]).sum() + between**2 / max(freedom, 1)
+        dof[axis] = (noise.sum() + between + known) ** 2 / max(spent, 1e-300)
+    return Level(
+        number, spin_axis, float(np.mean([m.source.force for m in group])), line, covariance, component,
+        np.minimum(dof, 1e9), tuple(m.source.index for m in group), directed,
+    )  # fmt: skip
+
+
+def _repeatability(members: list[list[RunLine]]) -> tuple[float, float, int]:
+    """Relative variance between power cycles beyond the noise; chi-square of the scatter, degrees of freedom."""
+    residuals, variances, freedom = [], [], 0
+    for group in members:
+        for sense in (1, -1):
+            same = [member for member in group if member.source.run.sense == sense]
+            if len(same) < 2:
+                continue
+            for axis in range(len(same[0].line)):
+                size = np.array([abs(member.line[axis]) for member in same])
+                variance = np.array([_radial(member, axis, 0.0) for member in same])
+                weights = 1 / np.maximum(variance, 1e-300)
+                mean = float((weights * size).sum() / weights.sum())
+                if mean**2 < 25 * variance.max():  # a line hardly above the noise says nothing of a relative scatter
+                    continue
+                residuals += list(size / mean - 1)
+                variances += list(variance / mean**2)
+                freedom += len(same) - 1
+    if not freedom:
+        return 0.0, 0.0, 0
+    left, expected = np.array(residuals)[None], np.maximum(np.array(variances)[None], 1e-24)
+    chi_square = float((left**2 / expected).sum())
+    if chi_square <= chi_square_limit(freedom):
+        return 0.0, chi_square, freedom
+    return float(excess_variance(left, expected, freedom)[0]), chi_square, freedom

@@ -1,0 +1,250 @@
+"""Levels to parameters: K, zeta, the curve, its direction and the cross terms, with one covariance over all of them.
+
+Every parameter is a function of the levels' lines; its derivative carries their covariance. The radius is common:
+with a relative error rho of R every K is off by -rho, c1 by -rho, c2 by -2 rho, zeta not at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imulab.centrifuge.curve import CurveFit, fit_curve
+from imulab.centrifuge.levels import Level, Levels, as_vector
+from imulab.centrifuge.manifest import Manifest
+from imulab.centrifuge.model import CROSS_UNIT, CURVE_UNITS, K_UNIT
+from imulab.estimate import chi_square_probability, coverage_factor
+from imulab.recording import Array
+
+_ROUNDING = 1e-7
+"""Turning of the drift, rad, below which nothing is said of it however small the noise."""
+
+
+@dataclass
+class _Row:
+    """A parameter under construction: value, derivative with respect to the levels' vectors, and to ln R."""
+
+    name: str
+    value: float
+    unit: str
+    derivative: Array
+    radius: float
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Parameters of a test.
+
+    Attributes
+    ----------
+    names, units
+        In the order of the record.
+    values, covariance
+        SI, shapes (p,), (p, p).
+    freedom, coverage
+        Effective degrees of freedom (Welch-Satterthwaite) and the factor of the 95 % interval, shapes (p,).
+    curves
+        Prefix (``x_``, ``y_``, ``x_down_`` ..) to the fitted curve.
+    turning
+        Prefix to the probability that the line's direction turns so much between levels by chance.
+    cross
+        Level to the complex cross term and half-sum of each axis, rad/s/(m/s^2)^2 and rad/s/(m/s^2).
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    covariance: Array
+    freedom: Array
+    coverage: Array
+    curves: dict[str, CurveFit]
+    turning: dict[str, float]
+    cross: dict[int, tuple[np.ndarray, np.ndarray]]
+    warnings: tuple[str, ...] = field(default=())
+
+
+def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "auto") -> Estimates:
+    """Return the parameters of all axes and both positions of the spin axis.
+
+    Parameters
+    ----------
+    levels
+        Pooled.
+    manifest
+        For radius and gravity.
+    method
+        ``least-squares`` (noise in magnitudes corrected) or ``fourier`` (not).
+    curve
+        Model of K(a), or ``auto``.
+
+    Raises
+    ------
+    OptionError
+        The curve's model is unknown or too large.
+    """
+    items = levels.items
+    axes = len(items[0].line)
+    width = 2 * axes
+    size = width * len(items)
+    V = np.zeros((size, size))
+    for index, level in enumerate(items):
+        V[index * width : (index + 1) * width, index * width : (index + 1) * width] = level.covariance
+    rows: list[_Row] = []
+    curves: dict[str, CurveFit] = {}
+    turning: dict[str, float] = {}
+    warnings: list[str] = []
+    for axis, letter in enumerate("xy"[:axes]):
+        for spin_axis, mark in (("up", ""), ("down", "down_")):
+            mine = [index for index, level in enumerate(items) if level.spin_axis == spin_axis]
+            if not mine:
+                continue
+            prefix = f"{letter}_{mark}"
+            K = [
+                _magnitude(items[index], index, axis, size, width, f"{prefix}K_{items[index].number}", method)
+                for index in mine
+            ]
+            rows += K
+            rows += [
+                _zeta(row, K[0], f"{prefix}zeta_{items[i].number}") for row, i in zip(K[1:], mine[1:], strict=True)
+            ]
+            fitted = _curve(prefix, K, items, mine, V, curve)
+            curves[prefix] = fitted[0]
+            rows += fitted[1]
+            if all(items[index].directed for index in mine):
+                direction, probability = _direction(prefix, items, mine, axis, V, size, width)
+                rows.append(direction)
+                turning[prefix] = probability
+            for row, index in zip(K, mine, strict=True):
+                u = float(np.sqrt(items[index].component_variance[axis]))
+                if row.value < 4 * u:
+                    warnings.append(
+                        f"{row.name}: the line is hardly above the noise ({row.value / max(u, 1e-300):.1f} sigma)"
+                    )
+    cross = _cross(items, axes, size, width, manifest, rows, warnings)
+    J = np.array([row.derivative for row in rows])
+    values = np.array([row.value for row in rows])
+    radius = np.array([row.radius for row in rows]) * manifest.radius_uncertainty / manifest.radius
+    covariance = J @ V @ J.T + np.outer(radius, radius)
+    freedom = _freedom(J, V, radius, items, width)
+    return Estimates(
+        names=tuple(row.name for row in rows),
+        units=tuple(row.unit for row in rows),
+        values=values,
+        covariance=(covariance + covariance.T) / 2,
+        freedom=freedom,
+        coverage=np.array([coverage_factor(float(nu) if nu < 1e6 else None) for nu in freedom]),
+        curves=curves,
+        turning=turning,
+        cross=cross,
+        warnings=tuple(warnings),
+    )
+
+
+def _magnitude(level: Level, index: int, axis: int, size: int, width: int, name: str, method: str) -> _Row:
+    line = level.line[axis]
+    modulus = max(abs(line), 1e-300)
+    derivative = np.zeros(size)
+    place = index * width + 2 * axis
+    derivative[place : place + 2] = line.real / modulus, line.imag / modulus
+    value = modulus
+    if level.directed and method == "least-squares":
+        value = modulus - level.component_variance[axis] / (2 * modulus)
+    return _Row(name, float(value), K_UNIT, derivative, -float(value))
+
+
+def _zeta(row: _Row, first: _Row, name: str) -> _Row:
+    ratio = row.value / first.value
+    return _Row(name, ratio - 1, "1", row.derivative / first.value - ratio / first.value * first.derivative, 0.0)
+
+
+def _curve(
+    prefix: str, K: list[_Row], items: tuple[Level, ...], mine: list[int], V: Array, model: str
+) -> tuple[CurveFit, list[_Row]]:
+    G = np.array([row.derivative for row in K])
+    force = np.array([items[index].force for index in mine])
+    fitted = fit_curve(force, np.array([row.value for row in K]), G @ V @ G.T, model)
+    p, D = fitted.coefficients, fitted.from_levels @ G
+    rows = [_Row(f"{prefix}K0", float(p[0]), CURVE_UNITS["K0"], D[0], -float(p[0]))]
+    for power, term in ((1, "c1"), (2, "c2")):
+        if term in fitted.model:
+            value = float(p[power] / p[0])
+            rows.append(
+                _Row(f"{prefix}{term}", value, CURVE_UNITS[term], (D[power] - value * D[0]) / p[0], -power * value)
+            )
+    return fitted, rows
+
+
+def _direction(
+    prefix: str, items: tuple[Level, ...], mine: list[int], axis: int, V: Array, size: int, width: int
+) -> tuple[_Row, float]:
+    """Angle of the pooled line, and the probability that the levels' angles differ so much by chance."""
+    lines = np.array([items[index].line[axis] for index in mine])
+    weights = 1 / np.maximum([items[index].component_variance[axis] for index in mine], 1e-60)
+    weights = weights / weights.sum()
+    pooled = complex((weights * lines).sum())
+    unit = pooled / max(abs(pooled), 1e-300)
+    derivative = np.zeros(size)
+    across = np.zeros((len(mine), size))
+    for number, (index, weight) in enumerate(zip(mine, weights, strict=True)):
+        place = index * width + 2 * axis
+        normal = np.array([-unit.imag, unit.real])
+        derivative[place : place + 2] = weight * normal / max(abs(pooled), 1e-300)
+        across[number, place : place + 2] = normal / max(abs(lines[number]), 1e-300)
+    # Angles of the levels against the pooled one; their covariance has one degree less than levels.
+    angle = np.angle(lines / unit)
+    spread = across - derivative
+    covariance = spread @ V @ spread.T + _ROUNDING**2 * np.eye(len(mine))
+    probability = 1.0
+    if len(mine) > 1:
+        chi_square = float(angle @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ angle)
+        probability = chi_square_probability(chi_square, len(mine) - 1)
+    return _Row(f"{prefix}direction", float(np.angle(pooled)), "rad", derivative, 0.0), probability
+
+
+def _cross(
+    items: tuple[Level, ...],
+    axes: int,
+    size: int,
+    width: int,
+    manifest: Manifest,
+    rows: list[_Row],
+    warnings: list[str],
+) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Add the cross terms where a level has the spin axis both ways: half the difference of its lines over g."""
+    where = {(level.spin_axis, level.number): index for index, level in enumerate(items)}
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for (spin_axis, number), up in where.items():
+        down = where.get(("down", number))
+        if spin_axis != "up" or down is None:
+            continue
+        if not (items[up].directed and items[down].directed):
+            warnings.append(f"level {number}: no table_angle, so that spin-axis cross terms cannot be separated")
+            continue
+        difference = (items[up].line - items[down].line) / (2 * manifest.gravity)
+        found[number] = (difference, (items[up].line + items[down].line) / 2)
+        for axis in range(axes):
+            modulus = max(abs(difference[axis]), 1e-300)
+            derivative = np.zeros(size)
+            pair = as_vector(difference[axis : axis + 1]) / modulus / (2 * manifest.gravity)
+            derivative[up * width + 2 * axis : up * width + 2 * axis + 2] = pair
+            derivative[down * width + 2 * axis : down * width + 2 * axis + 2] = -pair
+            rows.append(_Row(f"{'xy'[axis]}_cross_{number}", float(modulus), CROSS_UNIT, derivative, -float(modulus)))
+    return found
+
+
+def _freedom(J: Array, V: Array, radius: Array, items: tuple[Level, ...], width: int) -> Array:
+    """Effective degrees of freedom of each parameter's variance."""
+    variance = np.zeros(len(J))
+    spent = np.zeros(len(J))
+    for index, level in enumerate(items):
+        part = slice(index * width, (index + 1) * width)
+        mine = np.einsum("pi,ij,pj->p", J[:, part], V[part, part], J[:, part])
+        # An axis's own share decides which of the degrees of freedom counts.
+        shares = np.abs(J[:, part]).reshape(len(J), -1, 2).sum(axis=2)
+        nu = level.freedom[np.argmax(shares, axis=1)]
+        variance += mine
+        spent += mine**2 / nu
+    total = variance + radius**2
+    result: Array = np.clip(total**2 / np.maximum(spent, 1e-300), 1.0, 1e9)
+    return result

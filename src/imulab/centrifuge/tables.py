@@ -1,0 +1,175 @@
+"""The tables of a centrifuge record, in the units that people read: deg/h/g, per cent, arcsec, µrad/g."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imulab.calibration import Calibration
+from imulab.exhibit import Table, format_uncertain, plain_number
+from imulab.units import STANDARD_GRAVITY, from_si
+
+PER_G = float(from_si(STANDARD_GRAVITY, "deg/h"))
+"""deg/h/g in one rad/s/(m/s^2)."""
+
+_ENGINEERING = {
+    "K": (PER_G, "deg/h/g"),
+    "K0": (PER_G, "deg/h/g"),
+    "zeta": (100.0, "%"),
+    "c1": (1e6 * STANDARD_GRAVITY, "ppm/g"),
+    "c2": (1e6 * STANDARD_GRAVITY**2, "ppm/g²"),
+    "direction": (180 / np.pi, "deg"),
+    "cross": (PER_G * STANDARD_GRAVITY, "deg/h/g²"),
+}
+_BUDGET = {
+    "rad": (180 * 3600 / np.pi, "arcsec"),
+    "rad/(m/s^2)": (1e6 * STANDARD_GRAVITY, "µrad/g"),
+    "s": (1e3, "ms"),
+    "rad/s": (180 / np.pi, "deg/s"),
+    "1": (100.0, "%"),
+    "m": (1e6, "µm"),
+}
+
+
+def parameters_table(record: Calibration) -> Table:
+    """Return every parameter with its uncertainty and interval."""
+    rows = []
+    factors = record.fit["coverage_factor_95"]
+    freedom = record.fit["degrees_of_freedom"]
+    for name, parameter in record.parameters.items():
+        stem = next(part for part in name.split("_")[1:] if part != "down")
+        factor, unit = _ENGINEERING[stem]
+        value, u = parameter.value * factor, (parameter.standard_uncertainty or 0.0) * factor
+        ends = " to ".join(format_uncertain(value + sign * factors[name] * u, u)[0] for sign in (-1, 1))
+        nu = freedom[name]
+        rows.append([name, *format_uncertain(value, u), ends, unit, "many" if nu > 999 else f"{nu:.0f}"])
+    return Table(
+        title="Parameters",
+        caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a "
+        "term that is absent is 0; "
+        f"direction: from X toward Y. Noise: {record.fit['noise']}; 95 % intervals by Student's t.",
+        columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit", "degrees of freedom"],
+        rows=rows,
+    )
+
+
+def level_table(record: Calibration, sets: list[str]) -> Table:
+    """Return K and zeta at each level."""
+    columns = ["level", "specific force, g", "runs"]
+    for prefix in sets:
+        label = prefix.rstrip("_").replace("_", " ")
+        columns += [f"K {label}, deg/h/g", "u", f"zeta {label}, %", "u"]
+    rows = []
+    for level in record.sections["levels"]:
+        number = level["level"]
+        row = [str(number), f"{from_si(level['specific_force']['value'], 'g'):.4g}", str(len(level["runs"]))]
+        for prefix in sets:
+            K = record.parameters.get(f"{prefix}K_{number}")
+            zeta = record.parameters.get(f"{prefix}zeta_{number}")
+            row += (
+                ["–", "–"] if K is None else format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
+            )
+            row += (
+                ["–", "–"]
+                if zeta is None
+                else format_uncertain(100 * zeta.value, 100 * (zeta.standard_uncertainty or 0.0))
+            )
+        rows.append(row)
+    return Table("K and zeta at each level", "u: standard uncertainty. All zeta share the error of K_1.", columns, rows)
+
+
+def curve_table(record: Calibration, sets: list[str]) -> Table:
+    """Return the models of the curve that were tried."""
+    rows = []
+    for prefix in sets:
+        found = record.fit["curves"][prefix.rstrip("_")]
+        axis = prefix.rstrip("_").replace("_", " ")
+        rows += [
+            [axis, each["model"], str(each["coefficients"]), f"{each['chi_square']:.2f}", "chosen" * each["chosen"]]
+            for each in found["tried"]
+        ]
+    return Table(
+        "Terms of the curve",
+        "Weighted fits to the K_i. A term is taken where it lowers chi-square by more than its 5 % point.",
+        ["axis", "terms beside K0", "coefficients", "chi-square", ""],
+        rows,
+    )
+
+
+def budget_table(record: Calibration) -> Table:
+    """Return the error budget."""
+    rows = []
+    for entry in record.fit["error_budget"]:
+        factor, unit = _BUDGET[entry["unit"]]
+        rows.append(
+            [entry["error"], "yes" if entry["bounded"] else "no", *_sized(entry, factor), unit, _share(entry["effect"]),
+             "–" if entry["removed"] is None else _share(entry["removed"]), entry["basis"]]
+        )  # fmt: skip
+    return Table(
+        "Error budget (X axis)",
+        "What survives the subtraction of the FOG, or would without it: effect on K at the highest level. Bounded: "
+        "by these data. Where "
+        "not, value and effect are those of the size named.",
+        ["error", "bounded", "value", "u", "unit", "effect on K", "removed", "from"],
+        rows,
+    )
+
+
+def _sized(entry: dict[str, Any], factor: float) -> tuple[str, str]:
+    value, u = entry["value"], entry["standard_uncertainty"]
+    if value is None:
+        return "–", "–" if u is None else plain_number(u * factor, 2)
+    if u is None or u == 0:
+        return plain_number(value * factor, 3), "–"
+    return format_uncertain(value * factor, u * factor)
+
+
+def _share(value: float) -> str:
+    if value == 0:
+        return "0"
+    percent = 100 * abs(value)
+    return "< 0.0001 %" if percent < 1e-4 else f"{plain_number(percent, 2)} %"
+
+
+def run_table(record: Calibration) -> Table:
+    """Return the runs with their rates and lines."""
+    axes = [axis for axis in "xy" if any(axis in row for row in record.sections["runs"])]
+    columns = [
+        "run",
+        "file",
+        "cycle",
+        "sense",
+        "spin axis",
+        "a, g",
+        "table rate, deg/s",
+        "from",
+        "net rate, deg/s",
+        "periods",
+        "FOG line, deg/h",
+    ]
+    columns += [f"{axis.upper()} line, deg/h" for axis in axes]
+    rows = []
+    for index, run in enumerate(record.sections["runs"]):
+        row = [str(index), run["file"], str(run["power_cycle"]), f"{run['sense']:+d}", run["spin_axis"]]
+        if run["role"] == "static":
+            rows.append([*row, "static", *["–"] * (5 + len(axes))])
+            continue
+        net = run["net_rate"]
+        row += [
+            f"{from_si(run['specific_force']['value'], 'g'):.4g}",
+            f"{from_si(run['table_rate_used']['value'], 'deg/s'):.5f}",
+            run["table_rate_from"],
+            "–" if net is None else f"{from_si(net['value'], 'deg/s'):.4f}",
+            f"{run['periods']:.0f}",
+            _line(run["fog"]),
+            *(_line(run[axis]) for axis in axes),
+        ]
+        rows.append(row)
+    return Table("Runs", "Lines at the table rate: of the FOG, and of X and Y without it.", columns, rows)
+
+
+def _line(entry: dict[str, Any]) -> str:
+    size = from_si(float(np.hypot(entry["A"], entry["B"])), "deg/h")
+    u = from_si(float(np.sqrt(np.trace(np.array(entry["covariance"])) / 2)), "deg/h")
+    return format_uncertain(size, u)[0]

@@ -1,0 +1,231 @@
+"""Calibration of an array's elements against the truth that was put in, its record, and its report."""
+
+import json
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import DataError, ObservabilityError, RecordError, UnitError
+from imulab.gyro_array.align import align, nominal_orientation
+from imulab.gyro_array.fit import calibrate_array
+from imulab.gyro_array.fuse import FuseOptions, fuse
+from imulab.gyro_array.simulate import NoiseModel, simulate_array
+from imulab.present import exhibits_of
+from imulab.recording import Recording
+from test_gyro_array_fuse import array_recording
+
+UPSIDE_DOWN = np.array([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]])
+
+
+def motion(count: int, axes: int, rng: np.random.Generator) -> np.ndarray:
+    """Rates by hand, deg/s, made here apart from the simulator."""
+    time = np.arange(count) / 100
+    rates = np.zeros((count, axes))
+    for frequency in (0.13, 0.31, 0.7):
+        rates += 40 * np.sin(
+            2 * np.pi * frequency * time[:, None] * (1 + 0.17 * np.arange(axes)) + rng.uniform(0, 6, axes)
+        )
+    return rates
+
+
+def array_of(
+    seed: int, axes: int, n: int = 5, count: int = 12_000
+) -> tuple[Recording, Recording, np.ndarray, np.ndarray]:
+    """A still and a moving recording of one array, what its elements sense, and their biases, deg/s."""
+    rng = np.random.default_rng(seed)
+    sensing = np.eye(axes) + 0.02 * rng.standard_normal((n, axes, axes))
+    if axes == 3:
+        sensing[1::2] = sensing[1::2] @ UPSIDE_DOWN
+    else:
+        sensing[1::2] *= -1
+    bias = rng.standard_normal((axes, n))
+    shape = (count, axes, n)
+    still = bias + 0.05 * rng.standard_normal(shape)
+    moving = np.einsum("iab,tb->tai", sensing, motion(count, axes, rng)) + bias + 0.05 * rng.standard_normal(shape)
+    rate = 100.0
+    if axes == 1:
+        still, moving = still[:, 0], moving[:, 0]
+    return array_recording(still, rate, "still.csv"), array_recording(moving, rate, "moving.csv"), sensing, bias
+
+
+def in_gauge(sensing: np.ndarray) -> np.ndarray:
+    """The truth in the record's frame: the mean over the elements of P_i' A_i is the unit matrix."""
+    nominal = np.array([nominal_orientation(a @ np.linalg.inv(sensing[0])) for a in sensing])
+    mean = np.mean([p.T @ a for p, a in zip(nominal, sensing, strict=True)], axis=0)
+    return sensing @ np.linalg.inv(mean)
+
+
+@pytest.mark.parametrize("axes", [1, 3])
+def test_alignment_covers_the_truth(axes):
+    within = []
+    for seed in range(12):
+        still, moving, sensing, bias = array_of(seed, axes)
+        record = calibrate_array(still, moving).calibration
+        truth = in_gauge(sensing)
+        for i, element in enumerate(record.sections["elements"]):
+            if axes == 1:
+                error = np.array([[element["scale_factor"]["value"]]]) - truth[i]
+                u = np.array([[element["scale_factor"]["standard_uncertainty"]]])
+            else:
+                error = np.array(element["matrix"]["value"]) - np.linalg.inv(truth[i])
+                u = np.array(element["matrix"]["standard_uncertainty"])
+            assert u.max() < 1e-4
+            within += (np.abs(error) < 2 * u).ravel().tolist()
+            found = np.degrees(element["bias"]["value"])
+            np.testing.assert_allclose(np.atleast_1d(found), bias[:, i], atol=0.003)
+    assert 0.9 <= np.mean(within) <= 0.995
+
+
+def test_the_bias_is_the_plain_mean_and_its_uncertainty_holds():
+    within = []
+    for seed in range(3):
+        recording = simulate_array(experiment="static", duration=60.0, seed=seed)
+        record = calibrate_array(recording).calibration
+        for element in record.sections["elements"]:
+            mean = np.radians(recording.columns[element["name"]].mean())
+            assert element["bias"]["value"] == pytest.approx(mean, abs=1e-15)
+            assert element["bias"]["unit"] == "rad/s"
+            assert record.parameters[element["name"].replace("gyro", "bias")].value == element["bias"]["value"]
+    white = NoiseModel(gauss_markov=0.0, walk=0.0)
+    for seed in range(100, 125):
+        recording = simulate_array(experiment="static", duration=60.0, noise=white, seed=seed)
+        record = calibrate_array(recording).calibration
+        for i, element in enumerate(record.sections["elements"]):
+            truth = float(recording.metadata[f"truth_bias_{i + 1}"].split()[0])
+            within.append(abs(element["bias"]["value"] - truth) < 2 * element["bias"]["standard_uncertainty"])
+    assert np.mean(within) > 0.93
+
+
+def test_truth_rate_gives_absolute_scale_factors():
+    still, moving, sensing, _ = array_of(3, 1)
+    rng = np.random.default_rng(3)
+    truth = np.linalg.lstsq(
+        sensing[:, :, 0], np.column_stack([moving.columns[f"gyro_{i + 1}"] for i in range(5)]).T, rcond=None
+    )
+    known = moving.with_columns({"truth_rate": truth[0][0] + 0 * rng.standard_normal(1)}, {"truth_rate": "deg/s"})
+    record = calibrate_array(still, known).calibration
+    found = [e["scale_factor"]["value"] for e in record.sections["elements"]]
+    np.testing.assert_allclose(found, sensing[:, 0, 0], atol=2e-3)
+    assert record.model["gauge"] == "truth_rate"
+
+
+def test_a_calibrated_array_of_mixed_orientation_fuses_as_one():
+    still, moving, _, _ = array_of(7, 3)
+    record = calibrate_array(still, moving).calibration
+    fused = fuse(moving, FuseOptions(calibration=record))
+    assert not (fused.flags & 16).any()
+    spread = fused.rate - motion(12_000, 3, _after_draws(7))
+    # The frame is the elements' mean, a few mrad from the body's: what is left is a constant 3 x 3 map of the motion.
+    body = motion(12_000, 3, _after_draws(7))
+    left = fused.rate - body @ np.linalg.lstsq(body, fused.rate, rcond=None)[0]
+    assert left.std() < 1.1 * 0.05 / np.sqrt(5)
+    assert np.abs(spread).max() < 5
+
+
+def _after_draws(seed: int) -> np.random.Generator:
+    """The generator of `array_of` as it is when the motion is drawn."""
+    rng = np.random.default_rng(seed)
+    rng.standard_normal((5, 3, 3))
+    rng.standard_normal((3, 5))
+    rng.standard_normal((12_000, 3, 5))
+    return rng
+
+
+def test_the_covariance_is_that_of_the_noise():
+    rng = np.random.default_rng(5)
+    shared = rng.standard_normal((30_000, 1))
+    noise = rng.standard_normal((30_000, 3)) + 0.7 * shared
+    record = calibrate_array(array_recording(noise, 100.0), averaging_time=0.05).calibration
+    found = record.sections["correlation"]
+    truth = 0.49 / 1.49
+    off = np.array(found["matrix"][0])[~np.eye(3, dtype=bool)]
+    u = np.array(found["standard_uncertainty"][0])[~np.eye(3, dtype=bool)]
+    assert (np.abs(off - truth) < 3 * u).all()
+    covariance = np.degrees(np.degrees(found["covariance"][0]))
+    np.testing.assert_allclose(np.diag(covariance), 1.49 / 5, rtol=0.06)
+    limit = np.degrees(found["limit"][0]["value"])
+    assert limit == pytest.approx(np.sqrt((1 / 3 + 0.49) / 5), rel=0.05)
+
+
+def test_the_record_survives_saving_and_draws_its_report(tmp_path):
+    still, moving, _, _ = array_of(1, 3)
+    record = calibrate_array(still, moving).calibration
+    record.save(tmp_path / "r.json")
+    again = il.load(tmp_path / "r.json")
+    assert again.to_json() == record.to_json()
+    shown = exhibits_of(again)
+    assert [item.title for item in shown.items][:2] == ["Elements", "Alignment"]
+    il.write_report(again, tmp_path / "r.html")
+    assert "Gyro array" in (tmp_path / "r.html").read_text()
+    json.dumps([item.traces for item in shown.items if hasattr(item, "traces")], allow_nan=False)
+
+
+def test_the_real_array_is_calibrated(real_data):
+    recording = il.read(real_data / "mimu4444" / "exp_1.bin")
+    quiet = (recording.time > 468.5) & (recording.time < 495.5)
+    still = Recording({n: c[quiet] for n, c in recording.columns.items()}, recording.units, name="still")
+    record = calibrate_array(still, recording).calibration
+    for i, element in enumerate(record.sections["elements"]):
+        nominal = UPSIDE_DOWN if i % 2 else np.eye(3)
+        matrix = np.array(element["matrix"]["value"])
+        assert np.abs(matrix - nominal).max() < 0.03
+        assert np.max(element["matrix"]["standard_uncertainty"]) < 1e-3
+    assert any("at the end of a gyro's range" in message for message in record.warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        (lambda c: c | {"gyro_2": np.full(12_000, 0.25)}, DataError,
+         r"still.csv: column gyro_2: all samples are 0.25: a dead"),
+        (
+            lambda c: c | {"gyro_2": np.where(np.arange(12_000) == 5, np.nan, c["gyro_2"])},
+            DataError, r"still.csv: row 6 \(line 7\), column gyro_2: expected a finite number, found nan",
+        ),
+        (lambda c: {k: v[:100] for k, v in c.items()}, DataError, "100 samples at rest are too few"),
+        (lambda c: {k: v for k, v in c.items() if k != "time"}, DataError, "no column time"),
+        (lambda c: {k: v for k, v in c.items() if k != "gyro_3"}, DataError, "no column gyro_3; expected 5 elements"),
+        (
+            lambda c: {k: v + (k != "time") * 40 * np.sin(np.arange(12_000) / 300) for k, v in c.items()},
+            DataError, "the array moves: its elements go together by 28",
+        ),
+        (lambda c: {k: v for k, v in c.items() if k in ("time", "gyro_1")}, DataError, "1 element on each axis"),
+    ],
+)  # fmt: skip
+def test_a_bad_recording_at_rest_is_refused(change, error, text):
+    still, _, _, _ = array_of(1, 1)
+    columns = change(dict(still.columns))
+    units = {k: "s" if k == "time" else "deg/s" for k in columns}
+    with pytest.raises(error, match=text):
+        calibrate_array(Recording(columns, units, name="still.csv", lines_before=1))
+
+
+def test_units_and_motion_that_cannot_serve_are_refused():
+    still, _, sensing, _ = array_of(1, 3)
+    counts = Recording(still.columns, {k: "s" if k == "time" else "count" for k in still.columns}, name="c.csv")
+    with pytest.raises(UnitError, match="needs rates"):
+        calibrate_array(counts)
+    level = motion(12_000, 3, np.random.default_rng(2)) * [1, 1, 0]
+    noise = 0.05 * np.random.default_rng(3).standard_normal((12_000, 3, 5))
+    flat = array_recording(np.einsum("iab,tb->tai", sensing, level) + noise, 100.0, "m.csv")
+    with pytest.raises(ObservabilityError, match="alignment about z"):
+        calibrate_array(still, flat)
+    with pytest.raises(DataError, match=r"6 elements on 1 axes; expected 5 on 3"):
+        calibrate_array(still, simulate_array(duration=20.0))
+
+
+def test_alignment_needs_motion():
+    rng = np.random.default_rng(1)
+    with pytest.raises(ObservabilityError, match="expected a recording that turns"):
+        align(rng.standard_normal((2000, 1, 4)), np.ones((1, 4)))
+
+
+def test_a_record_of_another_array_is_refused():
+    still, _, _, _ = array_of(1, 1)
+    record = calibrate_array(still).calibration
+    with pytest.raises(RecordError, match="the record holds 5 elements on 1 axes, the recording 6 on 1"):
+        fuse(simulate_array(duration=2.0), FuseOptions(calibration=record))
+    tumble = il.fit_tumble(il.find_attitudes(il.simulate_tumble(order=1, attitudes=16, hold=3.0)), order=1, gravity=9.8)
+    with pytest.raises(RecordError, match="expected the record of an array calibration, found one of a tumble"):
+        fuse(simulate_array(duration=2.0), FuseOptions(calibration=tumble.calibration))

@@ -1,0 +1,345 @@
+"""``imulab array``: files and streams, what is printed, and what is refused."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.gyro_array.compare import compare_methods
+from imulab.gyro_array.experiments import run_experiment
+from imulab.gyro_array.fit import calibrate_array
+from imulab.gyro_array.fuse import fuse
+from imulab.gyro_array.model import METHODS
+from imulab.gyro_array.simulate import Fault, simulate_array
+from imulab.present import exhibits_of
+from test_gyro_array_fuse import array_recording, dynamic
+
+G = 9.80665
+
+
+@pytest.fixture(scope="module")
+def run_file(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("array")
+    faults = (Fault("stuck", 3, 10.0, 5.0), Fault("jump", 5, 20.0))
+    il.write_csv(simulate_array(duration=40.0, faults=faults, seed=3), folder / "run.csv")
+    il.write_csv(simulate_array(experiment="static", duration=60.0, seed=3, session=1), folder / "still.csv")
+    calibrate_array(il.read(folder / "still.csv")).calibration.save(folder / "array.json")
+    return folder
+
+
+def test_the_way_from_simulation_to_comparison(imulab, tmp_path):
+    array = ["--seed", "4", "--mounting", "alternate", "--scale-spread", "0.01"]
+    steps = [
+        ["simulate", "--experiment", "static", "--duration", "60 s", *array, "-o", "still.csv"],
+        ["simulate", "--experiment", "moving", *array, "-o", "moving.csv"],
+        ["simulate", "--duration", "20 s", *array, "--fault", "stuck:2:10", "-o", "run.csv"],
+        ["calibrate", "still.csv", "--moving", "moving.csv", "-o", "a.json", "--report", "a.html"],
+        ["fuse", "run.csv", "--calibration", "a.json", "-o", "fused.csv"],
+        ["compare", "run.csv", "--calibration", "a.json", "-o", "c.json", "--report", "c.html"],
+    ]
+    for arguments in steps:
+        done = imulab("array", *arguments)
+        assert done.returncode == 0, done.stderr
+    fused, run = il.read(tmp_path / "fused.csv"), il.read(tmp_path / "run.csv")
+    assert list(fused.columns) == ["time", "rate"]
+    assert fused.units == {"time": "s", "rate": "deg/s"}
+    assert fused.metadata["serial"] == "ARRAY-0004"
+    np.testing.assert_array_equal(fused.columns["time"], run.columns["time"])
+    assert (fused.columns["rate"] - run.columns["truth_rate"]).std() < 0.03
+    for name in ("a.json", "c.json"):
+        assert imulab("show", name).returncode == 0
+        assert imulab("report", name, "-o", "again.html").returncode == 0
+    printed = imulab("array", "calibrate", "still.csv", "--json")
+    assert json.loads(printed.stdout)["procedure"] == "gyro_array"
+    refused = imulab("array", "fuse", "run.csv", "--calibration", "c.json")
+    assert refused.returncode == 2
+    assert "expected the record of an array calibration, found one of a comparison" in refused.stderr
+
+
+def test_what_happened_to_a_gyro_is_one_line_that_names_its_column(imulab, run_file):
+    done = imulab("array", "fuse", run_file / "run.csv")
+    assert done.returncode == 0
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("imulab: warning: gyro_3: stuck 2")
+    assert "from 10.5 s" in lines[0]
+    assert lines[1].startswith("imulab: warning: gyro_5: jumped 51 samples from 20.4")
+    assert done.stdout.splitlines()[9].startswith("time [s],rate [deg/s]")
+
+
+def test_lines_are_fused_as_they_come(run_file):
+    lines = (run_file / "run.csv").read_bytes().splitlines(keepends=True)
+    head = next(i for i, line in enumerate(lines) if line.startswith(b"time")) + 1
+    process = subprocess.Popen(
+        [sys.executable, "-m", "imulab", "array", "fuse", "-"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE
+    )  # fmt: skip
+    got = []
+    process.stdin.write(b"".join(lines[:head]))
+    for k in range(60):
+        process.stdin.write(lines[head + k])
+        process.stdin.flush()
+        if k == 0:
+            while not (line := process.stdout.readline()).startswith(b"time"):
+                assert line.startswith(b"#")
+        got.append(process.stdout.readline())  # blocks until this very line has been fused
+    time.sleep(0.01)
+    assert process.poll() is None
+    out, _ = process.communicate(b"".join(lines[head + 60 : head + 1000]), timeout=60)
+    got += out.splitlines(keepends=True)
+    assert len(got) == 1000
+    whole = fuse(il.read(run_file / "run.csv")).rate[:, 0]
+    np.testing.assert_array_equal([float(line.split(b",")[1]) for line in got], whole[:1000])
+
+
+def test_a_reader_that_goes_away_ends_it_quietly(run_file):
+    shell = f"{sys.executable} -m imulab array fuse {run_file / 'run.csv'} | head -3"
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, check=False, timeout=60)
+    assert len(done.stdout.splitlines()) == 3
+    assert "Traceback" not in done.stderr
+
+
+def test_readings_may_be_nan_inf_or_missing(imulab, tmp_path):
+    recording = array_recording(dynamic(count=200)[0])
+    il.write_csv(recording, tmp_path / "a.csv")
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    fields = [line.split(",") for line in lines]
+    fields[51][2], fields[61][3], fields[71][4] = "nan", "inf", ""
+    fields[81][1:] = [""] * 6
+    (tmp_path / "b.csv").write_text("\n".join(",".join(f) for f in fields) + "\n")
+    done = imulab("array", "fuse", "b.csv", "-o", "out.csv")
+    assert done.returncode == 0, done.stderr
+    rate = il.read(tmp_path / "out.csv").columns["rate"]
+    assert np.flatnonzero(np.isnan(rate)).tolist() == [80]
+    for name in ("gyro_2", "gyro_3", "gyro_4"):
+        assert f"{name}: non-finite 2 samples" in done.stderr
+
+
+def test_every_method_and_start_runs(imulab, run_file):
+    record = run_file / "array.json"
+    for method in ("feedback", "covariance", "kalman"):  # the others run in test_compare_prints_all_seven
+        extra = ["--calibration", record] if method in ("covariance", "kalman") else ["--initial-bias", "zero"]
+        done = imulab("array", "fuse", run_file / "run.csv", "--method", method, *extra)
+        assert done.returncode == 0, done.stderr
+        assert len(done.stdout.splitlines()) == 2000 + 10
+    options = ["--method", "feedback", "--memory", "growing:100", "--initial-bias", record]
+    assert imulab("array", "fuse", run_file / "run.csv", *options).returncode == 0
+
+
+def test_three_axes_come_out_as_three_columns_in_their_unit(imulab, tmp_path):
+    il.write_csv(simulate_array(axes=3, duration=4.0, unit="rad/s"), tmp_path / "a.csv")
+    done = imulab("array", "fuse", "a.csv", "-o", "out.csv")
+    assert done.returncode == 0
+    assert il.read(tmp_path / "out.csv").units == {"time": "s", "rate_x": "rad/s", "rate_y": "rad/s", "rate_z": "rad/s"}
+
+
+# ---- compare --------------------------------------------------------------------------------------------------------
+
+
+def test_compare_prints_all_seven_in_plain_decimals(imulab, run_file):
+    done = imulab("array", "compare", run_file / "run.csv")
+    assert done.returncode == 0, done.stderr
+    rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.split()[:1]}
+    assert set(METHODS) <= set(rows)
+    assert "covariance cannot run: method covariance needs --calibration" in done.stdout
+    for method in METHODS:
+        if method == "covariance":
+            continue
+        for value in rows[method][:7]:
+            assert "e" not in value
+            assert sum(c.isdigit() for c in value.lstrip("0.")) >= 3
+
+
+def test_compare_finds_errors_reduction_and_limit():
+    recording = array_recording(dynamic()[0])
+    _, truth, sigma = dynamic()
+    with_truth = recording.with_columns({"truth_rate": np.radians(truth)}, {"truth_rate": "rad/s"})
+    found = compare_methods(with_truth).figures
+    mean = found["mean"][0]
+    error = np.mean([recording.columns[f"gyro_{i + 1}"] for i in range(6)], axis=0) - truth
+    assert mean.rate_std == pytest.approx(error.std(), rel=1e-12)
+    assert mean.rate_max == pytest.approx(np.abs(error).max(), rel=1e-12)
+    assert mean.angle_max == pytest.approx(np.abs(np.cumsum(error) / 50).max(), rel=1e-12)
+    limit = np.sum(sigma**-2) ** -0.5
+    assert found["robust"][0].over_limit == pytest.approx(1.0, abs=0.04)
+    assert mean.over_limit == pytest.approx(np.sqrt(np.mean(sigma**2) / 6) / limit, rel=0.06)
+    assert mean.reduction == pytest.approx(np.mean(sigma) / mean.rate_std, rel=0.05)
+
+
+def test_compare_measures_bandwidth_and_warns_of_filtering(monkeypatch):
+    from imulab.gyro_array import fuse as fuse_module
+    from imulab.gyro_array import kalman
+
+    recording = simulate_array(experiment="static", duration=200.0, seed=2)
+    found = compare_methods(recording)
+    assert found.figures["mean"][0].bandwidth == 50.0
+    assert not any("mean:" in message for message in found.warnings)
+    slow = np.radians(0.05)  # process noise of a unit that hardly moves
+    monkeypatch.setattr(kalman, "RATE_WALK", slow)
+    real = fuse_module.steady_gain
+    gains = []
+
+    def narrow(white, walk, rate_walk, step):
+        gains.append(real(white, walk, np.degrees(slow), step))
+        return gains[-1]
+
+    monkeypatch.setattr(fuse_module, "steady_gain", narrow)
+    filtered = compare_methods(recording)
+    gain = gains[0][0].sum()
+    # A first-order recursive filter with gain K has its -3 dB point where |K / (1 - (1 - K) e^-jw)|^2 = 1/2.
+    cosine = (1 + (1 - gain) ** 2 - 2 * gain**2) / (2 * (1 - gain))
+    expected = np.arccos(cosine) / (2 * np.pi) * 100
+    kalman_row = filtered.figures["kalman"][0]
+    assert kalman_row.bandwidth == pytest.approx(expected, rel=0.1)
+    assert kalman_row.rate_std < 0.7 * filtered.figures["robust"][0].rate_std
+    assert any(message.startswith("kalman: its bandwidth is") for message in filtered.warnings)
+
+
+def test_compare_without_truth_uses_the_longest_stretch_at_rest():
+    still = simulate_array(experiment="static", duration=20.0, seed=1).columns["gyro_1"]
+    rng = np.random.default_rng(1)
+    motion = np.zeros(6000)
+    motion[1000:2500] = 30 * np.sin(np.arange(1500) / 40)
+    readings = motion[:, None] + 0.05 * rng.standard_normal((6000, 6))
+    found = compare_methods(array_recording(readings, 100.0))
+    assert found.record.fit["samples"] == 3500
+    assert any("longest stretch at rest, 25 to 59.99 s" in message for message in found.warnings)
+    assert len(still) == 2000
+
+
+def test_compare_refuses_motion_without_truth():
+    readings = 30 * np.sin(np.arange(3000) / 40)[:, None] + 0.05 * np.random.default_rng(1).standard_normal((3000, 6))
+    from imulab.errors import DataError
+
+    with pytest.raises(DataError, match="neither a column truth_rate nor a stretch of 5 s at rest"):
+        compare_methods(array_recording(readings, 100.0))
+
+
+def test_the_report_of_a_comparison_comes_from_its_record():
+    faults = (Fault("stuck", 2, 5.0, 5.0), Fault("nan", 3, 2.0, 2.0), Fault("jump", 4, 12.0))
+    record = compare_methods(simulate_array(duration=20.0, faults=faults)).record
+    shown = exhibits_of(record)
+    titles = [item.title for item in shown.items]
+    assert titles == [
+        "Methods", "Allan deviation of each method", "Angle error over time", "Weight and health of each gyro "
+        "under robust",
+    ]  # fmt: skip
+    marks = {trace.get("name") for trace in shown.items[-1].traces}
+    assert {"stuck", "non-finite", "jumped"} <= marks
+    json.dumps(record.to_dict(), allow_nan=False)
+
+
+def test_the_source_s_dynamic_experiment():
+    rows = {(r.method, r.calibrated): r for r in run_experiment("dynamic", seeds=6)}
+    assert len(rows) == 13
+    robust, mean, feedback = (rows[m, False] for m in ("robust", "mean", "feedback"))
+    assert robust.rate_std < 0.95 * mean.rate_std
+    assert feedback.rate_std > 1.1 * mean.rate_std  # here the source's claim does not hold
+    assert rows["kalman", False].rate_std <= mean.rate_std
+    assert rows["robust", True].angle_max < 0.5 * robust.angle_max
+
+
+# ---- refusals -------------------------------------------------------------------------------------------------------
+
+GOOD = array_recording(dynamic(count=300)[0])
+
+
+def _text(recording=GOOD, **units) -> str:
+    titles = ",".join(f"{n} [{units.get(n, u)}]" for n, u in recording.units.items())
+    rows = zip(*(c.tolist() for c in recording.columns.values()), strict=True)
+    return titles + "\n" + "\n".join(",".join(map(repr, row)) for row in rows) + "\n"
+
+
+def _row(number: int, change) -> str:
+    lines = _text().splitlines()
+    lines[number] = change(lines[number])
+    return "\n".join(lines) + "\n"
+
+
+def _without(*names: str) -> str:
+    kept = {n: c for n, c in GOOD.columns.items() if n not in names}
+    return _text(type(GOOD)(kept, {n: GOOD.units[n] for n in kept}))
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "fragments"),
+    [
+        (_without("gyro_3", "gyro_4", "gyro_5", "gyro_6"), [],
+         ["robust needs 3 gyros on each axis, found 2 (gyro_1 gyro_2)"]),
+        (_without("gyro_3", "gyro_4", "gyro_5", "gyro_6"), ["--method", "least-squares"],
+         ["least-squares needs 3 gyros"]),
+        (_text(gyro_4="rad/s"), [], ["must share one unit", "gyro_4 [rad/s]", "gyro_1 [deg/s]"]),
+        (_without("time"), [], ["no column time"]),
+        (_without("gyro_2"), [], ["no column gyro_2; expected 6 elements"]),
+        (_without(*[f"gyro_{i}" for i in range(1, 7)]), [], ["no columns gyro_1 gyro_2 .. (one axis)", "found time"]),
+        (_row(50, lambda r: r + ",1.0"), [], ["row 50 (line 51)", "expected 7 fields, found 8"]),
+        (_row(50, lambda r: r.rsplit(",", 1)[0]), [], ["row 50 (line 51)", "expected 7 fields, found 6"]),
+        (_row(50, lambda r: r.replace(",", ",x", 1)), [], ["row 50 (line 51)", "column gyro_1", "expected a number"]),
+        (_row(50, lambda r: "0.5," + r.split(",", 1)[1]), [], ["row 50 (line 51)", "column time", "runs backwards"]),
+        (_row(50, lambda r: "nan," + r.split(",", 1)[1]), [], ["row 50 (line 51)", "column time", "found nan"]),
+        (None, ["--method", "median"],
+         ["expected one of mean support least-squares feedback robust covariance kalman"]),
+        (None, ["--memory", "1.5"], ["--memory '1.5'", "growing, growing:COUNT, or a gain between 0 and 1"]),
+        (None, ["--initial-bias", "last"], ["--initial-bias 'last'", "first, zero, or the file of a record"]),
+        (None, ["--method", "covariance"], ["covariance needs --calibration"]),
+        (None, ["--calibration", "none.json"], ["none.json: no such file"]),
+        (None, ["--calibration", "bad.csv"], ["bad.csv: not a calibration record"]),
+        (None, ["-o", "out.txt"], ["out.txt", ".csv"]),
+        (None, ["-o", "bad.csv"], ["bad.csv: would overwrite bad.csv"]),
+        (None, ["--still", "5"], ["--still '5'", "START,STOP"]),
+    ],
+)  # fmt: skip
+def test_a_bad_input_gets_one_line_and_leaves_nothing(text, options, fragments, imulab, tmp_path):
+    (tmp_path / "bad.csv").write_text(_text() if text is None else text)
+    output = [] if "-o" in options else ["-o", "out.csv"]
+    done = imulab("array", "fuse", "bad.csv", *options, *output)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("imulab: ")
+    assert done.stderr.count("\n") == 1
+    for fragment in fragments:
+        assert fragment in done.stderr
+    assert done.stdout == ""
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
+
+
+def test_clocks_that_disagree_are_refused(imulab, tmp_path):
+    clocks = {f"time_{i}": GOOD.columns["time"] + (2.0 if i == 4 else 0.0) for i in range(1, 7)}
+    il.write_csv(GOOD.with_columns(clocks, dict.fromkeys(clocks, "s")), tmp_path / "c.csv")
+    done = imulab("array", "fuse", "c.csv")
+    assert done.returncode == 2
+    assert "column time_4: the clocks disagree: " in done.stderr
+    assert "expected less than 0.5 s apart" in done.stderr
+    backwards = clocks["time_4"] - 2
+    backwards[20] = 0.1
+    recording = GOOD.with_columns(clocks | {"time_4": backwards}, dict.fromkeys(clocks, "s"))
+    il.write_csv(recording, tmp_path / "d.csv")
+    assert "row 21 (line 22), column time_4: the clock runs backwards" in imulab("array", "fuse", "d.csv").stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragment"),
+    [
+        (["compare"], "expected FILE, or --experiment static|dynamic"),
+        (["compare", "--experiment", "shaken"], "experiment 'shaken': expected static or dynamic"),
+        (["compare", "--experiment", "static", "--seeds", "0"], "seeds 0: expected 1 to 10000"),
+        (["simulate", "-o", "s.csv", "--experiment", "wild"], "expected one of static dynamic moving"),
+        (["simulate", "-o", "s.csv", "--axes", "2"], "axes 2: expected 1 or 3"),
+        (["simulate", "-o", "s.csv", "--elements", "0"], "elements 0: expected 1 to 64"),
+        (["simulate", "-o", "s.csv", "--fault", "stuck"], "expected KIND:GYRO"),
+        (["simulate", "-o", "s.csv", "--fault", "sick:1"], "fault 'sick': expected one of dead stuck spikes"),
+        (["simulate", "-o", "s.csv", "--fault", "dead:9"], "fault of gyro 9: expected 1 to 6"),
+        (["simulate", "-o", "s.csv", "--unit", "count"], "unit count: expected rad/s deg/s deg/h"),
+        (["calibrate", "no.csv"], "no.csv: no such file"),
+        (["fuse", "no.csv"], "no.csv: no such file"),
+    ],
+)
+def test_a_wrong_command_line_gets_one_line(arguments, fragment, imulab, tmp_path):
+    done = imulab("array", *arguments)
+    assert done.returncode == 2
+    assert fragment in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
