@@ -83,7 +83,7 @@ def run(
         print("\n".join([*_failures(state), f"records: {output}", f"table: {table or f'{output}/parameters.csv'}"]))
         warned = sum(bool(row.summary and row.summary.warnings) for row in state.rows)
         if warned:
-            print(f"warnings: in {warned} records; the table has them")
+            print(f"warnings: in {warned} record{'s' if warned > 1 else ''}; the table has them")
     return _verdict(state)
 
 

@@ -11,14 +11,13 @@ import numpy as np
 
 from imulab.exhibit import BAD, GOOD, QUIET, Figure, Table, format_uncertain, plain_number
 from imulab.fleet.display import Display, display_of
-from imulab.fleet.statistics import Change, ParameterStatistics
+from imulab.fleet.statistics import Change, ParameterStatistics, change_limit
 from imulab.fleet.table import Row
 
 COLUMNS = 3
 MOST_PANELS = 24
 _MOST_POINTS = 1500
 _MOST_ROWS = 40
-_CHANGED = 3.0
 _GAP_ACROSS = 0.075
 _ROW_HEIGHT = 215
 
@@ -241,6 +240,7 @@ def change_figure(title: str, changes: Sequence[Change]) -> Figure | None:
     usable = [change for change in changes if change.deviations is not None and not change.same_files]
     if not usable:
         return None
+    limit = change_limit(len(usable))
     names = list(dict.fromkeys(change.name for change in usable))[: 2 * MOST_PANELS]
     groups = [[change for change in usable if change.name == name] for name in names]
     traces = []
@@ -251,7 +251,7 @@ def change_figure(title: str, changes: Sequence[Change]) -> Figure | None:
         for place, group in enumerate(groups):
             for i, change in enumerate(group):
                 z = float(change.deviations or 0.0)
-                if (abs(z) > _CHANGED) == beyond:
+                if (abs(z) > limit) == beyond:
                     x.append(round(place + 0.6 * ((i * 0.618034) % 1.0 - 0.5), 3))
                     y.append(round(z, 3))
                     text.append(f"{change.serial}, {change.name}")
@@ -268,8 +268,9 @@ def change_figure(title: str, changes: Sequence[Change]) -> Figure | None:
         )
     return Figure(
         f"{title}: change since each unit's last calibration",
-        "(new − last) / √(u² + u²): of sensors that did not change, 1 in 370 lies beyond the band of ± 3. Many beyond "
-        "it mean sensors that age, or uncertainties that are stated too small.",
+        "(new − last) / √(u² + u²), as normal deviations (few degrees of freedom are allowed for). Of sensors that did "
+        "not change, one such figure in a hundred has a point outside the band. A column that is off zero as a whole "
+        "means a rig or a type that changed; one that is wider than the others, uncertainties stated too small.",
         traces,
         {
             "xaxis": {
@@ -281,7 +282,7 @@ def change_figure(title: str, changes: Sequence[Change]) -> Figure | None:
                 "showgrid": False,
             },
             "yaxis": {
-                "title": {"text": "change, standard uncertainties"},
+                "title": {"text": "change, normal deviations"},
                 "gridcolor": "#e6eaed",
                 "zerolinecolor": QUIET,
             },
@@ -291,8 +292,8 @@ def change_figure(title: str, changes: Sequence[Change]) -> Figure | None:
                     "xref": "paper",
                     "x0": 0,
                     "x1": 1,
-                    "y0": -_CHANGED,
-                    "y1": _CHANGED,
+                    "y0": -limit,
+                    "y1": limit,
                     "fillcolor": "#e6f1f4",
                     "line": {"width": 0},
                     "layer": "below",
@@ -310,6 +311,7 @@ def change_table(changes: Sequence[Change]) -> Table | None:
     if not changes:
         return None
     ranked = sorted(changes, key=lambda change: (change.same_files, -abs(change.deviations or 0.0)))
+    limit = change_limit(sum(not change.same_files for change in changes))
     rows = []
     for change in ranked[:_MOST_ROWS]:
         shown = display_of(change.unit)
@@ -317,7 +319,7 @@ def change_table(changes: Sequence[Change]) -> Table | None:
         u = None if change.standard_uncertainty is None else change.standard_uncertainty * factor
         difference, error = format_uncertain((change.new - change.old) * shown.factor, u)
         z = change.deviations
-        remark = "same files, fitted again" if change.same_files else "changed" if z and abs(z) > _CHANGED else ""
+        remark = "same files, fitted again" if change.same_files else "changed" if z and abs(z) > limit else ""
         rows.append(
             [
                 change.serial, change.name, difference, error, shown.unit,
@@ -327,10 +329,10 @@ def change_table(changes: Sequence[Change]) -> Table | None:
     again = sum(change.same_files for change in changes)
     return Table(
         "Largest changes since the last calibration",
-        f"{len(changes)} parameters have an earlier value; the first {len(rows)} by their change in standard "
-        "uncertainties (of both calibrations together)."
+        f"{len(changes)} parameters have an earlier value; the first {len(rows)} by their change in normal "
+        "deviations, with the uncertainties of both calibrations."
         + (" Values of the same files fitted again share their noise: no uncertainty applies." if again else ""),
-        ["serial", "parameter", "change", "u", "unit", "in u", "last calibration", "remark"],
+        ["serial", "parameter", "change", "u", "unit", "deviations", "last calibration", "remark"],
         rows,
     )
 
@@ -343,7 +345,7 @@ def failure_table(failures: Sequence[Row]) -> Table | None:
     return Table(
         "Units that failed",
         "They have no record; the next run tries them again." + more,
-        ["serial", "unit", "reason"],
+        ["serial", "file", "reason"],
         [[row.unit.serial, "; ".join(row.unit.files), row.reason] for row in failures[:_MOST_ROWS]],
     )
 
@@ -360,7 +362,7 @@ def _axis_key(name: str) -> str:
 
 
 def _height(count: int) -> int:
-    return 40 + _ROW_HEIGHT * math.ceil(count / COLUMNS)
+    return 62 + _ROW_HEIGHT * math.ceil(count / COLUMNS)
 
 
 def _grid() -> dict[str, Any]:
@@ -369,7 +371,7 @@ def _grid() -> dict[str, Any]:
         "shapes": [],
         "annotations": [],
         "bargap": 0.02,
-        "margin": {"l": 50, "r": 15, "t": 30, "b": 35},
+        "margin": {"l": 50, "r": 15, "t": 52, "b": 35},
     }
 
 

@@ -27,6 +27,7 @@ class Past:
     content_sha256: str
     sources: str
     parameters: Mapping[str, Parameter]
+    freedom: float | None
 
 
 def sources_of(summary: Summary) -> str:
@@ -54,6 +55,7 @@ class History:
             sa.Column("software", sa.String(80), nullable=False),
             sa.Column("content_sha256", sa.String(64), nullable=False),
             sa.Column("sources_sha256", sa.String(64), nullable=False),
+            sa.Column("degrees_of_freedom", sa.Double),
             sa.Column("warnings", sa.Text, nullable=False),
             sa.UniqueConstraint("serial", "procedure", "content_sha256"),
         )
@@ -89,6 +91,7 @@ class History:
                         "software": summary.software,
                         "content_sha256": summary.content_sha256,
                         "sources_sha256": sources_of(summary),
+                        "degrees_of_freedom": summary.freedom,
                         "warnings": json.dumps(summary.warnings, ensure_ascii=False),
                     },
                 ).scalar()
@@ -118,6 +121,7 @@ class History:
                 query = (
                     sa.select(
                         c.id, c.serial, c.procedure, c.date, c.created, c.content_sha256, c.sources_sha256,
+                        c.degrees_of_freedom,
                         p.name, p.value, p.standard_uncertainty, p.unit,
                     )
                     .select_from(self._calibrations.outerjoin(self._parameters))
@@ -131,7 +135,7 @@ class History:
                     if row.id not in found:
                         found[row.id] = Past(
                             row.serial, row.procedure, row.date, row.created, row.content_sha256, row.sources_sha256,
-                            parameters,
+                            parameters, row.degrees_of_freedom,
                         )  # fmt: skip
         past: dict[str, list[Past]] = {}
         for item in found.values():

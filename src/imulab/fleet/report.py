@@ -13,7 +13,14 @@ from imulab.fleet import figures
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
 from imulab.fleet.run import FleetState, default_history, fleet_state
-from imulab.fleet.statistics import Change, ParameterStatistics, changes_since, line_statistics, parameter_units
+from imulab.fleet.statistics import (
+    Change,
+    ParameterStatistics,
+    change_limit,
+    changes_since,
+    line_statistics,
+    parameter_units,
+)
 from imulab.report import render_page
 
 _TITLES = {"tumble": "Tumble", "array": "Gyro array", "warmup": "Warm-up", "centrifuge": "Centrifuge"}
@@ -64,7 +71,8 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
     out = {serial for item in statistics for serial, o in zip(item.serials, item.outliers, strict=True) if o}
     capable = [item for item in statistics if item.capability is not None]
     drifting = [item.name for item in statistics if item.drift is not None and item.drift.significant]
-    moved = {(c.serial, c.name) for c in changes if not c.same_files and abs(c.deviations or 0.0) > 3}
+    fresh = [change for change in changes if not change.same_files]
+    moved = {change.serial for change in fresh if abs(change.deviations or 0.0) > change_limit(len(fresh))}
     facts = [
         ("units done", f"{state.count('done')} of {len(state.rows)}"),
         ("failed", str(state.count("failed"))),
@@ -76,14 +84,15 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
         said.append(f"{len(state.failures)} failed")
     said.append(f"{len(out)} stand out in some parameter" if out else "none stands out")
     if drifting:
-        said.append(f"{' '.join(drifting[:4])}{' and others' if len(drifting) > 4 else ''} drift over the date")
+        some = ", ".join(drifting[:4]) + (" and others" if len(drifting) > 4 else "")
+        said.append(f"{some} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
     if capable:
         worst = min(capable, key=lambda item: item.capability.cpk if item.capability else 0.0)
         if worst.capability is not None:
             facts.append(("smallest Cpk", f"{worst.capability.cpk:.2f}"))
             said.append(f"the smallest Cpk is {worst.capability.cpk:.2f} ({worst.name})")
-    if changes:
-        facts.append(("changed since last", str(len({serial for serial, _ in moved}))))
+    if fresh:
+        facts.append(("changed since last", str(len(moved))))
     items: list[Figure | Table | None] = [figures.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = _TITLES.get(procedure, procedure)

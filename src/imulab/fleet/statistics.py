@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.calibration import Parameter
 from imulab.fleet.history import Past, sources_of
 from imulab.fleet.limits import Limits
 from imulab.fleet.work import Summary
@@ -23,6 +24,7 @@ _BEYOND = (7.90, 6.90, 6.29, 5.92, 5.24, 4.80, 4.46, 4.31, 4.34, 4.52, 4.84)
 _FEWEST_FOR_DRIFT = 8
 _SHORTEST_SPAN = 1.0 / 24
 _DRIFT_LEVEL = 0.001
+_FALSE_ALARM = 0.01
 _ONE_SIDED_95 = 1.6448536269514722
 
 
@@ -94,7 +96,20 @@ class ParameterStatistics:
 
 @dataclass(frozen=True)
 class Change:
-    """A parameter of a unit against its last calibration: ``deviations = (new - old) / sqrt(u_new^2 + u_old^2)``."""
+    """A parameter of a unit against its last calibration.
+
+    Attributes
+    ----------
+    before
+        Date of the last calibration.
+    old, new, standard_uncertainty
+        ``u = sqrt(u_new^2 + u_old^2)``, None where one is not stated.
+    deviations
+        The same chance in a normal distribution as ``(new - old) / u`` has in Student's, with the degrees of freedom
+        of both uncertainties (Welch and Satterthwaite); None without u.
+    same_files
+        Both were made from the same files: their errors are shared, and u does not apply.
+    """
 
     serial: str
     procedure: str
@@ -104,14 +119,8 @@ class Change:
     old: float
     new: float
     standard_uncertainty: float | None
+    deviations: float | None
     same_files: bool
-
-    @property
-    def deviations(self) -> float | None:
-        """Change in standard uncertainties, None where one is not stated."""
-        if self.standard_uncertainty is None or not self.standard_uncertainty > 0:
-            return None
-        return (self.new - self.old) / self.standard_uncertainty
 
 
 def days_of(text: str) -> float | None:
@@ -258,23 +267,40 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
             old = last.parameters.get(name)
             if old is None or old.unit != new.unit:
                 continue
-            uncertainty = None
-            if old.standard_uncertainty is not None and new.standard_uncertainty is not None:
-                uncertainty = math.hypot(old.standard_uncertainty, new.standard_uncertainty)
+            u, z = _compared(new, summary.freedom, old, last.freedom)
             changes.append(
                 Change(
-                    summary.serial,
-                    summary.procedure,
-                    name,
-                    new.unit,
-                    last.when,
-                    old.value,
-                    new.value,
-                    uncertainty,
-                    same,
+                    summary.serial, summary.procedure, name, new.unit, last.when, old.value, new.value, u, z, same
                 )
-            )
+            )  # fmt: skip
     return changes
+
+
+def change_limit(count: int) -> float:
+    """Return the deviations that one in so many normal changes is beyond in one set out of a hundred."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(_FALSE_ALARM / 2 / max(count, 1)))
+
+
+def _compared(
+    new: Parameter, new_freedom: float | None, old: Parameter, old_freedom: float | None
+) -> tuple[float | None, float | None]:
+    """Return the standard uncertainty of a change, and the change in equivalent normal deviations."""
+    if new.standard_uncertainty is None or old.standard_uncertainty is None:
+        return None, None
+    u = math.hypot(new.standard_uncertainty, old.standard_uncertainty)
+    if not u > 0:
+        return None, None
+    ratio = (new.value - old.value) / u
+    parts = [(p.standard_uncertainty or 0.0, f) for p, f in ((new, new_freedom), (old, old_freedom)) if f is not None]
+    share = sum((part / u) ** 4 / freedom for part, freedom in parts)
+    if share <= 0:
+        return u, ratio
+    from scipy.special import ndtri, stdtr
+
+    chance = max(float(stdtr(1 / share, -abs(ratio))), 1e-300)
+    return u, math.copysign(-float(ndtri(chance)), ratio)
 
 
 def _last(summary: Summary, past: Sequence[Past]) -> Past | None:

@@ -39,7 +39,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run, its table and its history need to know of a record."""
+    """What a run, its table and its history need to know of a record.
+
+    `inputs` are the hashes of its files; `freedom` the degrees of freedom of its uncertainties, None where the noise
+    was known.
+    """
 
     serial: str
     procedure: str
@@ -50,6 +54,7 @@ class Summary:
     inputs: tuple[str, ...]
     parameters: Mapping[str, Parameter]
     warnings: tuple[str, ...]
+    freedom: float | None
 
     @property
     def when(self) -> str:
@@ -157,7 +162,14 @@ def summarise(record: Calibration, content: Mapping[str, Any]) -> Summary:
         inputs=tuple(item["sha256"] for item in made["inputs"]),
         parameters=dict(record.parameters),
         warnings=record.warnings,
+        freedom=_freedom(record),
     )
+
+
+def _freedom(record: Calibration) -> float | None:
+    freedom = record.fit.get("degrees_of_freedom")
+    estimated = str(record.fit.get("noise", "known")).startswith("estimated")
+    return float(freedom) if estimated and isinstance(freedom, int | float) and freedom > 0 else None
 
 
 def _one_line(text: str) -> str:
