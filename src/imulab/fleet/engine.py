@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import queue
+import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -13,12 +14,12 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from imulab._version import VERSION
-from imulab.errors import ImulabError, OptionError
+from imulab.errors import OptionError
 from imulab.fleet.manifest import Unit
 from imulab.fleet.work import Job, Outcome, work
 
 ENGINES = ("local", "dask")
-_CONNECT = 15.0
+_CONNECT = 10.0
 """Seconds to wait for a scheduler, and as many for its first worker: both must be over within 45 s."""
 _LOST = 30.0
 """Seconds without scheduler, without workers, or with nothing left of what was submitted, before giving up."""
@@ -88,7 +89,7 @@ class DaskEngine:
             from joblib import Parallel, delayed, parallel_config
 
             try:
-                with parallel_config(backend="dask", client=self._client, wait_for_workers_timeout=_CONNECT):
+                with parallel_config(backend=_cluster_backend(self._client)):
                     parallel = Parallel(return_as="generator_unordered", pre_dispatch="3 * n_jobs")
                     for outcome in parallel(delayed(work)(unit, job) for unit in units):
                         results.put(outcome)
@@ -117,6 +118,20 @@ class DaskEngine:
         return self.run([unit], job)
 
 
+def _cluster_backend(client: Any) -> Any:
+    """Return joblib's backend for a cluster, which has work to do even where it has but one worker.
+
+    Where a backend has room for one task joblib does the work itself; but it is the cluster that sees the files.
+    """
+    from joblib._dask import DaskDistributedBackend
+
+    class ClusterBackend(DaskDistributedBackend):  # type: ignore[misc]
+        def effective_n_jobs(self, n_jobs: int) -> int:
+            return max(2, int(super().effective_n_jobs(n_jobs)))
+
+    return ClusterBackend(client=client, wait_for_workers_timeout=_CONNECT)
+
+
 class _Watch:
     """Notices that nothing more will come of a cluster, which joblib's backend would wait for without end."""
 
@@ -129,19 +144,21 @@ class _Watch:
         self._since.clear()
 
     def look(self, *, end: bool = False) -> None:
-        """Raise if the cluster is lost for some time (at once with `end`)."""
+        """Raise if the cluster is lost for some time; with `end`, because work has ended in an error, at once."""
         patience = 0.0 if end else _LOST
-        if self._seen("scheduler", self._client.status != "running", patience):
+        workers: Any = {}
+        tasks: dict[str, Any] = {}
+        connected = self._client.status == "running"
+        if connected:
+            try:
+                workers, tasks = self._client.ncores(), self._client.processing()
+            except Exception:  # the connection was lost in between
+                connected = False
+        if self._seen("scheduler", not connected, patience):
             raise OptionError(f"scheduler {self._name}: the connection is lost; a second run does what is missing")
-        if self._client.status != "running":
-            return
-        try:
-            workers, tasks = self._client.ncores(), self._client.processing()
-        except Exception:  # the connection may be lost in between: the next look says so
-            return
-        if self._seen("workers", not workers, patience):
+        if connected and self._seen("workers", not workers, patience):
             raise OptionError(f"scheduler {self._name}: no workers are left; a second run does what is missing")
-        if self._seen("tasks", not any(tasks.values()), _LOST):
+        if connected and self._seen("tasks", not any(tasks.values()), _LOST):
             raise WorkersLostError("nothing is left of what was submitted")
 
     def _seen(self, what: str, bad: bool, patience: float) -> bool:
@@ -149,7 +166,8 @@ class _Watch:
         if not bad:
             self._since.pop(what, None)
             return False
-        return time.monotonic() - self._since.setdefault(what, time.monotonic()) >= patience
+        now = time.monotonic()
+        return now - self._since.setdefault(what, now) >= patience
 
 
 @contextmanager
@@ -181,27 +199,58 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
         from distributed import Client, LocalCluster
     except ImportError:
         raise OptionError("--engine dask needs Dask: pip install 'imulab[fleet]'") from None
-    for name in ("distributed", "tornado", "asyncio"):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what a person must know is said by the watch
+    for name in ("asyncio", *logging.root.manager.loggerDict):
+        if name.partition(".")[0] in ("asyncio", "distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what a person must know is said by the watch
     if scheduler is None:
         import joblib
 
         count = workers or int(joblib.cpu_count())
         cluster = stack.enter_context(
             LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
+                n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
             )
         )
         scheduler = str(cluster.scheduler_address)
+    _check_address(scheduler)
     try:
         client = stack.enter_context(Client(scheduler, timeout=_CONNECT, set_as_default=False))  # type: ignore[no-untyped-call]
-    except ImulabError:
-        raise
-    except Exception as error:  # addresses that cannot be parsed, resolved, reached, or that answer something else
-        reason = "" if isinstance(error, OSError) else f": {' '.join(str(error).split())}"
-        raise OptionError(f"scheduler {scheduler}: cannot be reached within {_CONNECT:.0f} s{reason}") from None
+    except Exception as error:  # something answers there that is no scheduler, or nothing in time
+        reason = _last_line(error)
+        raise OptionError(f"scheduler {scheduler}: cannot be reached within {_CONNECT:.0f} s ({reason})") from None
     _check_workers(client, scheduler)
     return DaskEngine(client, scheduler)
+
+
+def _check_address(address: str) -> None:
+    """Wait until something listens at an address: a client that fails to connect leaves its complaints on the screen.
+
+    Raises
+    ------
+    OptionError
+        The address is none, has an unknown host, or nothing listens there in time.
+    """
+    from distributed.comm.addressing import get_address_host_port, parse_address
+
+    place = f"scheduler {address}: cannot be reached"
+    try:
+        scheme, _ = parse_address(address)
+        host, port = get_address_host_port(address, strict=True)
+    except (ValueError, KeyError) as error:
+        raise OptionError(f"{place}: expected an address such as tcp://host:8786 ({_last_line(error)})") from None
+    if scheme not in ("tcp", "tls"):
+        return
+    end = time.monotonic() + _CONNECT
+    while True:
+        try:
+            socket.create_connection((host, port), timeout=max(end - time.monotonic(), 0.1)).close()
+            return
+        except socket.gaierror as error:
+            raise OptionError(f"{place}: {error.strerror}") from None
+        except OSError as error:
+            if time.monotonic() > end - 0.5:
+                raise OptionError(f"{place} within {_CONNECT:.0f} s ({error.strerror or error})") from None
+        time.sleep(0.2)
 
 
 def _check_workers(client: Any, name: str) -> None:
