@@ -128,7 +128,7 @@ def run_fleet(
         rows = keeper.rows()
         write_table(rows, table or store.folder / "parameters.csv")
     return FleetState(
-        folder, fleet, rows, kept=keeper.kept, seconds=time.monotonic() - begin, notes=tuple(notes)
+        folder, fleet, rows, kept=keeper.kept, seconds=time.monotonic() - begin, notes=(*notes, *keeper.notes)
     )  # fmt: skip
 
 
@@ -146,6 +146,7 @@ class _Keeper:
         self.left = {unit.serial: unit for unit in fleet.units}
         self.unseen: set[str] = set()
         self.kept = 0
+        self.notes: list[str] = []
         self._fleet = fleet
         self._history = history
         self._progress = progress
@@ -178,7 +179,11 @@ class _Keeper:
     def flush(self) -> None:
         """Hand what is new to the history."""
         if self._history is not None:
-            self._history.add(self._new)
+            try:
+                self._history.add(self._new)
+            except OptionError as error:  # the records are the truth, and the next run hands them in again
+                self._history = None
+                self.notes.append(f"the history is not complete: {error}")
         self._new.clear()
         self._flushed = time.monotonic()
 
