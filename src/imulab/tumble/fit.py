@@ -128,7 +128,8 @@ def fit_tumble(
     else:
         chosen = int(order)
     problem = Problem(reading, noise, chosen, robust=loss == "huber", prior=known)
-    solution, seen = _solve(problem, attitudes, method)
+    solved = choice.solution if choice is not None and known is None else None
+    solution, seen = _solve(problem, attitudes, method, solved)
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])
     matrix, freedom = _covariance(problem, solution)
@@ -216,10 +217,15 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
     return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
 
 
-def _solve(problem: Problem, attitudes: Attitudes, method: str) -> tuple[Solution, Observability]:
+def _solve(
+    problem: Problem, attitudes: Attitudes, method: str, solved: Solution | None
+) -> tuple[Solution, Observability]:
+    """Solve the problem and see what it determines; `solved` is the solution by norm where the order's choice has it."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "linearised" and n >= size:
         solution = solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
+    elif solved is not None:
+        solution = solved
     else:
         limit = chi_square_limit(n - size if problem.prior is None else n)
         start = None if problem.prior is None else problem.prior.mean[None]
