@@ -4,17 +4,34 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint format bench docs clean
+.PHONY: demo test test-all core fuzz dist lint format bench docs clean
 
 demo: $(STAMP)
 	$(BIN)/imulab demo demo
 
-test: $(STAMP)
+test: core $(STAMP)
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 	$(BIN)/python -m pytest -n 2 -m slow --reduced
 
-test-all: $(STAMP)
+test-all: core $(STAMP)
 	$(BIN)/python -m pytest -n 2
+
+# The C core by itself: double and float, every compiler there is, with sanitizers.
+core:
+	$(MAKE) -C runtime test
+
+# Long by default; FUZZ_SECONDS or FUZZ_RUNS bound it.
+fuzz:
+	$(MAKE) -C runtime fuzz FUZZ_SECONDS=$(or $(FUZZ_SECONDS),3600)
+
+# sdist and wheel; on Linux with the manylinux tag that the wheel earns.
+dist: $(VENV)/.release
+	rm -rf dist build/wheel
+	$(BIN)/python -m build --outdir build/wheel .
+	mkdir -p dist && mv build/wheel/*.tar.gz dist/
+	if [ "$$(uname)" = Linux ]; then PATH="$(CURDIR)/$(BIN):$$PATH" auditwheel repair -w dist build/wheel/*.whl; \
+	else mv build/wheel/*.whl dist/; fi
+	ls dist
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -25,7 +42,7 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(STAMP)
+bench: $(STAMP) $(VENV)/.bench
 	$(BIN)/python benchmarks/run.py
 
 docs: $(STAMP) $(VENV)/.docs
@@ -33,7 +50,7 @@ docs: $(STAMP) $(VENV)/.docs
 	@echo "open docs/_build/html/index.html"
 
 clean:
-	rm -rf $(VENV) demo docs/_build build dist
+	rm -rf $(VENV) demo docs/_build build dist runtime/build
 
 C_SOURCES := $(wildcard src/imulab/*.c src/imulab/readers/*.c runtime/*.[ch])
 
@@ -41,6 +58,14 @@ $(STAMP): pyproject.toml CMakeLists.txt $(C_SOURCES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imulab needs Python 3.11 or later")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+$(VENV)/.release: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[release]'
+	touch $@
+
+$(VENV)/.bench: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	touch $@
 
 $(VENV)/.docs: $(STAMP)

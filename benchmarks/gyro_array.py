@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,7 @@ from ctypes import CDLL, POINTER, c_double, c_long
 from pathlib import Path
 
 import numpy as np
+from timing import seconds
 
 import imulab as il
 from imulab.gyro_array.fuse import FuseOptions, fuse
@@ -46,17 +46,6 @@ void fuse(long m, const double *z, double *rate) {
 }
 """
 _SAMPLES = 400_000
-
-
-def seconds(*functions: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median time of each function, the functions taking turns."""
-    times: list[list[float]] = [[] for _ in functions]
-    for _ in range(repeats):
-        for collected, function in zip(times, functions, strict=True):
-            begin = time.perf_counter()
-            function()
-            collected.append(time.perf_counter() - begin)
-    return [statistics.median(collected) for collected in times]
 
 
 def rows() -> list[tuple[str, str, str]]:

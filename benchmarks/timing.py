@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 Row = tuple[str, str, str]
 """What was measured, what was found, what was asked."""
@@ -29,13 +29,29 @@ def process(*arguments: str) -> Callable[[], object]:
     return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
 
 
-def peak_memory(*arguments: str) -> float:
-    """Peak resident memory, MB, of a Python process with these arguments; its output is thrown away."""
-    child = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    if status:
-        raise RuntimeError(f"{arguments} failed")
-    return usage.ru_maxrss / 1024
+_MEASURER = """
+import resource, subprocess, sys, time
+begin = time.perf_counter()
+done = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+took = time.perf_counter() - begin
+sys.stderr.buffer.write(done.stderr[-2000:])
+print(took, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+sys.exit(done.returncode)
+"""
+
+
+def measured(*arguments: str, folder: str | Path = ".") -> tuple[float, float]:
+    """Time, s, and peak resident memory, MB, of a Python process with these arguments.
+
+    A small process stands between, because a child begins with the memory of the process that starts it.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", _MEASURER, sys.executable, *arguments], cwd=folder, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(arguments)}: {done.stderr}")
+    took, peak = map(float, done.stdout.split())
+    return took, peak
 
 
 def exponent(sizes: list[float], values: list[float]) -> float:

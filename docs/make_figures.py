@@ -12,9 +12,11 @@ from pathlib import Path
 import imulab as il
 from imulab.centrifuge.manifest import make_manifest
 from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Truth
+from imulab.cli import main as commands
 from imulab.demo import run
 from imulab.exhibit import BAD, GOOD, Exhibits, Figure
-from imulab.report import render
+from imulab.present import exhibits_of
+from imulab.report import Card, render, render_index
 
 LEVELS = (1, 2, 5, 10, 15, 20, 30, 40)
 FIGURES = Path(__file__).resolve().parent / "figures"
@@ -82,12 +84,24 @@ def centrifuge(folder: Path) -> None:
     screenshot(page, FIGURES / "centrifuge_tilt.png", 1080, 690)
 
 
+def first_figure(folder: Path, record: str, picture: str) -> None:
+    """Headline and first figure of one record of the demonstration."""
+    exhibits = exhibits_of(il.load(folder / record))
+    figure = next(item for item in exhibits.items if isinstance(item, Figure))
+    page = folder / f"one_{picture}.html"
+    page.write_text(render_index(exhibits.headline, "", [Card(figure.title, "", [], replace(figure, title=""))]))
+    screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 260)
+
+
 def main() -> None:
     FIGURES.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        run(folder)
-        screenshot(Path(folder).resolve() / "tumble.html", FIGURES / "tumble.png", 1080, 930)
-        centrifuge(Path(folder).resolve())
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name).resolve()
+        run(folder, commands)
+        screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 930)
+        first_figure(folder, "array.json", "gyro_array")
+        first_figure(folder, "warmup.json", "warmup")
+        centrifuge(folder)
 
 
 if __name__ == "__main__":

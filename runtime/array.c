@@ -68,7 +68,7 @@ static il_real support_step(const il_array *a, il_array_axis *s, const il_real *
         for (int32_t j = 0; j < i; j++) sum += s->flags[i] | s->flags[j] ? IL_C(0.0) : (z[i] - z[j]) * (z[i] - z[j]);
     }
     if (count > 1) {
-        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : il_array_gain(a, s->seen[0] + a->start);
+        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : il_array_gain(a, il_counted(s->seen[0], a->start));
         s->spread += gain * (sum / ((il_real)count * (il_real)(count - 1) / IL_C(2.0)) - s->spread);
         il_count(&s->seen[0]);
     }
@@ -92,14 +92,14 @@ static il_real least_squares_step(const il_array *a, il_array_axis *s, const il_
     il_real mean = finite_mean(a, s, z, &count);
     for (int32_t i = 0; i < a->elements; i++) {
         if (!s->flags[i] && count > 1) {
-            uint32_t k = s->seen[i] + a->start;
+            uint32_t k = il_counted(s->seen[i], a->start);
             il_real gain = s->seen[i] == 0 ? IL_C(1.0) : il_array_gain(a, k), residual = z[i] - mean - s->bias[i];
             s->bias[i] += gain * residual;
             s->variance[i] += gain * ((IL_C(1.0) - gain) * residual * residual - s->variance[i]);
             il_count(&s->seen[i]);
         }
         /* equal weights until every variance rests on two residuals */
-        s->weight[i] = s->count < a->start + 2 ? IL_C(1.0) : IL_C(1.0) / (s->variance[i] + IL_TINY);
+        s->weight[i] = s->count - a->start < 2 ? IL_C(1.0) : IL_C(1.0) / (s->variance[i] + IL_TINY);
     }
     return weighted(a, s, z);
 }
@@ -132,16 +132,21 @@ static inline il_real feedback_step(const il_array *a, il_array_axis *s, const i
     int32_t n = a->elements;
     if (s->count == a->start) return start_bias(a, s, z, axis);
     il_real gain = il_array_gain(a, s->count), keep = IL_C(1.0) - gain, before = s->rate;
-    il_real total = IL_C(0.0), sum = IL_C(0.0);
+    il_real total = IL_C(0.0), sum = IL_C(0.0), part[IL_ARRAY_ELEMENTS];
+    /* What does not depend on the other gyros first: compilers divide two or four at once here. */
     for (int32_t i = 0; i < n; i++) {
-        il_real b = keep * s->bias[i] + gain * (z[i] - before), y = z[i] - b, error = y - before;
+        /* Written as a step: (1-g) and g as rounded do not add up to one, which would let the common bias leak away. */
+        il_real b = s->bias[i] + gain * (z[i] - s->bias[i] - before), y = z[i] - b, error = y - before;
         il_real d = keep * s->variance[i] + gain * (error * error);
         il_real share = IL_C(1.0) / (d < IL_TINY ? IL_TINY : d);
         s->bias[i] = b;
         s->variance[i] = d;
         s->weight[i] = share;
-        total += share;
-        sum += share * y;
+        part[i] = share * y;
+    }
+    for (int32_t i = 0; i < n; i++) {
+        total += s->weight[i];
+        sum += part[i];
     }
     return sum / total;
 }

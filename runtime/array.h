@@ -15,4 +15,9 @@ static inline void il_count(uint32_t *n) {
     if (*n < UINT32_MAX) ++*n;
 }
 
+/* Sum of two counts, which stops at the largest number too. */
+static inline uint32_t il_counted(uint32_t a, uint32_t b) {
+    return b <= UINT32_MAX - a ? a + b : UINT32_MAX;
+}
+
 #endif

@@ -134,7 +134,7 @@ typedef struct {
     int32_t active;          /* 0: the table does not cover this power-on temperature */
     int32_t row;             /* interval, or lower knot */
     il_real share[4];        /* of lower and upper value, lower and upper slope */
-    il_real per_tick;        /* u or s per tick */
+    il_real rate[3];         /* per tick: of u, or of t / tau0; or the exponents -tick / time_constant */
     il_real log_scale;       /* 1 / log(1 + T_M / tau0) */
     uint32_t settled, ended; /* ticks at T_M, and at the end of the taper */
 } il_warmup_state;
@@ -222,7 +222,8 @@ unsigned il_array_step(const il_array *settings, il_array_state *state, const il
 /* The unit stood still in the sample just fused: what is left of its rate is bias common to all gyros. */
 void il_array_still(const il_array *settings, il_array_state *state);
 
-/* n samples; flags and weights [sample][axis][element] and still [sample] may be NULL. */
+/* n samples; flags and weights [sample][axis][element] and still [sample] may be NULL. Returns the flags met, or-ed;
+ * without flags and weights those are only IL_NOT_FINITE of a fused rate, and all of the last sample. */
 unsigned il_array_block(const il_array *settings, il_array_state *state, size_t n, const il_real *reading,
                         const uint8_t *still, il_real *rate, uint8_t *flags, il_real *weight);
 
@@ -239,8 +240,8 @@ typedef struct {
     il_array array;
 } il_unit;
 
-/* Check a table and unpack it; arrays go to the caller's memory, which must outlive the unit. On failure unit->has
- * is 0. `size / 4` numbers of memory are always enough. */
+/* Check a table and unpack it; arrays go to the caller's memory, which must outlive the unit; the bytes need not. On
+ * failure unit->has is 0. `size / 4` numbers of memory are always enough. */
 il_status il_table_load(il_unit *unit, const uint8_t *bytes, size_t size, il_real *memory, size_t capacity);
 
 /* CRC-32 (IEEE 802.3) of n bytes. */

@@ -7,6 +7,10 @@
 
 #include "imulab.h"
 
+#if (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
+#error "imulab must recognise what is not a number: compile it without -ffast-math (-Ofast, /fp:fast)"
+#endif
+
 #define IL_IS_float 1
 #define IL_IS_double 0
 #define IL_PASTE(a, b) a##b

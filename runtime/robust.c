@@ -95,7 +95,7 @@ static int examine(const il_array *a, il_array_axis *s, const il_real *z, const 
         il_real change = il_fabs(reading[i] - s->last[i]);
         int same = change == IL_C(0.0) && s->compared[i] > 0;
         s->repeats[i] = same ? s->repeats[i] + (s->repeats[i] < UINT32_MAX) : 0;
-        if (s->compared[i] > 1 && s->changed[i] == UINT32_MAX) { /* halve both, so that their ratio goes on */
+        if (s->compared[i] == UINT32_MAX) { /* halve both, so that their ratio goes on */
             s->changed[i] >>= 1;
             s->compared[i] >>= 1;
         }
@@ -103,7 +103,7 @@ static int examine(const il_array *a, il_array_axis *s, const il_real *z, const 
             s->changed[i]++;
             if (change < s->resolution || s->resolution == IL_C(0.0)) s->resolution = change;
         }
-        il_count(&s->compared[i]); /* pairs seen, plus one: 0 means that there is no reading to compare with */
+        s->compared[i]++; /* pairs seen, plus one: 0 means that there is no reading to compare with */
         s->last[i] = reading[i];
         closer |= (s->repeats[i] >= a->stuck) | (s->standing[i] & STUCK);
     }
@@ -171,11 +171,27 @@ static il_real weight_of_evidence(const il_array *a, const il_array_axis *s, int
     return a->memory > IL_C(0.0) && count * a->memory > IL_C(1.0) ? IL_C(1.0) / a->memory : count;
 }
 
-/* Variance of a gyro, drawn to the mean of all while it rests on few residuals. */
+/* Variance of a gyro, drawn to the mean of all while it rests on few residuals: (prior v_mean + count v) / (both). */
+static il_real drawn(const il_array *a, const il_array_axis *s, const sample *p, int32_t i, il_real count, il_real share) {
+    il_real prior = a->weight != NULL ? CALIBRATED : OWN;
+    il_real mixed = (prior * s->ratio[i] * p->mean_variance + count * s->variance[i]) * share;
+    return larger(larger(mixed, a->weight_floor * p->mean_variance), IL_TINY);
+}
+
 static il_real trusted(const il_array *a, const il_array_axis *s, const sample *p, int32_t i) {
     il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = weight_of_evidence(a, s, i);
-    il_real mixed = (prior * s->ratio[i] * p->mean_variance + count * s->variance[i]) / (prior + count);
-    return larger(larger(mixed, a->weight_floor * p->mean_variance), IL_TINY);
+    return drawn(a, s, p, i, count, IL_C(1.0) / (prior + count));
+}
+
+static void trust_all(const il_array *a, const il_array_axis *s, sample *p) {
+    il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = IL_C(0.0), share = IL_C(0.0);
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (i == 0 || s->seen[i] != s->seen[i - 1]) { /* nearly always all have seen the same: one division serves */
+            count = weight_of_evidence(a, s, i);
+            share = IL_C(1.0) / (prior + count);
+        }
+        p->trust[i] = drawn(a, s, p, i, count, share);
+    }
 }
 
 /* Both gates about the median: inside[] counts in the output, learns[] teaches as well. */
@@ -267,8 +283,11 @@ static void weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t 
     il_real scale = IL_C(1.0) / total, cap = used < 3 ? IL_C(1.0) : a->weight_cap;
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] *= scale;
     if (s->weight[top] <= cap) return;
-    il_real factor = (IL_C(1.0) - cap) / (IL_C(1.0) - s->weight[top]);
-    for (int32_t i = 0; i < a->elements; i++) s->weight[i] = i == top ? cap : s->weight[i] * factor;
+    /* The others' sum, not what the top one leaves of 1: that may be nothing but rounding. */
+    il_real rest = IL_C(0.0);
+    for (int32_t i = 0; i < a->elements; i++) rest += i == top ? IL_C(0.0) : s->weight[i];
+    if (!(rest > IL_C(0.0))) return;
+    for (int32_t i = 0; i < a->elements; i++) s->weight[i] = i == top ? cap : s->weight[i] / rest * (IL_C(1.0) - cap);
 }
 
 /* A jump too small for the gate shows in the mean of a second, where the others' means agree. */
@@ -284,7 +303,7 @@ static void find_small_jumps(const il_array *a, il_array_axis *s, const sample *
     if (IL_C(4.0) * largest <= IL_C(0.5) * least * smallest) return;
     il_real usual = median_of(a->elements, p->learns, s->fast, &scatter);
     for (int32_t i = 0; i < a->elements; i++) {
-        if (!p->learns[i] || s->seen[i] < 5 * a->quiet) continue;
+        if (!p->learns[i] || s->seen[i] / 5 < a->quiet) continue; /* fewer than 5 quiet periods, without overflow */
         il_real limit = larger(il_sqrt(least * trusted(a, s, p, i)), IL_C(8.0) * scatter);
         limit = larger(limit, a->scale_tolerance * il_fabs(p->middle));
         if (il_fabs(s->fast[i] - usual) > limit) jump(s, i);
@@ -318,7 +337,7 @@ static void learn(const il_array *a, il_array_axis *s, const sample *p, int32_t 
         /* a start other than 1 is experience in the bias, from the second residual on */
         il_real bias_gain = gain;
         if (a->start > 1 && a->memory == IL_C(0.0) && !(known == 1 && a->initial == IL_FIRST)) {
-            bias_gain = learning_gain(a, known > UINT32_MAX - a->start ? known : known + a->start - 1);
+            bias_gain = learning_gain(a, il_counted(known, a->start - 1));
         }
         s->bias[i] += bias_gain * e[i];
         shift += bias_gain * e[i];
@@ -367,10 +386,10 @@ static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, sam
     int32_t used = 0, nearest = -1;
     gates(a, s, z, p, roll_call(a, s, p));
     judge(a, s, p);
+    trust_all(a, s, p); /* a gyro that is back has another variance now */
     for (int32_t i = 0; i < a->elements; i++) {
         int here = p->waived ? p->core[i] : p->usable[i] && !(s->standing[i] & OUT);
         p->used[i] = (uint8_t)(here && p->inside[i]);
-        p->trust[i] = trusted(a, s, p, i);
         used += p->used[i];
         if (!p->core[i]) continue;
         if (nearest < 0 || il_fabs(p->r[i] - p->middle) < il_fabs(p->r[nearest] - p->middle)) nearest = i;
@@ -414,9 +433,9 @@ il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, co
     p.mean_variance = mean_variance(a, s);
     for (int32_t i = 0; i < a->elements; i++) {
         p.r[i] = z[i] - s->bias[i];
-        p.trust[i] = trusted(a, s, &p, i);
         p.used[i] = p.learns[i] = 1;
     }
+    trust_all(a, s, &p);
     if (closer || !all_inside(a, s, &p)) used = choose(a, s, z, &p);
     if (used == 0) {
         report(a, s, &p, used);

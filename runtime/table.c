@@ -76,12 +76,16 @@ static int32_t count(cursor *c, uint32_t least, uint32_t most) {
     return (int32_t)least;
 }
 
+/* Whether n numbers are still to come in this section. */
+static int there(cursor *c, size_t n) {
+    if ((size_t)(c->end - c->at) / c->width >= n) return 1;
+    fail(c, IL_TABLE_CONTENT);
+    return 0;
+}
+
 static void numbers(cursor *c, il_real *out, size_t n) {
     for (size_t i = 0; i < n; i++) out[i] = IL_C(0.0);
-    if ((size_t)(c->end - c->at) / c->width < n) {
-        fail(c, IL_TABLE_CONTENT);
-        return;
-    }
+    if (!there(c, n)) return;
     for (size_t i = 0; i < n; i++, c->at += c->width) {
 #if !IL_FLOAT
         if (c->width == 8) {
@@ -113,7 +117,7 @@ static il_real positive(cursor *c) {
 
 /* Numbers into the caller's memory; NULL for none. */
 static const il_real *kept(cursor *c, size_t n) {
-    if (n == 0 || c->status != IL_OK) return NULL;
+    if (n == 0 || c->status != IL_OK || !there(c, n)) return NULL;
     if (n > c->capacity) {
         fail(c, IL_TABLE_MEMORY);
         return NULL;
@@ -172,13 +176,14 @@ static void read_warmup(cursor *c, il_warmup *w) {
     for (int32_t j = 0; exponential && j < w->terms; j++) {
         if (!(w->time_constant[j] > IL_C(0.0))) fail(c, IL_TABLE_CONTENT);
     }
-    size_t rows = (size_t)w->temperatures - (w->model == IL_INTERVAL_CUBIC ? 1u : 0u);
-    size_t size = rows * (size_t)w->axes; /* at most 2^32; times terms it may not fit where size_t has 32 bits */
-    if (size > SIZE_MAX / 8) {
+    /* No more numbers than the section has bytes for: asked by division, because a product need not fit in size_t. */
+    uint32_t left = (uint32_t)(c->end - c->at) / c->width, per_row = (uint32_t)w->axes * (uint32_t)w->terms;
+    uint32_t rows = (uint32_t)w->temperatures - (w->model == IL_INTERVAL_CUBIC ? 1u : 0u);
+    if ((uint32_t)w->temperatures > left || rows > left / per_row) {
         fail(c, IL_TABLE_CONTENT);
         return;
     }
-    size *= (size_t)w->terms;
+    size_t size = (size_t)rows * per_row;
     w->temperature = kept(c, (size_t)w->temperatures);
     w->coefficient = kept(c, size);
     w->slope = kept(c, exponential ? size : 0);

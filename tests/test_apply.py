@@ -93,7 +93,7 @@ def test_a_recording_without_the_triad_is_refused():
 
 @pytest.mark.parametrize(
     ("procedure", "message"),
-    [("warmup", "lacks table"), ("gyro_array", "array fuse --calibration"), ("centrifuge", "lacks x_K0")],
+    [("warmup", "lacks its table"), ("gyro_array", "array fuse --calibration"), ("centrifuge", "lacks x_K0")],
 )
 def test_a_record_with_nothing_to_apply_here_is_refused(procedure, message):
     other = Calibration(procedure, {}, Covariance((), ()), {}, {})

@@ -73,23 +73,31 @@ def test_arrays_and_centrifuge_tests_run_through_the_same_functions(imulab, tmp_
         "--static-duration", "20 s",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    cycles = ["warmup", "simulate", "-o", "w", "--temperatures", "0,20,40", "--cycles", 2, "--rate", "2 Hz"]
+    assert imulab(*cycles).returncode == 0
+    warm = sorted(f"w/{path.name}" for path in (tmp_path / "w").glob("*.csv"))
+    at = ["--temperatures", "0,20,40", "--model", "knot-cubic", "--settling-time", "300 s"]
     single = [
+        (["warmup", "fit", *warm, *at], "W1", "warmup", ";".join(warm)),
         (["array", "calibrate", "still.csv", "--moving", "moving.csv"], "A1", "array", "still.csv;moving.csv"),
         (["array", "calibrate", "still.csv"], "A2", "array", "still.csv"),
         (["centrifuge", "reduce", "c/manifest.toml"], "C1", "centrifuge", "c/manifest.toml"),
     ]
     rows = [{"serial": serial, "procedure": procedure, "file": file} for _, serial, procedure, file in single]
+    rows[0] |= {"temperatures": "0,20,40", "model": "knot-cubic", "settling-time": "300 s"}
     write_manifest(tmp_path / "m.csv", rows)
     state = run(tmp_path / "m.csv", tmp_path / "out")
     assert [row.reason for row in state.failures] == []
     for arguments, serial, _, _ in single:
         done = imulab(*arguments, "-o", "one.json")
         assert done.returncode == 0, done.stderr
-        assert il.load(tmp_path / "out" / f"{serial}.json").parameters == il.load(tmp_path / "one.json").parameters
-    assert run(tmp_path / "m.csv", tmp_path / "out").kept == 3
+        many, one = il.load(tmp_path / "out" / f"{serial}.json"), il.load(tmp_path / "one.json")
+        assert (many.parameters, many.covariance) == (one.parameters, one.covariance)
+        assert many.sections.get("table") == one.sections.get("table")
+    assert run(tmp_path / "m.csv", tmp_path / "out").kept == 4
     runs = sorted((tmp_path / "c").glob("*.csv"))
     runs[0].write_text(runs[0].read_text() + "\n")  # a run that only the test's own manifest names
-    assert run(tmp_path / "m.csv", tmp_path / "out").kept == 2
+    assert run(tmp_path / "m.csv", tmp_path / "out").kept == 3
 
 
 # ---- what is done, and what is done again --------------------------------------------------------------------------

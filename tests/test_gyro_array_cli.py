@@ -96,6 +96,14 @@ def test_lines_are_fused_as_they_come(run_file):
     np.testing.assert_array_equal([float(line.split(b",")[1]) for line in got], whole[:1000])
 
 
+def test_a_stream_tells_of_a_gyro_at_once_and_sums_up_at_its_end(imulab, run_file):
+    done = imulab("array", "fuse", "-", "--rate", "50 Hz", stdin=(run_file / "run.csv").read_text())
+    lines = [line.removeprefix("imulab: warning: ") for line in done.stderr.splitlines()]
+    assert "gyro_3: stuck at 10.5 s" in lines
+    assert lines.index("gyro_3: stuck at 10.5 s") < lines.index("gyro_5: jumped at 20.48 s")
+    assert sum(line.endswith("(of 2000 samples)") for line in lines) == 2
+
+
 def test_a_reader_that_goes_away_ends_it_quietly(run_file):
     shell = f"{sys.executable} -m imulab array fuse {run_file / 'run.csv'} | head -3"
     done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, check=False, timeout=60)
@@ -128,6 +136,15 @@ def test_every_method_and_start_runs(imulab, run_file):
         assert len(done.stdout.splitlines()) == 2000 + 10
     options = ["--method", "feedback", "--memory", "growing:100", "--initial-bias", record]
     assert imulab("array", "fuse", run_file / "run.csv", *options).returncode == 0
+
+
+def test_parquet_comes_out_the_same(imulab, run_file, tmp_path):
+    assert imulab("array", "fuse", run_file / "run.csv", "-o", "a.parquet").returncode == 0
+    assert imulab("array", "fuse", run_file / "run.csv", "-o", "a.csv").returncode == 0
+    csv, parquet = il.read(tmp_path / "a.csv"), il.read(tmp_path / "a.parquet")
+    assert parquet.units == csv.units
+    assert parquet.metadata == csv.metadata
+    np.testing.assert_array_equal(parquet.columns["rate"], csv.columns["rate"])
 
 
 def test_three_axes_come_out_as_three_columns_in_their_unit(imulab, tmp_path):

@@ -55,6 +55,11 @@ if TYPE_CHECKING:
     from imulab.tumble.fit import TumbleFit as TumbleFit
     from imulab.tumble.fit import fit_tumble as fit_tumble
     from imulab.tumble.simulate import simulate_tumble as simulate_tumble
+    from imulab.warmup.cycles import find_power_cycle as find_power_cycle
+    from imulab.warmup.fit import WarmupFit as WarmupFit
+    from imulab.warmup.fit import fit_warmup as fit_warmup
+    from imulab.warmup.plan import plan_warmup as plan_warmup
+    from imulab.warmup.simulate import simulate_warmup as simulate_warmup
     from imulab.writers import write as write
     from imulab.writers import write_csv as write_csv
 
@@ -73,18 +78,23 @@ _HOME = {
     "ImulabError": "errors",
     "Recording": "recording",
     "TumbleFit": "tumble.fit",
+    "WarmupFit": "warmup.fit",
     "apply": "applying",
     "export": "exporters",
     "find_attitudes": "segment",
+    "find_power_cycle": "warmup.cycles",
     "fit_centrifuge": "centrifuge.fit",
     "fit_tumble": "tumble.fit",
+    "fit_warmup": "warmup.fit",
     "load": "calibration",
     "load_manifest": "centrifuge.manifest",
     "normal_gravity": "gravity",
+    "plan_warmup": "warmup.plan",
     "read": "readers",
     "read_blocks": "readers",
     "simulate_centrifuge": "centrifuge.simulate",
     "simulate_tumble": "tumble.simulate",
+    "simulate_warmup": "warmup.simulate",
     "write": "writers",
     "write_csv": "writers",
     "write_report": "present",

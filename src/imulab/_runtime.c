@@ -59,6 +59,10 @@ static void *memory_of(buffers *b, PyObject *object, char type, Py_ssize_t n, in
         PyErr_Format(PyExc_TypeError, "expected an array of type '%c', found '%s'", type, format);
         return NULL;
     }
+    if (type != 'B' && (uintptr_t)view->buf % (size_t)view->itemsize != 0) {
+        PyErr_SetString(PyExc_ValueError, "expected an aligned array");
+        return NULL;
+    }
     if (n >= 0 && view->len / view->itemsize != n) {
         PyErr_Format(PyExc_ValueError, "expected %zd items, found %zd", n, view->len / view->itemsize);
         return NULL;
@@ -232,6 +236,10 @@ static PyObject *array_block(PyObject *self, PyObject *args) {
     if (unit == NULL) return NULL;
     Py_ssize_t axes = unit->array.axes, width = axes * unit->array.elements;
     void *bytes = memory_of(&b, state, 'B', (Py_ssize_t)sizeof(il_array_state), 1);
+    if (bytes != NULL && (uintptr_t)bytes % sizeof(il_real) != 0) {
+        PyErr_SetString(PyExc_ValueError, "expected an aligned state");
+        bytes = NULL;
+    }
     const il_real *reading = bytes != NULL ? memory_of(&b, readings, 'd', -1, 0) : NULL;
     Py_ssize_t n = reading != NULL ? items(&b, 1) / width : 0;
     if (reading != NULL && n * width != items(&b, 1)) {

@@ -19,11 +19,17 @@ from imulab.runtime import Unit
 from imulab.tables import tables_of
 from imulab.tumble.apply import apply_gyro, apply_tumble, beyond_test
 from imulab.units import from_si
+from imulab.warmup.apply import apply_warmup, record_table, temperature_warning
 
 _FAR_IN_TEMPERATURE = 20.0
 
 _Correct = Callable[[Unit, Mapping[str, Any], Recording], Recording]
-_APPLY: dict[str, _Correct] = {"tumble": apply_tumble, "gyro": apply_gyro, "centrifuge": apply_centrifuge}
+_APPLY: dict[str, _Correct] = {
+    "tumble": apply_tumble,
+    "gyro": apply_gyro,
+    "centrifuge": apply_centrifuge,
+    "warmup": apply_warmup,
+}
 _BEYOND = {"tumble": beyond_test, "centrifuge": beyond_levels}
 
 
@@ -45,12 +51,19 @@ def loaded(record: Calibration | Blob) -> Loaded:
     """
     if isinstance(record, Blob):
         # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
-        sections = [(str(section["kind"]), section) for section in record.text["sections"] if section["kind"] in _APPLY]
+        sections = [
+            (str(section["kind"]), section) for section in record.text["sections"] if section["kind"] != "array"
+        ]
+        unknown = [kind for kind, _ in sections if kind not in _APPLY]
+        if unknown:
+            raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
         if not sections:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         return Loaded(Unit(record.data), tuple(sections))
     if record.procedure == "gyro_array":
         raise RecordError("a gyro_array record cannot be applied: 'imulab array fuse --calibration' takes it")
+    if record.procedure == "warmup":
+        record_table(record)  # says in words what the core would refuse by a number
     tables = tables_of(record)
     return Loaded(Unit.of(*tables), tuple((table.kind, table.columns) for table in tables))
 
@@ -89,7 +102,11 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     mine, its = sensor.get("serial"), recording.metadata.get("serial")
     if mine and its and mine != its:
         found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
-    made = None if isinstance(record, Blob) else record.model.get("temperature")
+    tables = _warmup_ranges(record)
+    messages = [message for low, high in tables if (message := temperature_warning(low, high, recording))]
+    if isinstance(record, Blob) or record.procedure == "warmup":
+        return [*found, *messages]
+    made = record.model.get("temperature")
     here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
         return found
@@ -98,6 +115,15 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
         f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
         f"{made['value']:.1f} degC at which the record was made",
     ]
+
+
+def _warmup_ranges(record: Calibration | Blob) -> list[tuple[float, float]]:
+    """Power-on temperatures that the record's or blob's warm-up table covers, degC."""
+    if isinstance(record, Blob):
+        ranges = [section["range"] for section in record.text["sections"] if section["kind"] == "warmup"]
+    else:
+        ranges = [record_table(record).temperatures[[0, -1]]] if record.procedure == "warmup" else []
+    return [(float(low), float(high)) for low, high in ranges]
 
 
 def identity(record: Calibration | Blob) -> str:

@@ -11,8 +11,14 @@ from imulab.errors import RecordError
 from imulab.exhibit import Exhibits
 from imulab.gyro_array import figures as gyro_array
 from imulab.tumble import figures as tumble
+from imulab.warmup import figures as warmup
 
-_EXHIBITS = {"tumble": tumble.exhibits, "gyro_array": gyro_array.exhibits, "centrifuge": centrifuge.exhibits}
+_EXHIBITS = {
+    "tumble": tumble.exhibits,
+    "gyro_array": gyro_array.exhibits,
+    "warmup": warmup.exhibits,
+    "centrifuge": centrifuge.exhibits,
+}
 
 
 def exhibits_of(record: Calibration) -> Exhibits:

@@ -80,11 +80,11 @@ def pack(tables: Sequence[Table], width: int, text: Mapping[str, Any] | None = N
     """
     sections = [] if text is None else [(TEXT, json.dumps(text, ensure_ascii=False, sort_keys=True).encode("utf-8"))]
     with np.errstate(over="ignore"):
-        sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
-    for table in tables:
-        for field in table.fields:
-            if field.values is not None and not np.isfinite(field.values.astype(f"<f{width}")).all():
-                raise RecordError(f"{table.kind} {field.name}: {field.values} is beyond what {width} bytes hold")
+        for table in tables:
+            for field in table.fields:
+                if field.values is not None and not np.isfinite(field.values.astype(f"<f{width}")).all():
+                    raise RecordError(f"{table.kind} {field.name}: {field.values} is beyond what {width} bytes hold")
+    sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
     body = b"".join(struct.pack("<II", kind, len(payload)) + payload for kind, payload in sections)
     head = BLOB_MAGIC + struct.pack("<HHI", VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4)
     return head + body + struct.pack("<I", zlib.crc32(head + body))
@@ -179,8 +179,8 @@ def _centrifuge(record: Calibration) -> tuple[Table, ...]:
     for axis in axes:
         if f"{axis}_direction" not in record.parameters:
             raise RecordError(
-                f"the record has no {axis}_direction: it was reduced without table_angle, "
-                "so the drift's direction is not known and cannot be removed"
+                f"the record has no {axis}_direction: it was made without table_angle, "
+                "so that the direction of the drift in the gyroscope is not known"
             )
 
     def both(name: str) -> Array:
@@ -240,14 +240,20 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
         Field("axes", _whole(len(axes))),
         Field("terms", _whole(terms)),
         Field("settling_time", np.array(float(table["settling_time"]))),
-        Field("taper_time", np.array(float(table.get("taper_time") or 0.0))),
+        Field("taper_time", np.array(float(table["taper_time"]) if table["exit"] == "taper" else 0.0)),
         Field("time_scale", np.array(float(table.get("time_scale") or 0.0))),
         Field("time_constant", constants),
         Field("temperature", temperatures, pointed=True),
         Field("coefficient", coefficients, pointed=True),
         Field("slope", slopes, pointed=True),
     )
-    return Table("warmup", fields, {"axes": axes, "units": list(table["units"])})
+    ends = [float(temperatures[0]), float(temperatures[-1])]
+    return Table("warmup", fields, {"axes": axes, "units": list(table["units"]), "range": ends, "end": _end(table)})
+
+
+def _end(table: Mapping[str, Any]) -> float:
+    """Time from which on the table's curve no longer changes, s."""
+    return float(table["settling_time"]) + (float(table["taper_time"]) if table["exit"] == "taper" else 0.0)
 
 
 # ---- gyro array ----------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -63,3 +64,20 @@ def chosen(topic: str | None, instance: str | None, window: str | None, label: s
         part = tuple(quantity(end, name, "time", "s") if end.strip() else None for end in ends)
     number = None if instance is None else whole_number(instance, label.format("instance"))
     return {"topic": topic, "instance": number, "window": part}
+
+
+def number(text: str, option: str) -> float:
+    """Return a text as a finite number.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not math.isfinite(value):
+        raise OptionError(f"{option} {text!r}: expected a number")
+    return value

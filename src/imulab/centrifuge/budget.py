@@ -127,14 +127,14 @@ def _tilt(test: _Test) -> list[Entry]:
         variance = test.fog_variance / test.arm**2
         weight = 1 / np.maximum(variance, 1e-300)
         value, u = float((weight * size).sum() / weight.sum()), float(1 / np.sqrt(weight.sum()))
-        basis = "FOG line / arm rate, flexure included"
+        basis = "FOG line, flexure included"
         return [Entry("tilt", True, value, u, "rad", 0.0, test.fog_share, basis)]
     parameters, covariance, _ = _tilted(test)
     entries = []
     top = float(test.force.max())
     for error, index, factor, unit, basis in (
-        ("tilt", 0, 1.0, "rad", "FOG line / arm rate, at a = 0"),
-        ("common flexure", 2, top, "rad/(m/s^2)", "FOG line / arm rate, growth with a"),
+        ("tilt", 0, 1.0, "rad", "FOG line at a = 0"),
+        ("common flexure", 2, top, "rad/(m/s^2)", "FOG line, growth with a"),
     ):
         if index == 2 and test.levels < 2:
             continue
@@ -152,7 +152,7 @@ def _flexure(test: _Test) -> Entry:
     if not test.encoder or len(np.unique(senses)) < 2:
         return Entry(
             "differential flexure", False, _FLEXURE, None, "rad/(m/s^2)", _FLEXURE * reach, None,
-            "needs both senses with table_angle",
+            "needs both senses, encoder",
         )  # fmt: skip
     # Per unit of force: Z = D(level) + w_t kappa_d; the levels' own lines are free.
     labels = np.round(np.abs(test.arm), 6)
@@ -165,7 +165,7 @@ def _flexure(test: _Test) -> Entry:
     u = float(np.sqrt(found[0][1][-1, -1]))
     return Entry(
         "differential flexure", True, value, u, "rad/(m/s^2)", 0.0, value * reach,
-        "half the difference of the senses",
+        "difference of the senses",
     )  # fmt: skip
 
 
@@ -176,7 +176,7 @@ def _scale_mismatch(test: _Test) -> list[Entry]:
     if not room:
         return [
             Entry("scale mismatch", False, _MISMATCH, None, "1", _MISMATCH * test.fog_share, None,
-                  "needs a clear Earth-rate line"),
+                  "needs an Earth-rate line"),
         ]  # fmt: skip
     ratio = np.array([line[0] / line[-1] - 1 for line, _, _ in room])
     variance = np.array([(C[0, 0] + C[-1, -1] - 2 * C[0, -1]).real / 2 / abs(line[-1]) ** 2 for line, C, _ in room])
@@ -192,7 +192,7 @@ def _scale_mismatch(test: _Test) -> list[Entry]:
         effect = float(np.hypot(value, u)) * test.fog_share
         entries.append(
             Entry(error, True, value, u, unit, 0.0 if both else effect, effect if both else None,
-                  "Earth-rate line, X against FOG"),
+                  "Earth-rate line"),
         )  # fmt: skip
     return entries
 
@@ -201,7 +201,7 @@ def _delays(test: _Test) -> list[Entry]:
     """Delays of FOG and X against the encoder: by the turning of their lines with the table rate."""
     per_second = float(np.abs(test.table).max()) * test.fog_share
     if not test.encoder or test.levels < 3:
-        basis = "needs table_angle, three levels"
+        basis = "needs encoder, 3 levels"
         return [Entry("delay, FOG to X", False, _DELAY, None, "s", _DELAY * per_second, None, basis)]
     parameters, covariance, _ = _tilted(test)
     tau, u_tau = float(parameters[4]), float(np.sqrt(covariance[4, 4]))
@@ -212,8 +212,8 @@ def _delays(test: _Test) -> list[Entry]:
     own, u_own = float(slope[1]), float(np.sqrt(matrix[1, 1]))
     effect = float(np.hypot(tau - own, np.hypot(u_tau, u_own))) * per_second
     return [
-        Entry("delay of the FOG", True, tau, u_tau, "s", effect, None, "phase of the FOG line over table rate"),
-        Entry("delay of X", True, own, u_own, "s", effect, None, "phase of the drift over table rate (or flexure)"),
+        Entry("delay of the FOG", True, tau, u_tau, "s", effect, None, "FOG phase over table rate"),
+        Entry("delay of X", True, own, u_own, "s", effect, None, "drift phase over table rate"),
     ]
 
 
@@ -222,10 +222,10 @@ def _table_rate(test: _Test) -> Entry:
     if "manifest" in origins:
         return Entry(
             "table rate", False, None, None, "rad/s", 0.0, None,
-            "needs a FOG line or table_angle",
+            "needs FOG line or encoder",
         )  # fmt: skip
     if origins == {"encoder"}:
-        return Entry("table rate", True, 0.0, 0.0, "rad/s", 0.0, None, "phase measured by the encoder")
+        return Entry("table rate", True, 0.0, 0.0, "rad/s", 0.0, None, "encoder")
     u = np.array([run.rates.table_uncertainty or 0.0 for run in test.runs])
     lost = (u * [run.duration for run in test.runs]) ** 2 / 24
     off = np.array([abs(run.rates.table_rate) - run.run.table_rate for run in test.runs])
@@ -234,7 +234,7 @@ def _table_rate(test: _Test) -> Entry:
     return Entry(
         "table rate", True, float(off[worst]), float(u[worst]), "rad/s", float(lost.max()),
         float(min(removed.max(), 1.0)),
-        "refined on the FOG line, against manifest",
+        "FOG line",
     )  # fmt: skip
 
 
@@ -243,9 +243,7 @@ def _arm_rate(test: _Test, manifest: Manifest) -> Entry:
     runs = [run for run in test.runs if run.rates.net_rate is not None and run.rates.origin != "manifest"]
     stated = manifest.rate_uncertainty / float(np.abs(test.arm).max())
     if not runs:
-        return Entry(
-            "arm rate", False, None, manifest.rate_uncertainty, "rad/s", 2 * stated, None, "stated by the manifest"
-        )
+        return Entry("arm rate", False, None, manifest.rate_uncertainty, "rad/s", 2 * stated, None, "manifest")
     off = np.array([r.run.sense * (r.rates.table_rate + (r.rates.net_rate or 0.0)) - r.run.arm_rate for r in runs])
     u = np.array([np.hypot(r.rates.net_uncertainty or 0.0, r.rates.table_uncertainty or 0.0) for r in runs])
     arm = np.array([r.run.arm_rate for r in runs])
@@ -253,7 +251,7 @@ def _arm_rate(test: _Test, manifest: Manifest) -> Entry:
     effect = 2 * float((np.hypot(off, u) / arm).max())
     return Entry(
         "arm rate", True, float(off[worst]), float(u[worst]), "rad/s", effect, None,
-        "table + net rate, against manifest",
+        "table + net rate",
     )  # fmt: skip
 
 
@@ -267,5 +265,5 @@ def _radius(test: _Test, manifest: Manifest) -> Entry:
         "m",
         relative,
         None,
-        "stated by the manifest; not in zeta",
+        "manifest; not in zeta",
     )

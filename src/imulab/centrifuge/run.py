@@ -10,8 +10,10 @@ import numpy as np
 from imulab.centrifuge.cells import COLUMNS, CONSTANT, Cells, Samples, TooSlowError, compress, pieces_of
 from imulab.centrifuge.fourier import PeriodResult, PeriodSums
 from imulab.centrifuge.manifest import Manifest, Run
-from imulab.centrifuge.rates import Rates, find_rates, hann_spectrum, residual_noise, steady_part
+from imulab.centrifuge.rates import Rates, find_rates, residual_noise
 from imulab.centrifuge.regress import LINE, ROOM, SECOND, THIRD, Complex, scatter
+from imulab.centrifuge.spectra import hann_spectrum
+from imulab.centrifuge.steady import steady_part
 from imulab.errors import DataError, UnitError
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import from_si, parse_unit, to_si

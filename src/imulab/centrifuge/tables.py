@@ -108,9 +108,8 @@ def budget_table(record: Calibration) -> Table:
         )  # fmt: skip
     return Table(
         "Error budget (X axis)",
-        "What survives the subtraction of the FOG, or would without it: effect on K at the highest level. Bounded: "
-        "by these data. Where "
-        "not, value and effect are those of the size named.",
+        "Effect on K at the highest level: what is left, and what subtraction or combination removed. Bounded: by "
+        "these data; where not, value and effect are those of the size named.",
         ["error", "bounded", "value", "u", "unit", "effect on K", "removed", "from"],
         rows,
     )

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import allan, array, centrifuge, convert, export, fleet, records, tumble
+from imulab.cli import allan, array, centrifuge, convert, export, fleet, records, tumble, warmup
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -29,6 +29,7 @@ def command() -> Any:
         name="centrifuge",
         help="Measure how a gyroscope's g-sensitive drift changes with g.",
     )
+    app.add_typer(warmup.commands(_SETTINGS), name="warmup", help="Tabulate and subtract the bias after power-on.")
     app.add_typer(fleet.commands(_SETTINGS), name="fleet", help="Calibrate many units, and watch the line.")
     records.add_commands(app)
     app.command("convert")(convert.convert)

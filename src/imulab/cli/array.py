@@ -160,13 +160,15 @@ def fuse(
     layout: LayoutFile = None,
     output: OutputFile = None,
 ) -> None:
-    """Fuse an array into one rate; native CSV to OUT or standard output; FILE - fuses line by line as lines come."""
+    """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
     from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording, parse_memory
     from imulab.readers import read_blocks
-    from imulab.writers import write_csv, write_csv_to
+    from imulab.writers import check_writable, write, write_csv_to
 
     records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
     check_outputs([output], [name for name in (file, layout, *records) if name])
+    if output:
+        check_writable(output)
     gain, start = parse_memory(memory)
     options = FuseOptions(
         method=method,
@@ -177,10 +179,10 @@ def fuse(
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
         still=None if interval is None else _interval(interval, "--still"),
     )
-    fuser = Fuser(options)
+    fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
     blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout)))
     if output:
-        write_csv(blocks, output)
+        write(blocks, output)
     else:
         first = next(blocks)  # fused before anything is written, so that a refusal leaves no head behind
         write_csv_to(_flushed(first, blocks), sys.stdout.buffer)

@@ -83,8 +83,10 @@ def _who(records: Sequence[Calibration]) -> str:
 
 
 def _harmless(text: str) -> str:
-    """Text that cannot end a C comment."""
-    return text.replace("*/", "* /").replace("\\", "/").replace("\n", " ")
+    """Text that neither ends a C comment nor makes a compiler warn in one."""
+    for wrong, right in (("\\", "|"), ("\n", " "), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
+        text = text.replace(wrong, right)
+    return text
 
 
 def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
@@ -104,7 +106,9 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
     if "array" in kinds:
         lines.append(f"#define UNIT_ARRAY_AXES {kinds['array'].columns['axes']}")
         lines.append(f"#define UNIT_ARRAY_ELEMENTS {kinds['array'].columns['elements']}")
-    lines += ["", *(f"extern const il_{kind} unit_{kind};" for kind in kinds), "", "#endif", ""]
+    lines += ["", "#ifdef __cplusplus", 'extern "C" {', "#endif"]
+    lines += ["", *(f"extern const il_{kind} unit_{kind};" for kind in kinds), ""]
+    lines += ["#ifdef __cplusplus", "}", "#endif", "#endif", ""]
     return "\n".join(lines)
 
 

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from imulab.exhibit import BAD, GOOD, QUIET, Figure, Table, format_uncertain, plain_number
-from imulab.fleet.display import Display, display_of
+from imulab.fleet import panels as small
+from imulab.fleet.display import display_of
 from imulab.fleet.statistics import Change, ParameterStatistics, change_limit
 from imulab.fleet.table import Row
 
-COLUMNS = 3
 MOST_PANELS = 24
 _MOST_POINTS = 1500
 _MOST_ROWS = 40
-_GAP_ACROSS = 0.075
-_ROW_HEIGHT = 215
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -97,17 +94,17 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> Figu
     """Draw a histogram of each parameter, with median, units that stand out, and limits."""
     panels = shown_first(statistics)
     traces: list[dict[str, Any]] = []
-    layout = _grid()
+    layout = small.grid()
     for index, item in enumerate(panels):
         shown = display_of(item.unit)
         values = np.asarray(shown.of(item.values))
-        x, y = _names(index)
-        edges = _edges(values, item)
+        x, y = small.names(index)
+        edges = small.edges(values, item)
         counts, edges = np.histogram(values, bins=edges)
         traces.append(
             {
                 "type": "bar",
-                "x": _plain((edges[1:] + edges[:-1]) / 2),
+                "x": small.plain((edges[1:] + edges[:-1]) / 2),
                 "y": counts.tolist(),
                 "width": float(edges[1] - edges[0]),
                 "marker": {"color": GOOD},
@@ -122,7 +119,7 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> Figu
                 {
                     "type": "scatter",
                     "mode": "markers",
-                    "x": _plain(values[out]),
+                    "x": small.plain(values[out]),
                     "y": [0] * int(out.sum()),
                     "text": [s for s, o in zip(item.serials, out, strict=True) if o],
                     "marker": {"color": BAD, "size": 9, "symbol": "diamond"},
@@ -132,18 +129,18 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> Figu
                     "hovertemplate": "%{text}: %{x}<extra></extra>",
                 }
             )
-        _panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
-        layout["shapes"] += [_line(x, y, float(shown.of(item.median)), "#22303a", "dot")]
-        layout["shapes"] += [_line(x, y, end, BAD, "solid") for end in _ends(item, shown)]
-        layout[_axis_key(y)]["rangemode"] = "tozero"
+        small.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
+        layout["shapes"] += [small.line(x, y, float(shown.of(item.median)), "#22303a", "dot")]
+        layout["shapes"] += [small.line(x, y, end, BAD, "solid") for end in small.ends(item, shown)]
+        layout[small.axis_key(y)]["rangemode"] = "tozero"
     return Figure(
         f"{title}: distribution over the units",
-        _some(statistics, panels)
+        small.some(statistics, panels)
         + "Bars count units. Dotted: median. Red lines: limits, where they are within sight. Red diamonds: units whose "
         "robust z is beyond what one normal population of this size in a hundred would show.",
         traces,
         layout,
-        height=_height(len(panels)),
+        height=small.height(len(panels)),
     )
 
 
@@ -151,12 +148,12 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> Figure:
     """Draw each parameter over the date, or over the number of the unit where there is but one date."""
     panels = shown_first(statistics)
     traces: list[dict[str, Any]] = []
-    layout = _grid()
+    layout = small.grid()
     dated = any(item.drift is not None for item in panels)
     for index, item in enumerate(panels):
         shown = display_of(item.unit)
         values = np.asarray(shown.of(item.values))
-        x, y = _names(index)
+        x, y = small.names(index)
         out = item.outliers
         places = item.days if dated else np.arange(1.0, len(values) + 1)
         order = np.argsort(places, kind="stable")
@@ -168,8 +165,8 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> Figure:
                     {
                         "type": "scatter",
                         "mode": "markers",
-                        "x": [_date(day) for day in places[chosen]] if dated else places[chosen].tolist(),
-                        "y": _plain(values[chosen]),
+                        "x": [small.date(day) for day in places[chosen]] if dated else places[chosen].tolist(),
+                        "y": small.plain(values[chosen]),
                         "text": [item.serials[i] for i in chosen],
                         "marker": {"color": colour, "size": size},
                         "xaxis": x,
@@ -185,19 +182,19 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> Figure:
                 {
                     "type": "scatter",
                     "mode": "lines",
-                    "x": [_date(item.drift.start), _date(item.drift.start + item.drift.days)],
-                    "y": _plain(np.asarray(shown.of(ends))),
+                    "x": [small.date(item.drift.start), small.date(item.drift.start + item.drift.days)],
+                    "y": small.plain(np.asarray(shown.of(ends))),
                     "line": {"color": BAD if item.drift.significant else QUIET, "width": 2},
                     "xaxis": x,
                     "yaxis": y,
                     "hoverinfo": "skip",
                 }
             )
-        _panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
-        layout[_axis_key(x)] |= {"type": "date", "nticks": 4} if dated else {"nticks": 5}
+        small.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
+        layout[small.axis_key(x)] |= {"type": "date", "nticks": 4} if dated else {"nticks": 5}
     return Figure(
         f"{title}: over the {'date' if dated else 'units in the order of the manifest'}",
-        _some(statistics, panels)
+        small.some(statistics, panels)
         + (
             "Lines: drift, red where it is beyond chance (1 in 1000). The date is that of the recording where its head "
             "has a line date, otherwise that of the record."
@@ -207,7 +204,7 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> Figure:
         + " Red points stand out.",
         traces,
         layout,
-        height=_height(len(panels)),
+        height=small.height(len(panels)),
     )
 
 
@@ -348,104 +345,3 @@ def failure_table(failures: Sequence[Row]) -> Table | None:
         ["serial", "file", "reason"],
         [[row.unit.serial, "; ".join(row.unit.files), row.reason] for row in failures[:_MOST_ROWS]],
     )
-
-
-# ---- panels --------------------------------------------------------------------------------------------------------
-
-
-def _names(index: int) -> tuple[str, str]:
-    return ("x", "y") if index == 0 else (f"x{index + 1}", f"y{index + 1}")
-
-
-def _axis_key(name: str) -> str:
-    return f"{name[0]}axis{name[1:]}"
-
-
-def _height(count: int) -> int:
-    return 62 + _ROW_HEIGHT * math.ceil(count / COLUMNS)
-
-
-def _grid() -> dict[str, Any]:
-    return {
-        "showlegend": False,
-        "shapes": [],
-        "annotations": [],
-        "bargap": 0.02,
-        "margin": {"l": 50, "r": 15, "t": 52, "b": 35},
-    }
-
-
-def _panel(layout: dict[str, Any], index: int, count: int, title: str) -> None:
-    rows = math.ceil(count / COLUMNS)
-    row, column = divmod(index, COLUMNS)
-    width = (1 - _GAP_ACROSS * (COLUMNS - 1)) / COLUMNS
-    left = column * (width + _GAP_ACROSS)
-    gap = 0.32 / rows
-    height = (1 - gap * (rows - 1)) / rows
-    top = 1 - row * (height + gap)
-    x, y = _names(index)
-    axis = {"zeroline": False, "gridcolor": "#e6eaed", "exponentformat": "none", "tickfont": {"size": 11}}
-    layout[_axis_key(x)] = {**axis, "domain": [left, left + width], "anchor": y, "nticks": 5}
-    layout[_axis_key(y)] = {**axis, "domain": [max(top - height, 0.0), top], "anchor": x, "nticks": 5}
-    layout["annotations"].append(
-        {
-            "text": title,
-            "x": left,
-            "y": top,
-            "xref": "paper",
-            "yref": "paper",
-            "xanchor": "left",
-            "yanchor": "bottom",
-            "showarrow": False,
-            "font": {"size": 13},
-        }
-    )
-
-
-def _line(x: str, y: str, place: float, colour: str, dash: str) -> dict[str, Any]:
-    return {
-        "type": "line",
-        "xref": x,
-        "yref": f"{y} domain",
-        "x0": place,
-        "x1": place,
-        "y0": 0,
-        "y1": 1,
-        "line": {"color": colour, "width": 1.5, "dash": dash},
-    }
-
-
-def _ends(item: ParameterStatistics, shown: Display) -> list[float]:
-    """Limits of a parameter that lie near enough to its values to be drawn."""
-    if item.capability is None:
-        return []
-    limits = item.capability.limits
-    ends = sorted(shown.of(end) for end in (limits.lower, limits.upper) if math.isfinite(end))
-    values = np.asarray(shown.of(item.values))
-    span = max(float(np.ptp(values)), 1e-300)
-    return [end for end in ends if values.min() - 2 * span <= end <= values.max() + 2 * span]
-
-
-def _edges(values: np.ndarray, item: ParameterStatistics) -> np.ndarray:
-    """Edges of bins by Freedman and Diaconis over the bulk, at most 60 over all."""
-    low, high = float(values.min()), float(values.max())
-    if not high > low:
-        half = abs(low) * 1e-6 or 0.5
-        return np.linspace(low - half, high + half, 4)
-    quarters = np.quantile(values, [0.25, 0.75])
-    width = 2 * float(quarters[1] - quarters[0]) / len(values) ** (1 / 3) or (high - low) / 10
-    return np.linspace(low, high, int(np.clip(math.ceil((high - low) / width), 5, 60)) + 1)
-
-
-def _plain(values: np.ndarray) -> list[float]:
-    return [float(f"{value:.7g}") for value in values.tolist()]
-
-
-def _date(day: float) -> str:
-    return datetime.fromtimestamp(day * 86400.0, UTC).strftime("%Y-%m-%d %H:%M:%S")
-
-
-def _some(statistics: Sequence[ParameterStatistics], panels: Sequence[ParameterStatistics]) -> str:
-    if len(panels) == len(statistics):
-        return ""
-    return f"{len(panels)} of {len(statistics)} parameters, those to be looked at first; the table has all. "

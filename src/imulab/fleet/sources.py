@@ -154,7 +154,10 @@ class UnitFiles:
         from imulab.readers import read_blocks
 
         self.inputs[name] = self.sha256(name)
-        return read_blocks(self.path(name), self._layout(layout), name=name)
+        for number, block in enumerate(read_blocks(self.path(name), self._layout(layout), name=name)):
+            if not number:
+                self.heard(block)
+            yield block
 
     def beside(self, name: str, file: str) -> str:
         """Return the name of a file that file `name` names relative to itself, and note `name` as used."""

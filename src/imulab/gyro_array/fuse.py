@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -175,6 +175,7 @@ class Fuser:
     clock: Clock = field(default_factory=Clock)
     health: Health | None = None
     said: list[str] = field(default_factory=list)
+    tell: Callable[[str], None] = lambda _: None
     name: str = "recording"
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
@@ -230,7 +231,8 @@ class Fuser:
         time, rate = block.si("time"), out.rate[seen:]
         flags = out.flags[seen:] if out.flags is not None else None
         if self.health is not None:
-            self.health.watch(time, flags, rate)
+            for key in self.health.watch(time, flags, rate):
+                self.tell(self.health.first(key))
         return Fused(
             time=time,
             rate=rate,

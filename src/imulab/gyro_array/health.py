@@ -53,6 +53,11 @@ class Health:
                     event.samples += int(held.sum())
         return new
 
+    def first(self, key: tuple[int, int, str]) -> str:
+        """Return a line on the first time that a gyro was in a state."""
+        axis, element, kind = key
+        return f"{self.names[axis][element]}: {kind} at {self.events[key].first:.6g} s"
+
     def lines(self) -> list[str]:
         """Return one line per gyro that was excluded, stuck, jumped or non-finite, and one where all were lost."""
         found = []

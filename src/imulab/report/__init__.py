@@ -14,7 +14,12 @@ from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure
 from imulab.files import write_text
 
-_TITLES = {"tumble": "Tumble calibration", "gyro_array": "Gyro array", "centrifuge": "Centrifuge test"}
+_TITLES = {
+    "tumble": "Tumble calibration",
+    "gyro_array": "Gyro array",
+    "warmup": "Warm-up table",
+    "centrifuge": "Centrifuge test",
+}
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:

@@ -220,7 +220,7 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 def _solve(
     problem: Problem, attitudes: Attitudes, method: str, solved: Solution | None
 ) -> tuple[Solution, Observability]:
-    """Solve the problem and see what it determines; `solved` is the solution by norm where the order's choice has it."""
+    """Solve the problem, unless the choice of the order has `solved` it by norm, and see what it determines."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "linearised" and n >= size:
         solution = solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))

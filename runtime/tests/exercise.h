@@ -1,0 +1,52 @@
+/* Runs whatever a table has brought on a few samples, odd ones among them; for the loader's test and its fuzzer. */
+#ifndef EXERCISE_H
+#define EXERCISE_H
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "imulab.h"
+
+enum { EXERCISE_SAMPLES = 24, EXERCISE_AXES = 64 };
+
+static inline void exercise(const il_unit *unit) {
+    static const il_real odd[8] = {(il_real)0.5,  (il_real)-3,        (il_real)NAN, (il_real)1e30,
+                                   (il_real)-9.8, (il_real)-INFINITY, (il_real)0,   (il_real)1e-30};
+    static const uint32_t ticks[8] = {0, 1, 2999, 3000, 3001, 100000, UINT32_MAX - 1u, UINT32_MAX};
+    for (unsigned k = 0; k < 8; k++) {
+        const il_real in[3] = {odd[k], odd[(k + 1) % 8], odd[(k + 3) % 8]};
+        il_real out[3], rate[2] = {in[0], in[1]};
+        if (unit->has & IL_HAS_TUMBLE) (void)il_tumble_apply(&unit->tumble, in, out);
+        if (unit->has & IL_HAS_GYRO) (void)il_gyro_apply(&unit->gyro, in, odd, out);
+        if (unit->has & IL_HAS_CENTRIFUGE) (void)il_centrifuge_apply(&unit->centrifuge, in, rate);
+        if ((unit->has & IL_HAS_WARMUP) && unit->warmup.axes <= EXERCISE_AXES) {
+            static il_real columns[EXERCISE_AXES][8];
+            il_real bias[EXERCISE_AXES], *place[EXERCISE_AXES];
+            il_warmup_state state;
+            for (unsigned i = 0; i < EXERCISE_AXES; i++) place[i] = i % 3 == 1 ? NULL : columns[i];
+            (void)il_warmup_start(&unit->warmup, &state, k < 4 ? (il_real)(20.0 * k) - (il_real)10 : odd[k], (il_real)0.1);
+            il_warmup_bias(&unit->warmup, &state, ticks[k], bias);
+            il_warmup_block(&unit->warmup, &state, 8, ticks, place);
+        }
+    }
+    if (unit->has & IL_HAS_ARRAY) {
+        const size_t width = (size_t)unit->array.axes * (size_t)unit->array.elements;
+        il_array_state *state = malloc(sizeof *state);
+        il_real *reading = malloc(width * EXERCISE_SAMPLES * sizeof *reading), rate[3 * EXERCISE_SAMPLES];
+        uint8_t *flags = malloc(width * EXERCISE_SAMPLES);
+        if (state != NULL && reading != NULL && flags != NULL && il_array_start(&unit->array, state) == IL_OK) {
+            for (size_t i = 0; i < width * EXERCISE_SAMPLES; i++) {
+                reading[i] = i % 37 == 5 ? odd[i % 8] : (il_real)0.1 * (il_real)(i % 11) + (il_real)0.01 * (il_real)(i % 7);
+            }
+            (void)il_array_block(&unit->array, state, EXERCISE_SAMPLES, reading, NULL, rate, flags, NULL);
+            il_array_still(&unit->array, state);
+            (void)il_array_step(&unit->array, state, reading, rate);
+        }
+        free(state);
+        free(reading);
+        free(flags);
+    }
+}
+
+#endif

@@ -1,0 +1,271 @@
+/* Accelerometer and gyroscope triads, and the flexible gyroscope's drift. */
+#include "check.h"
+#include "vectors.h"
+
+enum { ORDERS = 5, FORCES = 12, RATES = 10 };
+
+static il_tumble golden_tumble(int order) {
+    il_tumble t;
+    const int i = order - 1;
+    t.order = order;
+    memcpy(t.gain, v_tumble_gain[i], sizeof t.gain);
+    memcpy(t.bias, v_tumble_bias[i], sizeof t.bias);
+    memcpy(t.misalignment, v_tumble_misalignment[i], sizeof t.misalignment);
+    memcpy(t.low, v_tumble_low[i], sizeof t.low);
+    memcpy(t.high, v_tumble_high[i], sizeof t.high);
+    memcpy(t.nonlinearity, v_tumble_nonlinearity[i], sizeof t.nonlinearity);
+    return t;
+}
+
+/* A triad without errors but for one coefficient of the polynomial, the same on every axis. */
+static il_tumble bent(int order, il_real k, il_real low, il_real high) {
+    il_tumble t;
+    memset(&t, 0, sizeof t);
+    t.order = order;
+    for (int i = 0; i < 3; i++) {
+        t.gain[i] = REAL(1);
+        t.low[i] = low;
+        t.high[i] = high;
+        t.nonlinearity[order - 2][i] = k;
+    }
+    return t;
+}
+
+static void tumble_equals_the_equations(void) {
+    for (int order = 1; order <= ORDERS; order++) {
+        const il_tumble t = golden_tumble(order);
+        for (int k = 0; k < FORCES; k++) {
+            il_real force[3];
+            CHECK(il_tumble_apply(&t, v_tumble_output[order - 1][k], force) == 0);
+            for (int i = 0; i < 3; i++) {
+                CHECK_CLOSE(force[i], v_tumble_force[order - 1][k][i], ROUNDING_LIMIT * REAL(20));
+            }
+        }
+    }
+}
+
+static void tumble_blocks_equal_single_samples(void) {
+    for (int order = 1; order <= ORDERS; order++) {
+        const il_tumble t = golden_tumble(order);
+        il_real single[FORCES][3], columns[3][FORCES], rows[FORCES][3], out[3][FORCES];
+        for (int k = 0; k < FORCES; k++) {
+            (void)il_tumble_apply(&t, v_tumble_output[order - 1][k], single[k]);
+            for (int i = 0; i < 3; i++) columns[i][k] = v_tumble_output[order - 1][k][i];
+        }
+        const il_real *const from[3] = {columns[0], columns[1], columns[2]};
+        il_real *const to[3] = {out[0], out[1], out[2]};
+        CHECK(il_tumble_block(&t, FORCES, from, 1, to, 1) == 0);
+        for (int k = 0; k < FORCES; k++) {
+            for (int i = 0; i < 3; i++) CHECK_SAME(&out[i][k], &single[k][i], 1);
+        }
+        /* interleaved, and in place */
+        memcpy(rows, v_tumble_output[order - 1], sizeof rows);
+        const il_real *const row_from[3] = {&rows[0][0], &rows[0][1], &rows[0][2]};
+        il_real *const row_to[3] = {&rows[0][0], &rows[0][1], &rows[0][2]};
+        CHECK(il_tumble_block(&t, FORCES, row_from, 3, row_to, 3) == 0);
+        CHECK_SAME(&rows[0][0], &single[0][0], FORCES * 3);
+        /* columns in, rows out */
+        memset(rows, 0, sizeof rows);
+        CHECK(il_tumble_block(&t, FORCES, from, 1, row_to, 3) == 0);
+        CHECK_SAME(&rows[0][0], &single[0][0], FORCES * 3);
+        il_real *const place[3] = {columns[0], columns[1], columns[2]};
+        CHECK(il_tumble_block(&t, FORCES, from, 1, place, 1) == 0);
+        CHECK_SAME(&columns[0][0], &out[0][0], 3 * FORCES);
+        CHECK(il_tumble_block(&t, 0, from, 1, place, 1) == 0);
+    }
+}
+
+static void what_is_not_a_number_stays_where_it_reaches(void) {
+    static const il_real bad[] = {NAN_REAL, INF_REAL, -INF_REAL};
+    for (int order = 1; order <= ORDERS; order++) {
+        const il_tumble t = golden_tumble(order);
+        for (size_t b = 0; b < LENGTH(bad); b++) {
+            for (int axis = 0; axis < 3; axis++) {
+                il_real output[3] = {REAL(100), REAL(200), REAL(-300)}, clean[3], force[3];
+                CHECK(il_tumble_apply(&t, output, clean) == 0);
+                output[axis] = bad[b];
+                CHECK(il_tumble_apply(&t, output, force) == IL_NOT_FINITE);
+                for (int i = 0; i < 3; i++) { /* x reaches y and z, y reaches z */
+                    if (i < axis) CHECK_SAME(&force[i], &clean[i], 1);
+                    if (i >= axis) CHECK(!isfinite(force[i]));
+                }
+                const il_real *const from[3] = {&output[0], &output[1], &output[2]};
+                il_real *const to[3] = {&force[0], &force[1], &force[2]};
+                CHECK(il_tumble_block(&t, 1, from, 1, to, 1) == IL_NOT_FINITE);
+                CHECK(il_tumble_block(&t, 1, from, 3, to, 3) == IL_NOT_FINITE);
+            }
+        }
+    }
+}
+
+static void outputs_beyond_a_turning_point_have_no_force(void) {
+    /* s - s^3 / 300 turns at s = 10, where it is 20/3 */
+    const il_real top = REAL(20.0) / REAL(3.0);
+    const il_tumble t = bent(3, REAL(-1.0) / REAL(300.0), -top, top);
+    static const il_real share[] = {REAL(0.5), REAL(0.9), REAL(0.99), REAL(0.999), REAL(1.001), REAL(2), REAL(1e6)};
+    for (size_t i = 0; i < LENGTH(share); i++) {
+        for (int sign = -1; sign <= 1; sign += 2) {
+            const il_real output[3] = {REAL(sign) * share[i] * top, REAL(0), REAL(0)};
+            il_real force[3];
+            const unsigned flags = il_tumble_apply(&t, output, force);
+            CHECK(flags == (share[i] > REAL(1) ? (unsigned)IL_BEYOND : 0u));
+            if (share[i] > REAL(1)) CHECK(isnan(force[0]) && force[1] != force[1]);
+            else CHECK_CLOSE(force[0] - force[0] * force[0] * force[0] / REAL(300), output[0], ROUNDING_LIMIT * REAL(10));
+        }
+    }
+    /* Settings whose limits promise more than the polynomial has: said, never looped for. */
+    const il_tumble wrong[] = {bent(2, REAL(1), REAL(-1e30), REAL(1e30)), bent(3, REAL(-1), REAL(-1e30), REAL(1e30)),
+                               bent(5, REAL(-1), REAL(-1e30), REAL(1e30))};
+    for (size_t i = 0; i < LENGTH(wrong); i++) {
+        for (int k = -400; k <= 400; k++) {
+            const il_real a = REAL(k) / REAL(16), output[3] = {a, REAL(0), REAL(0)};
+            il_real force[3];
+            const unsigned flags = il_tumble_apply(&wrong[i], output, force);
+            CHECK(flags == 0u || flags == (unsigned)IL_BEYOND);
+            CHECK((flags == 0u) == (isfinite(force[0]) != 0));
+        }
+    }
+    const il_real below[3] = {REAL(-1000) /* s + s^2 is never below -1/4 */, REAL(0), REAL(0)};
+    il_real force[3];
+    CHECK(il_tumble_apply(&wrong[0], below, force) == (unsigned)IL_BEYOND);
+    CHECK(isnan(force[0]));
+}
+
+static il_gyro golden_gyro(int sensitive) {
+    il_gyro g;
+    g.has_sensitivity = sensitive;
+    memcpy(g.gain, v_gyro_gain, sizeof g.gain);
+    memcpy(g.bias, v_gyro_bias, sizeof g.bias);
+    memcpy(g.turn, v_gyro_turn, sizeof g.turn);
+    memcpy(g.sensitivity, v_gyro_sensitivity, sizeof g.sensitivity);
+    return g;
+}
+
+static void gyro_equals_the_equations(void) {
+    const il_gyro plain = golden_gyro(0), sensitive = golden_gyro(1);
+    il_real columns[3][RATES], under[3][RATES], out[3][RATES], single[RATES][3], rows[RATES][3], forces[RATES][3];
+    const il_real *const from[3] = {columns[0], columns[1], columns[2]}, *const with[3] = {under[0], under[1], under[2]};
+    il_real *const to[3] = {out[0], out[1], out[2]};
+    for (int k = 0; k < RATES; k++) {
+        il_real rate[3];
+        const il_real lost[3] = {NAN_REAL, INF_REAL, NAN_REAL};
+        CHECK(il_gyro_apply(&plain, v_gyro_output[k], NULL, rate) == 0);
+        for (int i = 0; i < 3; i++) CHECK_CLOSE(rate[i], v_gyro_plain[k][i], ROUNDING_LIMIT * REAL(6));
+        CHECK(il_gyro_apply(&plain, v_gyro_output[k], lost, rate) == 0); /* a force that it does not need */
+        for (int i = 0; i < 3; i++) CHECK_CLOSE(rate[i], v_gyro_plain[k][i], ROUNDING_LIMIT * REAL(6));
+        CHECK(il_gyro_apply(&sensitive, v_gyro_output[k], v_gyro_force[k], single[k]) == 0);
+        for (int i = 0; i < 3; i++) {
+            CHECK_CLOSE(single[k][i], v_gyro_rate[k][i], ROUNDING_LIMIT * REAL(6));
+            columns[i][k] = v_gyro_output[k][i];
+            under[i][k] = v_gyro_force[k][i];
+        }
+    }
+    CHECK(il_gyro_block(&sensitive, RATES, from, with, 1, to, 1) == 0);
+    for (int k = 0; k < RATES; k++) {
+        for (int i = 0; i < 3; i++) CHECK_SAME(&out[i][k], &single[k][i], 1);
+    }
+    memcpy(rows, v_gyro_output, sizeof rows);
+    memcpy(forces, v_gyro_force, sizeof forces);
+    const il_real *const row_from[3] = {&rows[0][0], &rows[0][1], &rows[0][2]};
+    const il_real *const row_with[3] = {&forces[0][0], &forces[0][1], &forces[0][2]};
+    il_real *const row_to[3] = {&rows[0][0], &rows[0][1], &rows[0][2]};
+    CHECK(il_gyro_block(&sensitive, RATES, row_from, row_with, 3, row_to, 3) == 0);
+    CHECK_SAME(&rows[0][0], &single[0][0], RATES * 3);
+    CHECK(il_gyro_block(&plain, RATES, from, NULL, 1, to, 1) == 0);
+    CHECK_CLOSE(out[1][4], v_gyro_plain[4][1], ROUNDING_LIMIT * REAL(6));
+    CHECK(il_gyro_block(&plain, RATES, from, with, 1, to, 1) == 0);
+    CHECK_CLOSE(out[1][4], v_gyro_plain[4][1], ROUNDING_LIMIT * REAL(6));
+}
+
+static void gyro_corners(void) {
+    const il_gyro plain = golden_gyro(0), sensitive = golden_gyro(1);
+    const il_real *const none[3] = {v_gyro_output[0], v_gyro_output[0], v_gyro_output[0]};
+    il_real rate[3];
+    il_real *const to[3] = {&rate[0], &rate[1], &rate[2]};
+    CHECK(il_gyro_apply(&sensitive, v_gyro_output[0], NULL, rate) == IL_NOT_FINITE); /* its force is missing */
+    CHECK(isnan(rate[0]) && isnan(rate[1]) && isnan(rate[2]));
+    CHECK(il_gyro_block(&sensitive, 1, none, NULL, 1, to, 1) == IL_NOT_FINITE);
+    for (int i = 0; i < 3; i++) {
+        il_real output[3] = {REAL(1), REAL(2), REAL(3)}, force[3] = {REAL(1), REAL(2), REAL(3)};
+        output[i] = i == 1 ? INF_REAL : NAN_REAL;
+        CHECK(il_gyro_apply(&plain, output, NULL, rate) == IL_NOT_FINITE);
+        CHECK(!isfinite(rate[0]) && !isfinite(rate[1]) && !isfinite(rate[2]));
+        output[i] = REAL(0);
+        force[i] = i == 1 ? INF_REAL : NAN_REAL;
+        CHECK(il_gyro_apply(&sensitive, output, force, rate) == IL_NOT_FINITE);
+        CHECK(!isfinite(rate[0]) && !isfinite(rate[1]) && !isfinite(rate[2]));
+    }
+}
+
+static il_centrifuge golden_centrifuge(void) {
+    il_centrifuge c;
+    c.has[0] = c.has[1] = 1;
+    c.highest = REAL(150);
+    memcpy(c.k0, v_centrifuge_k0, sizeof c.k0);
+    memcpy(c.c1, v_centrifuge_c1, sizeof c.c1);
+    memcpy(c.c2, v_centrifuge_c2, sizeof c.c2);
+    memcpy(c.cosine, v_centrifuge_cosine, sizeof c.cosine);
+    memcpy(c.sine, v_centrifuge_sine, sizeof c.sine);
+    return c;
+}
+
+static void centrifuge_equals_the_equations(void) {
+    il_centrifuge c = golden_centrifuge();
+    il_real force[2][RATES], rate[2][RATES], single[2][RATES];
+    for (int k = 0; k < RATES; k++) {
+        il_real out[2] = {v_centrifuge_rate[k][0], v_centrifuge_rate[k][1]};
+        CHECK(il_centrifuge_apply(&c, v_centrifuge_force[k], out) == 0);
+        for (int i = 0; i < 2; i++) {
+            CHECK_CLOSE(out[i], v_centrifuge_expected[k][i], ROUNDING_LIMIT * REAL(1e-3));
+            force[i][k] = v_centrifuge_force[k][i];
+            rate[i][k] = v_centrifuge_rate[k][i];
+            single[i][k] = out[i];
+        }
+    }
+    const il_real *const under[2] = {force[0], force[1]};
+    il_real *const both[2] = {rate[0], rate[1]};
+    CHECK(il_centrifuge_block(&c, RATES, under, both) == 0);
+    CHECK_SAME(&rate[0][0], &single[0][0], 2 * RATES);
+    /* one axis that is not there, and one that was not tested */
+    for (int k = 0; k < RATES; k++) rate[0][k] = rate[1][k] = v_centrifuge_rate[k][1];
+    il_real *const second[2] = {NULL, rate[1]};
+    CHECK(il_centrifuge_block(&c, RATES, under, second) == 0);
+    CHECK_SAME(rate[1], single[1], RATES);
+    c.has[0] = 0;
+    const il_real kept = rate[0][3];
+    il_real *const first[2] = {rate[0], NULL};
+    CHECK(il_centrifuge_block(&c, RATES, under, first) == 0);
+    CHECK_SAME(&rate[0][3], &kept, 1);
+}
+
+static void centrifuge_corners(void) {
+    const il_centrifuge c = golden_centrifuge();
+    const il_real strong[2] = {REAL(-120), REAL(120)}, bad[][2] = {{NAN_REAL, REAL(0)}, {REAL(0), NAN_REAL}, {INF_REAL, REAL(1)}};
+    il_real rate[2] = {REAL(0), REAL(0)};
+    CHECK(il_centrifuge_apply(&c, strong, rate) == IL_BEYOND);
+    CHECK(isfinite(rate[0]) && isfinite(rate[1]) && rate[0] != REAL(0));
+    for (size_t i = 0; i < LENGTH(bad); i++) {
+        rate[0] = rate[1] = REAL(0);
+        CHECK((il_centrifuge_apply(&c, bad[i], rate) & ~(unsigned)IL_BEYOND) == IL_NOT_FINITE);
+        CHECK(isnan(rate[0]) && isnan(rate[1]));
+    }
+    rate[0] = INF_REAL;
+    rate[1] = REAL(1);
+    CHECK(il_centrifuge_apply(&c, v_centrifuge_force[0], rate) == IL_NOT_FINITE);
+    CHECK(isnan(rate[0]) && isfinite(rate[1]));
+    const il_real *const under[2] = {bad[0], bad[1]};
+    il_real lost[2] = {REAL(0), REAL(0)};
+    il_real *const both[2] = {&lost[0], &lost[1]};
+    CHECK(il_centrifuge_block(&c, 1, under, both) == IL_NOT_FINITE);
+}
+
+void test_triads(void) {
+    tumble_equals_the_equations();
+    tumble_blocks_equal_single_samples();
+    what_is_not_a_number_stays_where_it_reaches();
+    outputs_beyond_a_turning_point_have_no_force();
+    gyro_equals_the_equations();
+    gyro_corners();
+    centrifuge_equals_the_equations();
+    centrifuge_corners();
+}

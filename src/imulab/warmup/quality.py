@@ -1,0 +1,132 @@
+"""What is wrong with a warm-up test, a sentence each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imulab.warmup.curves import SETTLED, Curves
+from imulab.warmup.engineering import in_engineering
+from imulab.warmup.judge import Judged
+
+_COLD = 1.0
+_FAR = 0.5
+_LATE = 0.5
+_CLEAR = 4.0
+_DRIFT_SHARE = 0.5
+_MOST_NAMED = 3
+_FIT_FAILS = 1.5
+_WIDE = 20.0
+
+
+def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]:
+    """Return the warnings on a test and the table made from it."""
+    return [
+        *_ends(curves, settled),
+        *_starts(curves),
+        *_motion(curves),
+        *_drifts(curves, chosen),
+        *_temperatures(curves),
+        *_single(curves),
+        *_intervals(curves, chosen),
+    ]
+
+
+def _named(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return ", ".join(names[:_MOST_NAMED]) + more
+
+
+def _ends(curves: Curves, settled: bool) -> list[str]:
+    found = []
+    if not settled:
+        found.append(
+            f"not settled: the curves still change when the recordings end; T_M = {curves.settling_time:g} s leaves "
+            f"{SETTLED:g} s for the reference: record longer"
+        )
+    short = [
+        f"{c.name} ({end:.6g} s)" for c, end, half in zip(curves.cycles, curves.end, curves.halved, strict=True) if half
+    ]
+    if short:
+        found.append(
+            f"not settled: ends before T_M + {SETTLED:g} s = {curves.settling_time + SETTLED:g} s, so that the second "
+            f"half of the cycle is its reference: {_named(short)}"
+        )
+    return found
+
+
+def _starts(curves: Curves) -> list[str]:
+    late = [f"{c.name} ({c.first:.3g} s)" for c in curves.cycles if c.first > _LATE]
+    return [f"the first sample comes late after power-on: {_named(late)}"] if late else []
+
+
+def _motion(curves: Curves) -> list[str]:
+    moved = [
+        f"{c.name} ({seconds:g} s, first at {began:g} s)"
+        for c, (seconds, began) in zip(curves.cycles, curves.moved, strict=True)
+        if seconds > 0
+    ]
+    return [f"the unit moved; those seconds are left out: {_named(moved)}"] if moved else []
+
+
+def _drifts(curves: Curves, chosen: Judged) -> list[str]:
+    """Settled parts that go on changing by much of what the model leaves over."""
+    clear = np.abs(curves.drift) > _CLEAR * curves.drift_uncertainty
+    largest = np.sqrt((curves.mean**2).mean(axis=(0, 1)))
+    big = np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)
+    found = []
+    for kind, index in curves.kinds().items():
+        share = (clear & big)[:, index]
+        if share.any():
+            row, column = np.unravel_index(np.argmax(np.abs(curves.drift[:, index]) * share), share.shape)
+            axis = index[column]
+            found.append(
+                f"not settled: {kind} still drifts in the settled part of {int(share.any(axis=1).sum())} of "
+                f"{len(curves.cycles)} cycles, most in {curves.cycles[row].name} ({curves.axes[axis]}, "
+                f"{in_engineering(curves.drift[row, axis], curves.units[axis])} from T_M to its end); Z is relative to "
+                "the mean of that part"
+            )
+    return found
+
+
+def _temperatures(curves: Curves) -> list[str]:
+    warm, far = [], []
+    for cycle, nominal in zip(curves.cycles, curves.temperatures[curves.group], strict=True):
+        chamber = nominal if cycle.chamber is None else cycle.chamber
+        reading = cycle.temperature if cycle.first_reading is None else max(cycle.temperature, cycle.first_reading)
+        if reading - chamber > _COLD:
+            warm.append(f"{cycle.name} ({reading - chamber:+.2g} K)")
+        elif abs(cycle.temperature - nominal) > _FAR:
+            far.append(f"{cycle.name} ({cycle.temperature - nominal:+.2g} K)")
+    found = []
+    if warm:
+        found.append(
+            "not cold: at power-on warmer than the chamber, so that the curve starts half-way (soak longer): "
+            f"{_named(warm)}"
+        )
+    if far:
+        found.append(f"power-on temperature more than {_FAR:g} K from the set point: {_named(far)}")
+    return found
+
+
+def _single(curves: Curves) -> list[str]:
+    count = np.bincount(curves.group, minlength=len(curves.temperatures))
+    alone = [f"{t:g}" for t, n in zip(curves.temperatures, count, strict=True) if n == 1]
+    if not alone:
+        return []
+    return [f"one cycle only at {' '.join(alone)} degC: its repeatability is not known there"]
+
+
+def _intervals(curves: Curves, chosen: Judged) -> list[str]:
+    if chosen.model != "interval-cubic":
+        return []
+    wide = [
+        f"[{low:g}, {high:g})"
+        for low, high in zip(curves.temperatures[:-1], curves.temperatures[1:], strict=True)
+        if high - low > _WIDE
+    ]
+    if not wide:
+        return []
+    return [
+        f"interval-cubic uses one curve for all of {' '.join(wide)} degC, the mean of both ends: measure in between, "
+        "or use a model with knots"
+    ]

@@ -1,0 +1,78 @@
+"""Mistakes with `imulab export`: one line, exit 2, nothing made."""
+
+import shutil
+import subprocess
+from dataclasses import replace
+
+import pytest
+
+import madeup
+from imulab.cli import main
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    madeup.tumble(2).save("accel.json")
+    madeup.tumble(1).save("again.json")
+    madeup.warmup().save("warmup.json")
+    (tmp_path / "cut.json").write_text((tmp_path / "accel.json").read_text()[:500])
+    (tmp_path / "file").write_text("x")
+    return tmp_path
+
+
+@pytest.mark.parametrize("target", ["c", "blob"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("missing.json -o out", "missing.json: no such file"),
+        ("cut.json -o out", "cut.json: not a calibration record"),
+        ("file -o out", "file: not a calibration record"),
+        ("accel.json again.json -o out", "two records give a tumble table"),
+        ("accel.json -o file", "expected a folder to write to, found a file"),
+        ("accel.json -o file/out", "the folder cannot be made"),
+        ("accel.json", "Missing option"),
+        ("-o out", "Missing argument"),
+    ],
+)
+def test_a_mistake_gets_one_line(target, arguments, message, folder, capsys):
+    before = sorted(folder.rglob("*"))
+    assert main(["export", "--to", target, *arguments.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert message in err
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_an_unknown_target_lists_the_known_ones(folder, capsys):
+    assert main(["export", "--to", "pascal", "accel.json", "-o", "out"]) == 2
+    assert "unknown target; known targets: c blob px4 ardupilot" in capsys.readouterr().err
+    assert not (folder / "out").exists()
+
+
+def test_it_says_what_it_wrote(folder, capsys):
+    assert main(["export", "--to", "c", "accel.json", "warmup.json", "-o", "new/out"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    written = sorted(path.relative_to(folder).as_posix() for path in (folder / "new/out").iterdir())
+    assert sorted(line.removeprefix("c: ") for line in lines) == written
+
+
+def test_a_second_export_replaces_the_first(folder):
+    for record in ("accel.json", "again.json", "accel.json"):
+        assert main(["export", "--to", "c", record, "-o", "out"]) == 0
+    first = {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+    assert main(["export", "--to", "c", "accel.json", "-o", "other"]) == 0
+    assert {path.name: path.read_bytes() for path in (folder / "other").iterdir()} == first
+
+
+def test_a_serial_cannot_end_a_comment(folder, capsys):
+    record = replace(madeup.tumble(1), sensor={"serial": "*/ int main(void) { /* \\\n??/ µ"})
+    record.save("odd.json")
+    assert main(["export", "--to", "c", "odd.json", "-o", "out"]) == 0
+    text = (folder / "out" / "unit.c").read_text(encoding="utf-8")
+    assert text.index("*/") > text.index("int main(void)")
+    compiler = shutil.which("cc")
+    if compiler:
+        strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+        subprocess.run([compiler, *strict, folder / "out" / "unit.c", folder / "out" / "selftest.c"], check=True)

@@ -1,0 +1,285 @@
+"""What was validated on the desk is what runs in the unit: Python against the exported C, as compiled there."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+import madeup
+from conftest import REPOSITORY
+from imulab.exporters import export
+from imulab.runtime import ArraySettings, Stream, Unit, array_table
+from imulab.tables import METHODS, MODELS, pack, tables_of
+
+G = madeup.G
+MANY = 1_000_000
+DRIVER = REPOSITORY / "tests" / "firmware" / "driver.c"
+WARN = ["-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror"]
+STRICT = ["-std=c99", "-ffp-contract=off", *WARN]
+
+
+@pytest.fixture(scope="session")
+def compiler():
+    path = shutil.which("cc")
+    if path is None:
+        pytest.skip("no C compiler (cc) on this machine")
+    return path
+
+
+@pytest.fixture(scope="session")
+def records():
+    return [madeup.tumble(5, gyro=True, sensitive=True), madeup.centrifuge(), madeup.warmup()]
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory, records):
+    folder = tmp_path_factory.mktemp("firmware")
+    export("c", records, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def built(compiler, exported):
+    """The exported C with a small program around it, as double and as float."""
+    programs = {}
+    for name, define in (("double", []), ("float", ["-DIMULAB_REAL=float"])):
+        # More elements than firmware has by default, so that every array that Python fuses can be fused here as well.
+        options = ["-O2", *STRICT, *define, "-DIL_ARRAY_ELEMENTS=64", f"-I{exported}"]
+        sources = [DRIVER, exported / "imulab.c", exported / "unit.c"]
+        programs[name] = exported / f"driver-{name}"
+        subprocess.run([compiler, *options, *map(str, sources), "-o", programs[name], "-lm"], check=True)
+    return programs
+
+
+@pytest.fixture
+def c_core(built, tmp_path):
+    """Run rows of numbers through a function of the compiled core; tables None takes the numbers in unit.c."""
+
+    def run(real, tables, function, rows, *arguments):
+        source = "unit"
+        if tables is not None:
+            source = str(tmp_path / "unit.blob")
+            (tmp_path / "unit.blob").write_bytes(pack(tables, 8 if real == "double" else 4))
+        command = [built[real], source, *function.split(), *map(repr, arguments)]
+        done = subprocess.run(command, input=np.ascontiguousarray(rows).tobytes(), capture_output=True, check=True)
+        return np.frombuffer(done.stdout).reshape(len(rows), -1)
+
+    return run
+
+
+def bits(values):
+    """The bits of numbers; all that are not numbers are one."""
+    return np.where(np.isnan(values), np.nan, values).view(np.uint64)
+
+
+def assert_same(found, expected):
+    assert found.shape == expected.shape
+    assert np.array_equal(bits(found), bits(expected))
+
+
+def assert_near(found, expected, limit):
+    there = np.isfinite(expected)
+    assert np.array_equal(np.isfinite(found), there)
+    assert np.abs(found[there] - expected[there]).max() <= limit
+
+
+def outputs_of(table, reach, rng, *, odd=True):
+    """Random outputs within `reach` of what a triad measures, one in 1,000 of them no number."""
+    fields = {field.name: field.values for field in table.fields}
+    rows = (rng.uniform(-reach, reach, (MANY, 3)) + fields["bias"]) / fields["gain"]
+    if odd:
+        rows[rng.integers(0, MANY, MANY // 1000), rng.integers(0, 3, MANY // 1000)] = np.nan
+        rows[rng.integers(0, MANY, MANY // 1000), rng.integers(0, 3, MANY // 1000)] = -np.inf
+    return rows
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_tumble_to_the_last_bit(order, c_core, records):
+    rng = np.random.default_rng(order)
+    tables = tables_of(madeup.tumble(order))
+    rows = outputs_of(tables[0], 16 * G, rng)  # at orders above 1 some lie beyond a turning point
+    force, flags = Unit.of(*tables).tumble(list(rows.T))
+    assert flags & 1
+    assert_same(c_core("double", tables, "tumble", rows), np.column_stack(force))
+    rows = outputs_of(tables[0], 2 * G, rng)
+    force, _ = Unit.of(*tables).tumble(list(rows.T))
+    assert_near(c_core("float", tables, "tumble", rows), np.column_stack(force), 2e-6 * 2 * G)
+
+
+@pytest.mark.parametrize("sensitive", [False, True])
+def test_gyro_to_the_last_bit(sensitive, c_core):
+    rng = np.random.default_rng(3)
+    table = tables_of(madeup.tumble(1, gyro=True, sensitive=sensitive))[1]
+    rows = outputs_of(table, 5.0, rng)  # rad/s, about 300 deg/s
+    force = rng.uniform(-2 * G, 2 * G, (MANY, 3))
+    force[7, 1] = np.nan
+    rate, _ = Unit.of(table).gyro(list(rows.T), list(force.T) if sensitive else None)
+    name, wide = ("gyro-force", np.hstack([rows, force])) if sensitive else ("gyro", rows)
+    assert_same(c_core("double", [table], name, wide), np.column_stack(rate))
+    assert_near(c_core("float", [table], name, wide)[8:], np.column_stack(rate)[8:], 2e-6 * 5)
+
+
+def test_centrifuge_to_the_last_bit(c_core, records):
+    rng = np.random.default_rng(4)
+    tables = tables_of(records[1])
+    rows = np.hstack([rng.uniform(-100, 100, (MANY, 2)), rng.uniform(-1e-2, 1e-2, (MANY, 2))])
+    rows[5] = [np.nan, 1.0, 0.0, 0.0]
+    rows[6, 3] = np.inf
+    rate, _ = Unit.of(*tables).centrifuge(list(rows.T[:2]), list(rows.T[2:]))
+    assert_same(c_core("double", tables, "centrifuge", rows), np.column_stack(rate))
+    assert_near(c_core("float", tables, "centrifuge", rows), np.column_stack(rate), 2e-6 * 1e-2)
+
+
+@pytest.mark.parametrize("rule", ["zero", "hold", "taper"])
+@pytest.mark.parametrize("model", MODELS)
+def test_warmup_to_the_last_bit(model, rule, c_core):
+    rng = np.random.default_rng(5)
+    tables = tables_of(madeup.warmup(model, rule))
+    ticks = rng.integers(0, int(1.3 * madeup.SETTLED / madeup.TICK), MANY // 4).astype(np.uint32)
+    for temperature in (-40.0, -30.0, 21.5, 60.0):
+        raw = rng.uniform(-1, 1, (2, len(ticks))) * 1e-3
+        left, covered = Unit.of(*tables).warmup(temperature, madeup.TICK, ticks, list(raw))
+        assert covered
+        rows = ticks.astype(np.float64)[:, None]
+        bias = c_core("double", tables, "warmup", rows, temperature, madeup.TICK)
+        assert_same(raw.T - bias, np.column_stack(left))
+        if temperature == 21.5:  # 0.01 deg/h
+            found = c_core("float", tables, "warmup", rows, temperature, madeup.TICK)
+            assert_near(found, bias, 0.01 * np.pi / 180 / 3600)
+
+
+def readings(rng, elements, *, odd):
+    """A turn of up to 3 rad/s seen by unequal gyros, and what a robust method has to bear."""
+    turn = 3 * np.sin(np.arange(MANY) * 2e-3)[:, None]
+    z = turn + 2e-3 * rng.uniform(0.5, 1.5, elements) * rng.standard_normal((MANY, elements))
+    z += 0.01 * rng.standard_normal(elements)
+    if odd:
+        z[rng.integers(0, MANY, 2000), rng.integers(0, elements, 2000)] = np.nan
+        z[rng.integers(0, MANY, 2000), rng.integers(0, elements, 2000)] += 5.0
+        z[200_000:201_000, 1] = z[200_000, 1]
+        z[400_000:, 2] += 0.05
+        z[600_000:600_100, 1:] = np.nan
+        z[700_000:700_010] = np.inf
+    return z
+
+
+def settings_of(method, elements):
+    rng = np.random.default_rng(6)
+    more = {}
+    if method == "covariance":
+        more["weights"] = rng.uniform(0.5, 2, elements)
+    if method == "kalman":
+        gain = np.vstack([np.full(elements, 0.3 / elements), 1e-3 * (np.eye(elements) - 1 / elements)])
+        more["gain"] = gain * rng.uniform(0.9, 1.1, gain.shape)
+    return ArraySettings(method, elements, rate=50.0, **more)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_array_to_the_last_bit(method, c_core):
+    """Blocks in Python, single steps in C."""
+    settings = settings_of(method, 6)
+    z = readings(np.random.default_rng(7), 6, odd=True)
+    rate = Stream(settings).process(z, flags=False).rate
+    assert_same(c_core("double", [array_table(settings)], "array", z), rate)
+    if method in (
+        "feedback",
+        "least-squares",
+    ):  # without a defence: a spike goes through with weights of float accuracy
+        z = readings(np.random.default_rng(7), 6, odd=False)
+        rate = Stream(settings).process(z, flags=False).rate
+        assert_same(c_core("double", [array_table(settings)], "array", z), rate)
+    assert_near(c_core("float", [array_table(settings)], "array", z), rate, 2e-6 * 5)  # full scale 5 rad/s
+
+
+def test_the_numbers_in_unit_c_are_those_of_the_records(c_core, records):
+    rng = np.random.default_rng(8)
+    accel, gyro = tables_of(records[0])
+    for table, name in ((accel, "tumble"), (gyro, "gyro-force")):
+        rows = outputs_of(table, 2.0, rng, odd=False)[:1000]
+        rows = np.hstack([rows, rng.uniform(-G, G, (1000, 3))]) if name == "gyro-force" else rows
+        assert_same(c_core("double", None, name, rows), c_core("double", [table], name, rows))
+    rows = rng.uniform(-100, 100, (1000, 4))
+    expected = c_core("double", tables_of(records[1]), "centrifuge", rows)
+    assert_same(c_core("double", None, "centrifuge", rows), expected)
+    ticks = np.arange(0.0, 1e5, 77.0)[:, None]
+    expected = c_core("double", tables_of(records[2]), "warmup", ticks, 33.3, 0.005)
+    assert_same(c_core("double", None, "warmup", ticks, 33.3, 0.005), expected)
+
+
+def make_test(folder, *options):
+    done = subprocess.run(["make", "-C", str(folder), "test", *options], capture_output=True, text=True, check=False)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("imulab self-test")]
+    return done.returncode, lines[0] if len(lines) == 1 else done.stdout + done.stderr
+
+
+def worst(line):
+    return float(line.split("worst ")[1].split()[0])
+
+
+@pytest.mark.parametrize("name", ["gcc", "clang"])
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_the_exported_self_test_passes(name, real, exported, compiler):
+    if shutil.which(name) is None:
+        pytest.skip(f"no {name} on this machine")
+    code, line = make_test(exported, f"CC={name}" + (" -DIMULAB_REAL=float" if real == "float" else ""))
+    assert code == 0, line
+    assert "pass" in line
+    assert real in line
+    assert worst(line) <= (0 if real == "double" else 2e-6)
+
+
+def test_the_self_test_notices_a_wrong_number(exported, tmp_path, compiler):
+    folder = tmp_path / "altered"
+    shutil.copytree(exported, folder)
+    text = (folder / "unit.c").read_text()
+    gain = text.split(".gain = {R(")[1].split(")")[0]
+    (folder / "unit.c").write_text(text.replace(gain, repr(float(gain) * (1 + 1e-5)), 1))
+    code, line = make_test(folder)
+    assert code != 0
+    assert "FAIL" in line
+    assert worst(line) > 1e-6
+
+
+def test_the_header_compiles_as_c_plus_plus(exported, tmp_path, compiler):
+    compile_with = shutil.which("c++")
+    if compile_with is None:
+        pytest.skip("no C++ compiler on this machine")
+    source = tmp_path / "main.cpp"
+    source.write_text(
+        '#include "unit.h"\nint main() {\n  il_real in[3] = {0, 0, 0}, out[3];\n'
+        "  return il_tumble_apply(&unit_tumble, in, out) == 0 ? 0 : 1;\n}\n"
+    )
+    objects = []
+    for name in ("imulab", "unit"):
+        objects.append(tmp_path / f"{name}.o")
+        subprocess.run([compiler, "-c", exported / f"{name}.c", "-o", objects[-1]], check=True)
+    strict = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", f"-I{exported}"]
+    subprocess.run([compile_with, *strict, source, *objects, "-o", tmp_path / "main", "-lm"], check=True)
+    subprocess.run([tmp_path / "main"], check=True)
+
+
+def test_nothing_but_the_self_test_has_a_main_and_the_core_is_the_same_for_every_unit(exported, tmp_path):
+    export("c", [madeup.tumble(1)], tmp_path)
+    assert (tmp_path / "imulab.c").read_bytes() == (exported / "imulab.c").read_bytes()
+    assert (tmp_path / "imulab.h").read_bytes() == (exported / "imulab.h").read_bytes()
+    core, own = {"imulab.c", "imulab.h"}, {"unit.c", "unit.h", "unit.blob"}
+    others = {"Makefile", "README.md", "golden.h", "selftest.c"}
+    assert {path.name for path in tmp_path.iterdir()} == core | own | others
+    assert [path.name for path in tmp_path.glob("*.c") if " main(" in path.read_text()] == ["selftest.c"]
+    assert [path.name for path in tmp_path.iterdir() if '"golden.h"' in path.read_text("latin-1")] == ["selftest.c"]
+
+
+def test_double_never_occurs_in_the_float_build(exported, tmp_path):
+    compile_with = shutil.which("arm-none-eabi-gcc")
+    if compile_with is None:
+        pytest.skip("no arm-none-eabi-gcc on this machine")
+    target = ["-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-Os", "-DIMULAB_REAL=float"]
+    for name in ("imulab", "unit"):
+        command = [compile_with, *target, *STRICT, "-c", exported / f"{name}.c", "-o", tmp_path / f"{name}.o"]
+        subprocess.run(command, check=True)
+    symbols = subprocess.run(
+        ["arm-none-eabi-nm", "-u", tmp_path / "imulab.o"], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert {"expf", "log1pf"} <= set(symbols)
+    assert not {name for name in symbols if name.startswith("__aeabi_") or name in ("exp", "log1p", "sqrt")}
