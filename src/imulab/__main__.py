@@ -2,4 +2,5 @@
 
 from imulab.cli import run
 
-run()
+if __name__ == "__main__":  # processes that are started from this one import it again
+    run()

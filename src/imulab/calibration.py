@@ -124,7 +124,7 @@ class Calibration:
 
     def to_json(self) -> str:
         """Return the record as JSON text."""
-        return json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        return json_text(self.to_dict())
 
     def save(self, path: str | Path) -> None:
         """Write the record, whole or not at all.
@@ -144,6 +144,11 @@ class Calibration:
             uncertainty = "" if p.standard_uncertainty is None else f" ± {p.standard_uncertainty:.2g}"
             lines.append(f"  {name} = {p.value:.9g}{uncertainty} {p.unit}")
         return "\n".join(lines)
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """Return a record's content (`Calibration.to_dict`) as the text of its file."""
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def load(path: str | Path) -> Calibration:

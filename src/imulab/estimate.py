@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,18 +94,29 @@ def levenberg_marquardt(
     converged = np.zeros(count, dtype=np.bool_)
     active = everything
     for _ in range(max_iterations):
-        weighted = jacobian[active] * weights[active, :, None]
-        normal = np.matmul(weighted.transpose(0, 2, 1), jacobian[active])
-        gradient = np.einsum("bnp,bn->bp", weighted, residuals[active])
-        step = _damped_step(normal, gradient, damping[active])
-        trial = parameters[active] + step
+        rows: Any = slice(None) if active.size == count else active  # views, not copies, while all are active
+        weighted = jacobian[rows] * weights[rows, :, None]
+        normal = np.matmul(weighted.transpose(0, 2, 1), jacobian[rows])
+        gradient = np.einsum("bnp,bn->bp", weighted, residuals[rows])
+        step = _damped_step(normal, gradient, damping[rows])
+        trial = parameters[rows] + step
         with np.errstate(all="ignore"):
             new_residuals, new_jacobian = model(trial, active)
-            new_cost = np.einsum("bn,bn,bn->b", weights[active], new_residuals, new_residuals)
+            new_cost = np.einsum("bn,bn,bn->b", weights[rows], new_residuals, new_residuals)
         small = np.abs(step).max(axis=1) <= tolerance
         # Near the minimum the cost is flat to rounding: a small step that changes nothing is an arrival.
-        better = new_cost <= cost[active] * (1 + 1e-12 * small)
-        iterations[active] += 1
+        better = new_cost <= cost[rows] * (1 + 1e-12 * small)
+        iterations[rows] += 1
+        if better.all():
+            parameters[rows], residuals[rows], jacobian[rows], cost[rows] = trial, new_residuals, new_jacobian, new_cost
+            if damping.any():
+                relaxed = damping[rows] / 10
+                damping[rows] = np.where(relaxed < 1e-9, 0.0, relaxed)
+            converged[rows] = small
+            active = active[~small]
+            if not active.size:
+                break
+            continue
         taken = active[better]
         parameters[taken], residuals[taken] = trial[better], new_residuals[better]
         jacobian[taken], cost[taken] = new_jacobian[better], new_cost[better]

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from imulab.errors import OptionError
+
+_UMASK = threading.Lock()
 
 
 @contextmanager
@@ -55,6 +58,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
+    with _UMASK:  # there is no way to look without setting it: one thread at a time, and never wider meanwhile
+        mask = os.umask(0o077)
+        os.umask(mask)
     return mask

@@ -75,10 +75,7 @@ def fit_centrifuge(
     ----------
     CN102636185A; IEEE Std 813, 836, 1057.
     """
-    if method not in METHODS:
-        raise OptionError(f"method {method!r}: expected one of {' '.join(METHODS)}")
-    if curve != "auto" and curve not in MODELS:
-        raise OptionError(f"curve {curve!r}: expected one of auto {' '.join(MODELS)}")
+    check_options(method, curve)
     seen = _Seen(recording_of)
     statics: list[StaticRun] = []
     runs: list[LoadedRun] = []
@@ -109,6 +106,20 @@ def fit_centrifuge(
         temperature=float(np.mean(seen.temperatures)) if seen.temperatures else None,
     )
     return CentrifugeFit(record, tuple(runs), levels, estimates)
+
+
+def check_options(method: str, curve: str) -> None:
+    """Check what can be checked before there is data.
+
+    Raises
+    ------
+    OptionError
+        Unknown method or curve.
+    """
+    if method not in METHODS:
+        raise OptionError(f"method {method!r}: expected one of {' '.join(METHODS)}")
+    if curve != "auto" and curve not in MODELS:
+        raise OptionError(f"curve {curve!r}: expected one of auto {' '.join(MODELS)}")
 
 
 @dataclass

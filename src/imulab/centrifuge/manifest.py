@@ -88,8 +88,8 @@ class Manifest:
         return specific_force(run.arm_rate, self.radius)
 
 
-def load_manifest(path: str | Path) -> Manifest:
-    """Read a manifest.
+def load_manifest(path: str | Path, name: str | None = None) -> Manifest:
+    """Read a manifest; `name` is what messages call it, its path if not given.
 
     Raises
     ------
@@ -98,15 +98,16 @@ def load_manifest(path: str | Path) -> Manifest:
     UnitError
         A unit is unknown or of another quantity.
     """
+    name = name or str(path)
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ReadError(f"{path}: no such manifest") from None
+        raise ReadError(f"{name}: no such manifest") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ReadError(f"{path}: the manifest cannot be read: {error}") from None
+        raise ReadError(f"{name}: the manifest cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
-        raise ReadError(f"{path}: the manifest is not TOML: {error}") from None
-    return parse_manifest(table, str(path))
+        raise ReadError(f"{name}: the manifest is not TOML: {error}") from None
+    return parse_manifest(table, name)
 
 
 def parse_manifest(table: Mapping[str, Any], name: str) -> Manifest:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import allan, array, centrifuge, convert, export, records, tumble, warmup
+from imulab.cli import allan, array, centrifuge, convert, export, fleet, records, tumble, warmup
 
 _SETTINGS: dict[str, Any] = {
     "add_completion": False,
@@ -30,6 +30,7 @@ def command() -> Any:
         help="Measure how a gyroscope's g-sensitive drift changes with g.",
     )
     app.add_typer(warmup.commands(_SETTINGS), name="warmup", help="Tabulate and subtract the bias after power-on.")
+    app.add_typer(fleet.commands(_SETTINGS), name="fleet", help="Calibrate many units, and watch the line.")
     records.add_commands(app)
     app.command("convert")(convert.convert)
     app.command("export")(export.export)

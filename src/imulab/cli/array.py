@@ -10,6 +10,7 @@ import typer
 
 from imulab.cli.options import (
     AsJson,
+    GivenFiles,
     LayoutFile,
     OutputFile,
     RecordingFile,
@@ -134,34 +135,12 @@ def calibrate(
 ) -> None:
     """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
     from imulab.cli.tumble import finish
-    from imulab.gyro_array.fit import calibrate_array
-    from imulab.readers import read
+    from imulab.tasks import run_task
 
     check_outputs([output, report], [name for name in (still, moving, layout) if name])
-    at_rest = _between(read(still, layout), interval)
-    in_motion = None if moving is None else read(moving, layout)
-    result = calibrate_array(at_rest, in_motion, averaging_time=quantity(averaging, "--averaging", "time", "s"))
-    finish(result.calibration, output, report, json=json)
-
-
-def _between(recording: Recording, interval: str | None) -> Recording:
-    """Cut a recording to an interval of its time."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    if interval is None:
-        return recording
-    ends = [quantity(part, "--interval", "time", "s") for part in interval.split(",")]
-    if len(ends) != 2 or not ends[0] < ends[1]:
-        raise OptionError(f"--interval {interval!r}: expected START,STOP, such as 468,496")
-    if "time" not in recording:
-        raise OptionError(f"{recording.name}: --interval needs a column time")
-    inside = np.flatnonzero((recording.si("time") >= ends[0]) & (recording.si("time") < ends[1]))
-    if not inside.size:
-        raise OptionError(f"{recording.name}: --interval {interval}: no samples there")
-    columns = {name: values[inside] for name, values in recording.columns.items()}
-    return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
+    files = [still] if moving is None else [still, moving]
+    options = {"interval": interval, "averaging": averaging, "layout": layout}
+    finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
 
 def fuse(

@@ -9,6 +9,7 @@ import typer
 
 from imulab.cli.options import (
     AsJson,
+    GivenFiles,
     LayoutFile,
     OutputFile,
     ReportFile,
@@ -21,7 +22,6 @@ from imulab.cli.options import (
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
-    from imulab.calibration import Calibration
     from imulab.centrifuge.manifest import Manifest
     from imulab.centrifuge.plan import Plan
     from imulab.centrifuge.simulate import Truth
@@ -170,54 +170,15 @@ def reduce(
 
     from imulab.centrifuge.manifest import load_manifest
     from imulab.cli.tumble import finish
+    from imulab.tasks import run_task
 
     test = load_manifest(manifest)
     files = [str(Path(manifest).parent / run.file) for run in test.runs]
     check_outputs([output, report], [manifest, *([layout] if layout else []), *files])
+    options = {"method": method, "curve": curve, "layout": layout}
     with progress_bar("runs", len(test.runs)) as progress:
-        record = reduce_test(test, manifest, layout=layout, method=method, curve=curve, progress=progress)
+        record = run_task("centrifuge", [manifest], options, GivenFiles(), progress=progress)
     finish(record, output, report, json=json)
-
-
-def reduce_test(
-    test: Manifest,
-    file: str,
-    *,
-    layout: str | None = None,
-    method: str = "least-squares",
-    curve: str = "auto",
-    progress: Any = None,
-) -> Calibration:
-    """Reduce the files of a manifest, and name them as sources with their hashes."""
-    import hashlib
-    from pathlib import Path
-
-    from imulab.centrifuge.fit import fit_centrifuge
-    from imulab.errors import ReadError
-    from imulab.readers import read_blocks
-    from imulab.recording import Source
-
-    folder = Path(file).parent
-    for index, run in enumerate(test.runs):  # what is missing is said before hours of data are read
-        if not (folder / run.file).is_file():
-            raise ReadError(f"{test.place(index)}: no such file")
-
-    def sources() -> list[Source]:
-        named = [(file, Path(file)), *((run.file, folder / run.file) for run in test.runs)]
-        found = []
-        for name, path in named:
-            with path.open("rb") as stream:
-                found.append(Source(name, hashlib.file_digest(stream, "sha256").hexdigest()))
-        return found
-
-    return fit_centrifuge(
-        test,
-        lambda run: read_blocks(folder / run.file, layout),
-        method=method,
-        curve=curve,
-        sources=sources,
-        progress=progress,
-    ).calibration
 
 
 def _levels(text: str) -> list[float]:

@@ -1,8 +1,7 @@
-"""What several commands take, and how texts on the command line become values."""
+"""What several commands take, and what they say."""
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -11,10 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.errors import OptionError, ReadError, UnitError
-from imulab.units import parse_unit, to_si
+from imulab.errors import OptionError, ReadError
+from imulab.texts import chosen as chosen
+from imulab.texts import quantity as quantity
+from imulab.texts import whole_number as whole_number
 
 if TYPE_CHECKING:
+    from imulab.calibration import Calibration
     from imulab.recording import Recording
 
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
@@ -32,61 +34,6 @@ Window = Annotated[
     str | None, typer.Option("--window", metavar="FROM:TO", help="Part to read, s; either side may be left out.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
-
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
-
-
-def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
-    """Return a text such as ``0.7mg`` or ``5 s`` in SI.
-
-    Raises
-    ------
-    OptionError
-        It is no number with a unit of this kind.
-    """
-    match = _QUANTITY.fullmatch(text)
-    expected = f"{option} {text!r}: expected a number, or one with a unit of {kind} such as 1 {default_unit}"
-    if match is None:
-        raise OptionError(expected)
-    try:
-        unit = parse_unit(match[2].strip() if match[2] else default_unit)
-    except UnitError as error:
-        raise OptionError(f"{option} {text!r}: {error}") from None
-    if unit.quantity != kind:
-        raise OptionError(expected)
-    return to_si(float(match[1]), unit.symbol)
-
-
-def whole_number(text: str, option: str) -> int:
-    """Return a text as a whole number.
-
-    Raises
-    ------
-    OptionError
-        It is none.
-    """
-    try:
-        return int(text)
-    except ValueError:
-        raise OptionError(f"{option} {text!r}: expected a whole number") from None
-
-
-def chosen(topic: str | None, instance: str | None, window: str | None) -> dict[str, Any]:
-    """Return the options of `read` that choose a part of a file.
-
-    Raises
-    ------
-    OptionError
-        The instance is no number, or the window is not FROM:TO.
-    """
-    part: tuple[float | None, ...] | None = None
-    if window is not None:
-        ends = window.split(":")
-        if len(ends) != 2 or not any(end.strip() for end in ends):
-            raise OptionError(f"--window {window!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
-        part = tuple(quantity(end, "--window", "time", "s") if end.strip() else None for end in ends)
-    number = None if instance is None else whole_number(instance, "--instance")
-    return {"topic": topic, "instance": number, "window": part}
 
 
 def heard(blocks: Iterable[Recording], *, notes: bool = True) -> Iterator[Recording]:
@@ -110,6 +57,34 @@ def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recor
     recording = read(file, layout, **part)
     list(heard([recording], notes=False))
     return recording
+
+
+class GivenFiles:
+    """Access to the files that a command names, for `imulab.tasks`."""
+
+    def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
+        """Read a recording as a whole, and warn where it was cut."""
+        return read_recording(name, layout, part)
+
+    def record(self, name: str) -> Calibration:
+        """Read a calibration record."""
+        from imulab.calibration import load
+
+        return load(name)
+
+    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+        """Read a recording in blocks."""
+        from imulab.readers import read_blocks
+
+        return read_blocks(name, layout)
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file."""
+        return Path(name)
+
+    def beside(self, name: str, file: str) -> str:
+        """Return the name of a file that is named relative to another."""
+        return str(Path(name).parent / file)
 
 
 def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:

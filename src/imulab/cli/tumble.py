@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +9,7 @@ import typer
 
 from imulab.cli.options import (
     AsJson,
+    GivenFiles,
     Instance,
     LayoutFile,
     OutputFile,
@@ -25,11 +25,9 @@ from imulab.cli.options import (
     warn,
     whole_number,
 )
-from imulab.errors import OptionError
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
-    from imulab.tumble.record import Gravity
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -137,27 +135,27 @@ def fit(
 
     Prints what was found; -o writes the calibration record, --report its figures.
     """
-    from imulab.calibration import load
-    from imulab.segment import find_attitudes
-    from imulab.tumble.fit import fit_tumble
+    from imulab.tasks import run_task
 
     check_outputs([output, report], [name for name in (file, layout, prior) if name])
-    local = _gravity(gravity, latitude, height)
-    part = chosen(topic, instance, window)
+    options = {
+        "order": order,
+        "method": method,
+        "loss": loss,
+        "gravity": gravity,
+        "latitude": latitude,
+        "height": height,
+        "prior": prior,
+        "monte_carlo": monte_carlo,
+        "layout": layout,
+        "topic": topic,
+        "instance": instance,
+        "window": window,
+    }
     trials = None if monte_carlo is None else whole_number(monte_carlo, "--monte-carlo")
-    attitudes = find_attitudes(read_recording(file, layout, part))
     with progress_bar("Monte Carlo", trials) as progress:
-        result = fit_tumble(
-            attitudes,
-            order=_order(order),
-            gravity=local,
-            method=method,
-            loss=loss,
-            prior=None if prior is None else load(prior),
-            monte_carlo=trials,
-            progress=progress,
-        )
-    finish(result.calibration, output, report, json=json)
+        record = run_task("tumble", [file], options, GivenFiles(), progress=progress)
+    finish(record, output, report, json=json)
 
 
 def finish(record: Calibration, output: str | None, report: str | None, *, json: bool) -> None:
@@ -255,25 +253,3 @@ def check(
         f"({attitudes.label(result.worst)}), limit {small_g(result.limit)}"
     )
     return 0 if result.passed else 1
-
-
-def _order(text: str) -> int | str:
-    return int(text) if text.isascii() and text.isdecimal() and len(text) < 3 else text
-
-
-def _gravity(gravity: str | None, latitude: str | None, height: str | None) -> Gravity | float | None:
-    from imulab.gravity import normal_gravity
-    from imulab.tumble.record import Gravity
-
-    if gravity is not None:
-        if latitude is not None or height is not None:
-            raise OptionError("--gravity together with --latitude or --height: expected one or the other")
-        return quantity(gravity, "--gravity", "acceleration", "m/s^2")
-    if latitude is None:
-        if height is not None:
-            raise OptionError("--height without --latitude: expected both")
-        return None
-    angle = quantity(latitude, "--latitude", "angle", "deg")
-    above = quantity(height, "--height", "length", "m") if height is not None else 0.0
-    value = normal_gravity(angle, above)
-    return Gravity(value, f"normal gravity at latitude {math.degrees(angle):.6g} deg, height {above:g} m (WGS 84)")

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.options import AsJson, LayoutFile, OutputFile, ReportFile, check_outputs, quantity, warn, whole_number
+from imulab.cli.options import (
+    AsJson,
+    GivenFiles,
+    LayoutFile,
+    OutputFile,
+    ReportFile,
+    check_outputs,
+    quantity,
+    warn,
+    whole_number,
+)
 from imulab.errors import OptionError
-
-if TYPE_CHECKING:
-    from imulab.recording import Source
-    from imulab.warmup.cycles import Cycle
-
-_SOURCE = "-40,-30,-20,-10,0,40,50,60"
+from imulab.tasks.warmup import TEMPERATURES, temperature_list
+from imulab.texts import number as _number
 
 Temperatures = Annotated[str, typer.Option(metavar="T,T,...", help="Calibration temperatures, degC, ascending.")]
 
@@ -28,7 +34,7 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
 
 
 def plan(
-    temperatures: Temperatures = _SOURCE,
+    temperatures: Temperatures = TEMPERATURES,
     cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "5",
     soak: Annotated[str, typer.Option(help="Before each power-on, unit off.")] = "60 min",
     record: Annotated[str, typer.Option(help="Recording from power-on on.")] = "10 min",
@@ -84,7 +90,7 @@ def plan(
 
 def simulate(
     output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder for the recordings.")],
-    temperatures: Temperatures = _SOURCE,
+    temperatures: Temperatures = TEMPERATURES,
     cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "3",
     law: Annotated[str, typer.Option(help="How the zeros depend on temperature: smooth or bent.")] = "smooth",
     duration: Annotated[str, typer.Option(help="Of each recording.")] = "600 s",
@@ -131,7 +137,7 @@ def fit(
     model: Annotated[
         str, typer.Option(help="auto, interval-cubic, knot-cubic, knot-log-cubic or exponential.")
     ] = "auto",
-    temperatures: Temperatures = _SOURCE,
+    temperatures: Temperatures = TEMPERATURES,
     tolerance: Annotated[str, typer.Option(metavar="K", help="A power-on temperature within this fits, K.")] = "1",
     settling_time: Annotated[
         str | None, typer.Option("--settling-time", help="T_M; chosen from the data if not given.")
@@ -159,23 +165,24 @@ def fit(
     Prints the comparison of the models; -o writes the calibration record, --report its figures.
     """
     from imulab.cli.tumble import finish
-    from imulab.warmup.fit import fit_warmup
+    from imulab.tasks import run_task
 
     check_outputs([output, report], [*files, *([layout] if layout else [])])
-    latest = quantity(latest_start, "--latest-start", "time", "s")
-    options: dict[str, Any] = {
-        "temperatures": temperature_list(temperatures),
-        "tolerance": _number(tolerance, "--tolerance"),
-        "settling_time": None if settling_time is None else quantity(settling_time, "--settling-time", "time", "s"),
-        "settling_limit": _limit(settling_limit),
-        "taper_time": quantity(taper_time, "--taper-time", "time", "s"),
-        "axes": None if axes is None else [name.strip() for name in axes.split(",")],
+    options = {
+        "model": model,
+        "temperatures": temperatures,
+        "tolerance": tolerance,
+        "settling_time": settling_time,
+        "settling_limit": settling_limit,
+        "exit": exit_rule,
+        "taper_time": taper_time,
+        "pool": pool,
+        "axes": axes,
+        "latest_start": latest_start,
+        "temperature_column": "yes" if temperature_column else "no",
+        "layout": layout,
     }
-    cycles = [
-        read_cycle(name, layout, latest_start=latest, temperature_from_column=temperature_column) for name in files
-    ]
-    result = fit_warmup(cycles, model=model, exit_rule=exit_rule, pool=pool, **options)
-    finish(result.calibration, output, report, json=json)
+    finish(run_task("warmup", files, options, GivenFiles()), output, report, json=json)
 
 
 def table(
@@ -199,76 +206,6 @@ def table(
         raise OptionError(f"{output}: a table makes a record; expected a name such as unit.json")
     record_of_table(read_table(file), file).save(output)
     print(f"record: {output}")
-
-
-def read_cycle(name: str, layout: str | None = None, *, latest_start: float, temperature_from_column: bool) -> Cycle:
-    """Read one power cycle block by block."""
-    from imulab.readers import load_layout, read_blocks
-    from imulab.warmup.cycles import find_power_cycle
-
-    shape = load_layout(layout) if layout else None
-    return find_power_cycle(
-        read_blocks(name, shape),
-        latest_start=latest_start,
-        temperature_from_column=temperature_from_column,
-        source=_source(name),
-    )
-
-
-def _source(name: str) -> Source | None:
-    """Name and hash of a file; None for standard input and folders."""
-    from hashlib import file_digest
-
-    from imulab.recording import Source
-
-    path = Path(name)
-    if name == "-" or not path.is_file():
-        return None
-    with path.open("rb") as stream:
-        return Source(name, file_digest(stream, "sha256").hexdigest())
-
-
-def temperature_list(text: str) -> list[float]:
-    """Return ``-40,-30,...`` as numbers.
-
-    Raises
-    ------
-    OptionError
-        It is no such list.
-    """
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise OptionError(f"--temperatures {text!r}: expected numbers such as -40,-30,0") from None
-
-
-def _number(text: str, option: str) -> float:
-    from math import isfinite
-
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not isfinite(value):
-        raise OptionError(f"{option} {text!r}: expected a number")
-    return value
-
-
-def _limit(text: str) -> dict[str, float]:
-    """Kind to the |Z| that counts as settled; a share of the peak is negative."""
-    if text.rstrip().endswith("%"):
-        share = _number(text.rstrip()[:-1], "--settling-limit") / 100
-        if not 0 < share < 1:
-            raise OptionError(f"--settling-limit {text!r}: expected more than 0 and less than 100 %")
-        return {"gyro": -share, "accel": -share}
-    for kind, what, unit in (("gyro", "rate", "deg/h"), ("accel", "acceleration", "mg")):
-        try:
-            value = quantity(text, "--settling-limit", what, unit)
-        except OptionError:
-            continue
-        if any(symbol in text for symbol in ("deg", "rad")) == (kind == "gyro") and value > 0:
-            return {kind: value}
-    raise OptionError(f"--settling-limit {text!r}: expected a percentage such as '5 %', a rate or an acceleration")
 
 
 def _hours(seconds: float) -> str:

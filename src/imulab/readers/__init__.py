@@ -30,6 +30,7 @@ def read(
     topic: str | None = None,
     instance: int | None = None,
     window: tuple[float | None, float | None] | None = None,
+    name: str | None = None,
 ) -> Recording:
     """Read a recording as a whole.
 
@@ -45,6 +46,8 @@ def read(
         Which sensor of a flight log, from 0; by default the first.
     window
         First and last time to read, s; None for no bound.
+    name
+        What messages and the source call the file; its path if not given.
 
     Returns
     -------
@@ -59,7 +62,7 @@ def read(
         The file has no such topic, instance or window.
     """
     selection = Selection(topic, instance, window)
-    name, known = _name(file), _layout(layout)
+    name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
     blocks = list(windowed(_blocks(file, name, known, selection, hashed), window, name))
     source = Source(name, hashed.of(file))
@@ -84,13 +87,14 @@ def read_blocks(
     topic: str | None = None,
     instance: int | None = None,
     window: tuple[float | None, float | None] | None = None,
+    name: str | None = None,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
     Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
     """
     selection = Selection(topic, instance, window)
-    name = _name(file)
+    name = name or _name(file)
     yield from windowed(_blocks(file, name, _layout(layout), selection, None), window, name)
 
 
@@ -139,7 +143,7 @@ def _blocks(
     else:
         kind = TEXT
         if str(file) != "-" and not (layout is not None and layout.text):
-            with _open(file) as stream:
+            with _open(file, name) as stream:
                 kind = recognised(stream.read(1024))
     if kind.layout == "none" and layout is not None:
         raise ReadError(f"{name}: a {kind.name} file says itself what its columns are; leave out {layout.name}")
@@ -150,7 +154,7 @@ def _blocks(
             raise ReadError(f"{name}: cannot be read: {error.strerror or error}") from None
         return
     selection.refuse(name, "a text file")
-    with _open(file) as stream:
+    with _open(file, name) as stream:
         text = TextFile(stream, name, layout, hashed=hashed is not None, whole=hashed is not None)
         if hashed is not None:
             hashed.text = text
@@ -185,14 +189,14 @@ def _layout(layout: str | Path | Layout | None) -> Layout | None:
     return load_layout(layout) if isinstance(layout, str | Path) else layout
 
 
-def _open(file: str | Path) -> BinaryIO:
+def _open(file: str | Path, name: str) -> BinaryIO:
     if str(file) == "-":
         return sys.stdin.buffer
     try:
         return Path(file).open("rb")
     except FileNotFoundError:
-        raise ReadError(f"{file}: no such file") from None
+        raise ReadError(f"{name}: no such file") from None
     except IsADirectoryError:
-        raise ReadError(f"{file}: expected a file, found a folder") from None
+        raise ReadError(f"{name}: expected a file, found a folder") from None
     except OSError as error:
-        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
+        raise ReadError(f"{name}: cannot be read: {error.strerror}") from None

@@ -53,8 +53,8 @@ class Layout:
     text: bool = False
 
 
-def load_layout(path: str | Path) -> Layout:
-    """Read a layout file.
+def load_layout(path: str | Path, name: str | None = None) -> Layout:
+    """Read a layout file; `name` is what messages call it, its path if not given.
 
     Raises
     ------
@@ -63,15 +63,16 @@ def load_layout(path: str | Path) -> Layout:
     UnitError
         A unit is unknown or does not belong to its column.
     """
+    name = name or str(path)
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ReadError(f"{path}: no such layout file") from None
+        raise ReadError(f"{name}: no such layout file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ReadError(f"{path}: the layout cannot be read: {error}") from None
+        raise ReadError(f"{name}: the layout cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
-        raise ReadError(f"{path}: the layout is not TOML: {error}") from None
-    return _layout(table, str(path))
+        raise ReadError(f"{name}: the layout is not TOML: {error}") from None
+    return _layout(table, name)
 
 
 def _layout(table: dict[str, Any], path: str) -> Layout:

@@ -34,10 +34,15 @@ _LONGEST_LINE = 1 << 20
 
 
 class _Crew:
-    """Threads to parse with, as many as there are processors; started when there is work for them."""
+    """Threads to parse with, as many as there are processors; started when there is work for them.
+
+    OMP_NUM_THREADS limits them as it does the linear algebra, so that workers beside each other do not compete.
+    """
 
     def __init__(self) -> None:
-        self.size = min(_MOST_THREADS, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2)
+        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
+        allowed = os.environ.get("OMP_NUM_THREADS", "")
+        self.size = min(_MOST_THREADS, processors, int(allowed) if allowed.isdecimal() and int(allowed) else processors)
         self._pool: ThreadPoolExecutor | None = None
 
     def begin(self, job: Callable[[], tuple[int, int, int]]) -> Callable[[], tuple[int, int, int]]:

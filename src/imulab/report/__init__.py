@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -24,16 +24,35 @@ _TITLES = {
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
     """Return the report of a record as HTML text."""
+    return render_page(
+        _TITLES.get(record.procedure, record.procedure.capitalize()),
+        record.sensor.get("serial", "unit without serial number"),
+        exhibits,
+        warnings=record.warnings,
+        provenance=_provenance(record),
+    )
+
+
+def render_page(
+    title: str,
+    subject: str,
+    exhibits: Exhibits,
+    *,
+    warnings: Sequence[str] = (),
+    provenance: Sequence[tuple[str, str]] = (),
+) -> str:
+    """Return exhibits as HTML text: subject, result, warnings, figures and tables, provenance."""
     plots = [item for item in exhibits.items if isinstance(item, Figure)]
     return str(
         _template("page.html.j2").render(
-            record=record,
-            title=_TITLES.get(record.procedure, record.procedure.capitalize()),
+            title=title,
+            subject=subject,
+            warnings=warnings,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
             plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
             plotly=_plotly(),
-            provenance=_provenance(record),
+            provenance=provenance,
         )
     )
 

@@ -108,7 +108,7 @@ def fit_tumble(
     RecordError
         The prior lacks a parameter, or has outputs in another unit.
     """
-    _check_options(order, method, loss)
+    check_options(order, method, loss)
     local = _gravity(gravity)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
@@ -128,7 +128,8 @@ def fit_tumble(
     else:
         chosen = int(order)
     problem = Problem(reading, noise, chosen, robust=loss == "huber", prior=known)
-    solution, seen = _solve(problem, attitudes, method)
+    solved = choice.solution if choice is not None and known is None else None
+    solution, seen = _solve(problem, attitudes, method, solved)
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])
     matrix, freedom = _covariance(problem, solution)
@@ -163,7 +164,14 @@ def fit_tumble(
     )
 
 
-def _check_options(order: int | str, method: str, loss: str) -> None:
+def check_options(order: int | str, method: str, loss: str) -> None:
+    """Check what can be checked before there is data.
+
+    Raises
+    ------
+    OptionError
+        An option has an unknown value, or does not go with another.
+    """
     known = ("auto", *range(1, HIGHEST_ORDER + 1))
     if order not in known or isinstance(order, bool):
         raise OptionError(f"order {order!r}: expected one of {' '.join(map(str, known))}")
@@ -209,10 +217,15 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
     return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
 
 
-def _solve(problem: Problem, attitudes: Attitudes, method: str) -> tuple[Solution, Observability]:
+def _solve(
+    problem: Problem, attitudes: Attitudes, method: str, solved: Solution | None
+) -> tuple[Solution, Observability]:
+    """Solve the problem, unless the choice of the order has `solved` it by norm, and see what it determines."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "linearised" and n >= size:
         solution = solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
+    elif solved is not None:
+        solution = solved
     else:
         limit = chi_square_limit(n - size if problem.prior is None else n)
         start = None if problem.prior is None else problem.prior.mean[None]

@@ -94,8 +94,9 @@ def _solve_polynomial(reading: Array, nonlinearity: Array) -> tuple[Array, Array
             moving = np.abs(step) > size
             s = np.where(moving | np.isnan(step), s - step, s)
             if not moving.any():
-                break
-        slope = _polynomial(s, nonlinearity)[1]
+                break  # and the slope is that at s
+        else:
+            slope = _polynomial(s, nonlinearity)[1]
         # Where the polynomial turns back there is no specific force that gives this output.
         solved = (slope > 0) & ~moving
         return np.where(solved, s, np.nan), np.where(solved, slope, np.nan)
@@ -103,12 +104,17 @@ def _solve_polynomial(reading: Array, nonlinearity: Array) -> tuple[Array, Array
 
 def _polynomial(s: Array, nonlinearity: Array) -> tuple[Array, Array]:
     """Value and slope of ``s + k2 s^2 + ... + ke s^e`` by Horner's scheme."""
-    value = np.zeros_like(s)
-    slope = np.zeros_like(s)
-    for index in reversed(range(nonlinearity.shape[-2])):
+    # value = k2 + k3 s + ..., so that the polynomial is s (1 + s value); Horner's first two rows are written out.
+    count = nonlinearity.shape[-2]
+    value = nonlinearity[..., count - 1, :]
+    if count == 1:
+        scaled = s * value
+        return s * (1 + scaled), 1 + (scaled + scaled)
+    slope = value
+    value = value * s + nonlinearity[..., count - 2, :]
+    for index in reversed(range(count - 2)):
         slope = slope * s + value
         value = value * s + nonlinearity[..., index, :]
-    # value = k2 + k3 s + ..., so that the polynomial is s (1 + s value)
     return s * (1 + s * value), 1 + s * (2 * value + s * slope)
 
 

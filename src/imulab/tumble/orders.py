@@ -43,10 +43,11 @@ class OrderRow:
 
 @dataclass(frozen=True)
 class OrderChoice:
-    """The table of orders, lowest first, and the order that it leads to."""
+    """The table of orders, lowest first, the order that it leads to, and the solution of that order."""
 
     order: int
     rows: tuple[OrderRow, ...]
+    solution: Solution | None
 
 
 def choose_order(problem: Problem, gravity: float) -> OrderChoice:
@@ -85,7 +86,7 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
         significant = order == 1 or f_test(costs[chosen], parameter_count(chosen), costs[order], size, n) < level
         if row.observable and better and significant:
             chosen, best = order, row.leave_one_out or np.inf
-    return OrderChoice(chosen, tuple(rows))
+    return OrderChoice(chosen, tuple(rows), fits[chosen][1] if chosen in fits else None)
 
 
 def _row(problem: Problem, fit: Solution, costs: dict[int, float], gravity: float) -> OrderRow:

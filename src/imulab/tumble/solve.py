@@ -33,6 +33,7 @@ _REWEIGHTING_PASSES = {False: 4, True: 30}
 _WEIGHTS_AT_REST = 1e-4
 _DIVERGED = 0.98
 """A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
+_REFIT_STEPS = 15  # without one attitude of many the solution is near; what wanders for longer is not determined
 _REFIT_AT_MOST = 150
 
 
@@ -297,7 +298,8 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     repeated = replace(problem, reading=np.broadcast_to(problem.reading[0], (n, n, 3)))
     weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
     lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
-    fit = _least_squares(repeated, np.repeat(solution.theta, n, axis=0), weights, lengthening)
+    start = np.repeat(solution.theta, n, axis=0)
+    fit = _least_squares(repeated, start, weights, lengthening, max_iterations=_REFIT_STEPS)
     return np.diagonal(fit.residuals)
 
 

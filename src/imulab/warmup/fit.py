@@ -112,7 +112,7 @@ def fit_warmup(
     Source: start-up zero error compensation of MEMS inertial instruments (patent record 38161583), and
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
     """
-    at = _check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool)
+    at = check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool)
     if not cycles:
         raise DataError("no power cycles: expected at least one file for each calibration temperature")
     found = [find_power_cycle(item) if isinstance(item, Recording) else item for item in cycles]
@@ -163,7 +163,7 @@ def _covariance(curves: Curves, chosen: Judged, by_unit: bool) -> Array | None:
     return coefficient_covariance(curves, chosen.solution, sums, cluster)
 
 
-def _check_options(
+def check_options(
     model: str,
     temperatures: Sequence[float],
     tolerance: float,
@@ -172,6 +172,13 @@ def _check_options(
     taper_time: float,
     pool: str,
 ) -> Array:
+    """Check what can be checked before there is data, and return the temperatures, degC, shape (k,).
+
+    Raises
+    ------
+    OptionError
+        An option has a value that cannot be used.
+    """
     for name, value, known in (
         ("model", model, (*MODELS, "auto")),
         ("exit", exit_rule, EXITS),

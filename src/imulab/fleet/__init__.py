@@ -1,0 +1,1 @@
+"""Many units: one task per unit, on this machine or a cluster; restartable, with history and the line's statistics."""

@@ -1,0 +1,198 @@
+"""History: every calibration that a line has made, so that the next knows the last; SQLite or PostgreSQL."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from imulab.calibration import Parameter
+from imulab.errors import OptionError
+from imulab.fleet.work import Summary
+
+_MANY = 500
+
+
+@dataclass(frozen=True)
+class Past:
+    """One calibration of the history; `sources` is a hash over those of its files."""
+
+    serial: str
+    procedure: str
+    when: str
+    created: str
+    content_sha256: str
+    sources: str
+    parameters: Mapping[str, Parameter]
+    freedom: float | None
+
+
+def sources_of(summary: Summary) -> str:
+    """Return one hash for the files that a record was made from."""
+    return hashlib.sha256("\n".join(sorted(summary.inputs)).encode()).hexdigest()
+
+
+class History:
+    """An open history."""
+
+    def __init__(self, engine: Any, name: str) -> None:
+        import sqlalchemy as sa
+
+        self._engine = engine
+        self._name = name
+        tables = sa.MetaData()
+        self._calibrations = sa.Table(
+            "imulab_calibrations",
+            tables,
+            sa.Column("id", sa.Integer, primary_key=True, autoincrement=True),
+            sa.Column("serial", sa.String(200), nullable=False, index=True),
+            sa.Column("procedure", sa.String(40), nullable=False),
+            sa.Column("date", sa.String(80), nullable=False),
+            sa.Column("created", sa.String(40), nullable=False),
+            sa.Column("software", sa.String(80), nullable=False),
+            sa.Column("content_sha256", sa.String(64), nullable=False),
+            sa.Column("sources_sha256", sa.String(64), nullable=False),
+            sa.Column("degrees_of_freedom", sa.Double),
+            sa.Column("warnings", sa.Text, nullable=False),
+            sa.UniqueConstraint("serial", "procedure", "content_sha256"),
+        )
+        self._parameters = sa.Table(
+            "imulab_parameters",
+            tables,
+            sa.Column("calibration", sa.ForeignKey("imulab_calibrations.id"), primary_key=True),
+            sa.Column("name", sa.String(120), primary_key=True),
+            sa.Column("value", sa.Double, nullable=False),
+            sa.Column("standard_uncertainty", sa.Double),
+            sa.Column("unit", sa.String(80), nullable=False),
+        )
+        tables.create_all(engine)
+
+    def add(self, summaries: Sequence[Summary]) -> None:
+        """Add calibrations that are not there yet, all or none."""
+        if not summaries:
+            return
+        from importlib import import_module
+
+        dialect = import_module(f"sqlalchemy.dialects.{self._engine.dialect.name}")
+        insert = dialect.insert(self._calibrations).on_conflict_do_nothing().returning(self._calibrations.c.id)
+        rows: list[dict[str, Any]] = []
+        with self._said(), self._engine.begin() as connection:
+            for summary in summaries:
+                found = connection.execute(
+                    insert,
+                    {
+                        "serial": summary.serial,
+                        "procedure": summary.procedure,
+                        "date": summary.when,
+                        "created": summary.created,
+                        "software": summary.software,
+                        "content_sha256": summary.content_sha256,
+                        "sources_sha256": sources_of(summary),
+                        "degrees_of_freedom": summary.freedom,
+                        "warnings": json.dumps(summary.warnings, ensure_ascii=False),
+                    },
+                ).scalar()
+                if found is not None:
+                    rows += (
+                        {
+                            "calibration": found,
+                            "name": name,
+                            "value": p.value,
+                            "standard_uncertainty": p.standard_uncertainty,
+                            "unit": p.unit,
+                        }
+                        for name, p in summary.parameters.items()
+                    )
+            if rows:
+                connection.execute(self._parameters.insert(), rows)
+
+    def of(self, serials: Sequence[str]) -> dict[str, list[Past]]:
+        """Return the calibrations of these units, oldest first."""
+        import sqlalchemy as sa
+
+        c, p = self._calibrations.c, self._parameters.c
+        found: dict[int, Past] = {}
+        values: dict[int, dict[str, Parameter]] = {}
+        with self._said(), self._engine.connect() as connection:
+            for start in range(0, len(serials), _MANY):
+                query = (
+                    sa.select(
+                        c.id, c.serial, c.procedure, c.date, c.created, c.content_sha256, c.sources_sha256,
+                        c.degrees_of_freedom,
+                        p.name, p.value, p.standard_uncertainty, p.unit,
+                    )
+                    .select_from(self._calibrations.outerjoin(self._parameters))
+                    .where(c.serial.in_(serials[start : start + _MANY]))
+                    .order_by(c.created, c.id)
+                )  # fmt: skip
+                for row in connection.execute(query):
+                    parameters = values.setdefault(row.id, {})
+                    if row.name is not None:
+                        parameters[row.name] = Parameter(row.value, row.standard_uncertainty, row.unit)
+                    if row.id not in found:
+                        found[row.id] = Past(
+                            row.serial, row.procedure, row.date, row.created, row.content_sha256, row.sources_sha256,
+                            parameters, row.degrees_of_freedom,
+                        )  # fmt: skip
+        past: dict[str, list[Past]] = {}
+        for item in found.values():
+            past.setdefault(item.serial, []).append(item)
+        return past
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        """Turn what the database refuses into one line."""
+        from sqlalchemy.exc import SQLAlchemyError
+
+        try:
+            yield
+        except SQLAlchemyError as error:
+            raise OptionError(f"history {self._name}: {_reason(error)}") from None
+
+
+@contextmanager
+def open_history(url: str) -> Iterator[History]:
+    """Open a history by its SQLAlchemy URL (``sqlite:///FILE``, ``postgresql://USER@HOST/DATABASE``); make its tables.
+
+    Raises
+    ------
+    OptionError
+        SQLAlchemy or the database's driver is missing, or the database cannot be used.
+    """
+    try:
+        import sqlalchemy as sa
+        from sqlalchemy.exc import SQLAlchemyError
+    except ImportError:
+        raise OptionError("the history needs SQLAlchemy: pip install 'imulab[fleet]'") from None
+    expected = "expected a URL such as sqlite:///history.sqlite or postgresql://user@host/database"
+    try:
+        address = sa.make_url(url)
+    except SQLAlchemyError:
+        raise OptionError(f"history {url!r}: {expected}") from None
+    name = address.render_as_string(hide_password=True)
+    kind = address.get_backend_name()
+    if kind not in ("sqlite", "postgresql"):
+        raise OptionError(f"history {name}: {expected}")
+    if address.drivername == "postgresql":
+        address = address.set(drivername="postgresql+psycopg")
+    try:
+        engine = sa.create_engine(address, connect_args={"timeout" if kind == "sqlite" else "connect_timeout": 20})
+    except ImportError as error:
+        raise OptionError(f"history {name}: its driver is missing ({error}): pip install 'imulab[postgres]'") from None
+    except SQLAlchemyError as error:
+        raise OptionError(f"history {name}: {_reason(error)}") from None
+    try:
+        try:
+            history = History(engine, name)
+        except SQLAlchemyError as error:
+            raise OptionError(f"history {name}: {_reason(error)}") from None
+        yield history
+    finally:
+        engine.dispose()
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(getattr(error, "orig", None) or error).split())[:300]

@@ -1,0 +1,129 @@
+"""The report of a fleet: the line's statistics from records, history and limits as one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from imulab.errors import OptionError
+from imulab.exhibit import Exhibits, Figure, Table
+from imulab.files import write_text
+from imulab.fleet import figures
+from imulab.fleet.history import History, open_history
+from imulab.fleet.limits import load_limits
+from imulab.fleet.run import FleetState, default_history, fleet_state
+from imulab.fleet.statistics import (
+    Change,
+    ParameterStatistics,
+    change_limit,
+    changes_since,
+    line_statistics,
+    parameter_units,
+)
+from imulab.report import render_page
+
+_TITLES = {"tumble": "Tumble", "array": "Gyro array", "warmup": "Warm-up", "centrifuge": "Centrifuge"}
+
+
+def write_fleet_report(folder: str, output: str, *, limits: str | None = None, history: str | None = None) -> None:
+    """Write the statistics of a fleet's records.
+
+    Parameters
+    ----------
+    folder, output
+        Folder of the fleet, and HTML file to write.
+    limits
+        TOML file of limits for Cpk; none if not given.
+    history
+        SQLAlchemy URL, by default the SQLite file in the folder where there is one; ``none`` for none.
+
+    Raises
+    ------
+    ReadError, UnitError, OptionError
+        The folder, the limits or the history cannot be used, or there is no record yet.
+    """
+    state = fleet_state(folder)
+    found = [row.summary for row in state.rows if row.summary is not None]
+    if not found:
+        raise OptionError(f"{folder}: no records yet: {state.count('failed')} units failed, the others are missing")
+    known = {} if limits is None else load_limits(limits, parameter_units(found))
+    statistics = line_statistics(found, known)
+    with ExitStack() as stack:
+        past = _history(folder, history, stack)
+        changes = [] if past is None else changes_since(found, past.of([summary.serial for summary in found]))
+    exhibits = fleet_exhibits(state, statistics, changes)
+    provenance = [
+        ("folder", folder),
+        ("manifest", state.manifest.name),
+        ("units", f"{len(state.rows)}: {', '.join(f'{state.count(s)} {s}' for s in ('done', 'failed', 'missing'))}"),
+        ("limits", limits or "none given"),
+        ("records made", " to ".join(sorted({min(s.created for s in found), max(s.created for s in found)}))),
+        ("software", ", ".join(sorted({summary.software for summary in found}))),
+    ]
+    write_text(
+        output, render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, warnings=_warnings(state))
+    )
+
+
+def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics], changes: Sequence[Change]) -> Exhibits:
+    """Return what the report shows."""
+    out = {serial for item in statistics for serial, o in zip(item.serials, item.outliers, strict=True) if o}
+    capable = [item for item in statistics if item.capability is not None]
+    drifting = [item.name for item in statistics if item.drift is not None and item.drift.significant]
+    fresh = [change for change in changes if not change.same_files]
+    moved = {change.serial for change in fresh if abs(change.deviations or 0.0) > change_limit(len(fresh))}
+    facts = [
+        ("units done", f"{state.count('done')} of {len(state.rows)}"),
+        ("failed", str(state.count("failed"))),
+        ("units that stand out", str(len(out))),
+        ("parameters that drift", str(len(drifting))),
+    ]
+    said = [f"{state.count('done')} of {len(state.rows)} units have their record"]
+    if state.failures:
+        said.append(f"{len(state.failures)} failed")
+    said.append(f"{len(out)} stand out in some parameter" if out else "none stands out")
+    if drifting:
+        some = ", ".join(drifting[:4]) + (" and others" if len(drifting) > 4 else "")
+        said.append(f"{some} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
+    if capable:
+        worst = min(capable, key=lambda item: item.capability.cpk if item.capability else 0.0)
+        if worst.capability is not None:
+            facts.append(("smallest Cpk", f"{worst.capability.cpk:.2f}"))
+            said.append(f"the smallest Cpk is {worst.capability.cpk:.2f} ({worst.name})")
+    if fresh:
+        facts.append(("changed since last", str(len(moved))))
+    items: list[Figure | Table | None] = [figures.failure_table(state.failures)]
+    for procedure in dict.fromkeys(item.procedure for item in statistics):
+        title = _TITLES.get(procedure, procedure)
+        mine = [item for item in statistics if item.procedure == procedure]
+        items += [
+            figures.distributions(title, mine),
+            figures.summary_table(title, mine),
+            figures.over_date(title, mine),
+            figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
+        ]
+    items += [figures.outlier_table(statistics), figures.change_table(changes)]
+    return Exhibits("; ".join(said) + ".", facts, [item for item in items if item is not None])
+
+
+def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
+    if url == "none":
+        return None
+    if url is None:
+        if not (Path(folder) / "history.sqlite").is_file():
+            return None
+        url = default_history(folder)
+    return stack.enter_context(open_history(url))
+
+
+def _warnings(state: FleetState) -> list[str]:
+    said = []
+    if state.at_work:
+        said.append(
+            f"A run is at work on the folder ({state.at_work}): this is what was there when the report was made."
+        )
+    missing = state.count("missing")
+    if missing:
+        said.append(f"{missing} units have no record yet.")
+    return said

@@ -1,0 +1,250 @@
+"""A run over a fleet: every unit that has no record of its present files and options is fitted, once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from imulab.errors import OptionError
+from imulab.files import write_text
+from imulab.fleet.engine import Engine, WorkersLostError, open_engine
+from imulab.fleet.history import History, open_history
+from imulab.fleet.manifest import FleetManifest, Unit, load_fleet
+from imulab.fleet.store import Store
+from imulab.fleet.table import Row, check_table, write_table
+from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, summarise
+
+_FRUITLESS = 5
+"""Losses of workers in a row, without a unit done between them, before giving up."""
+_FLUSH = 2.0
+
+
+@dataclass(frozen=True)
+class FleetState:
+    """Where a fleet stands.
+
+    Attributes
+    ----------
+    folder, manifest
+        Where the records are, and what was asked.
+    rows
+        Every unit of the manifest in its order: ``done``, ``failed`` or ``missing``.
+    kept
+        Number of units that had their record before this run.
+    at_work
+        Process that works on the folder now, or None.
+    seconds
+        Time that the run took.
+    notes
+        What a person must know besides, a sentence each.
+    """
+
+    folder: str
+    manifest: FleetManifest
+    rows: tuple[Row, ...]
+    kept: int = 0
+    at_work: str | None = None
+    seconds: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def count(self, status: str) -> int:
+        """Return the number of units with this status."""
+        return sum(row.status == status for row in self.rows)
+
+    @property
+    def failures(self) -> tuple[Row, ...]:
+        """The units that failed."""
+        return tuple(row for row in self.rows if row.status == FAILED)
+
+
+def default_history(folder: str | Path) -> str:
+    """Return the URL of the history that a fleet has where no other is named."""
+    return f"sqlite:///{Path(folder).resolve() / 'history.sqlite'}"
+
+
+def run_fleet(
+    manifest: str,
+    folder: str,
+    *,
+    engine: str = "local",
+    scheduler: str | None = None,
+    workers: int | None = None,
+    history: str | None = None,
+    table: str | None = None,
+    started: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int], None] = lambda _: None,
+) -> FleetState:
+    """Calibrate every unit of a manifest that has no record of its present files and options yet.
+
+    Writes ``folder/<serial>.json`` as soon as a unit is done, ``folder/parameters.csv`` and the history at the end and
+    on the way. It can be killed at any moment; the next run does what is missing. One unit's failure is that unit's.
+
+    Parameters
+    ----------
+    manifest
+        CSV or Parquet, path or URL: ``serial,procedure,file`` and options of the fits.
+    folder
+        Where the records go; made if it is not there.
+    engine, scheduler, workers
+        ``local`` with so many processes (all processors if not given), or ``dask``: the cluster at ``scheduler``, or
+        one started here with so many workers.
+    history
+        SQLAlchemy URL; a SQLite file in the folder if not given; ``none`` for no history.
+    table
+        Table of all parameters, .csv or .parquet; ``parameters.csv`` in the folder if not given.
+    started, progress
+        Called once with the number of units, then with the number of units that are over.
+
+    Raises
+    ------
+    ReadError, OptionError
+        The manifest, an option, the folder, the cluster or the history cannot be used.
+    """
+    begin = time.monotonic()
+    fleet = load_fleet(manifest)
+    store = Store(Path(folder).resolve())
+    if store.folder.exists() and not store.folder.is_dir():
+        raise OptionError(f"{folder}: expected a folder to write to, found a file")
+    if table is not None:
+        check_table(table)
+    with ExitStack() as stack:
+        notes: list[str] = []
+        past = _open_history(history, stack) if history else None
+        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=workers))
+        token = stack.enter_context(store.run())
+        if history is None:
+            try:
+                past = _open_history(default_history(store.folder), stack)
+            except OptionError as error:
+                notes.append(f"no history is kept: {error}")
+        store.keep_manifest(fleet)
+        started(len(fleet.units))
+        keeper = _Keeper(store, fleet, past, progress)
+        _work_through(machine, Job(str(store.folder), fleet.base, token), keeper)
+        keeper.flush()
+        rows = keeper.rows()
+        write_table(rows, table or store.folder / "parameters.csv")
+    return FleetState(
+        folder, fleet, rows, kept=keeper.kept, seconds=time.monotonic() - begin, notes=(*notes, *keeper.notes)
+    )  # fmt: skip
+
+
+def _open_history(url: str, stack: ExitStack) -> History | None:
+    return None if url == "none" else stack.enter_context(open_history(url))
+
+
+class _Keeper:
+    """Takes outcomes in: what is over, and what goes to folder and history."""
+
+    def __init__(
+        self, store: Store, fleet: FleetManifest, history: History | None, progress: Callable[[int], None]
+    ) -> None:
+        self.store = store
+        self.left = {unit.serial: unit for unit in fleet.units}
+        self.unseen: set[str] = set()
+        self.kept = 0
+        self.notes: list[str] = []
+        self._fleet = fleet
+        self._history = history
+        self._progress = progress
+        self._over: dict[str, Outcome] = {}
+        self._new: list[Summary] = []
+        self._flushed = time.monotonic()
+        self._before = {path.stem for path in store.folder.glob("*.json")}
+
+    def take(self, outcome: Outcome) -> None:
+        """Take one outcome in."""
+        if outcome.status == LEFT:  # a worker that has another folder of this name: it is to send the record back
+            self.unseen.add(outcome.serial)
+            return
+        unit = self.left.pop(outcome.serial, None)
+        if unit is None:
+            return
+        if outcome.text is not None:
+            write_text(self.store.record(unit.serial), outcome.text)
+        if outcome.status == FAILED and self.store.reason(unit.serial) is None:
+            self.store.fail(unit, outcome.reason)
+        # A record that was not there before was made by a process that ended before it could say so.
+        self.kept += outcome.status == KEPT and unit.serial in self._before
+        self._over[unit.serial] = replace(outcome, text=None)
+        if outcome.summary is not None:
+            self._new.append(outcome.summary)
+        if time.monotonic() - self._flushed > _FLUSH:
+            self.flush()
+        self._progress(len(self._over))
+
+    def flush(self) -> None:
+        """Hand what is new to the history."""
+        if self._history is not None:
+            try:
+                self._history.add(self._new)
+            except OptionError as error:  # the records are the truth, and the next run hands them in again
+                self._history = None
+                self.notes.append(f"the history is not complete: {error}")
+        self._new.clear()
+        self._flushed = time.monotonic()
+
+    def rows(self) -> tuple[Row, ...]:
+        """Return the state of every unit, in the order of the manifest."""
+        return tuple(
+            Row(unit, DONE if outcome.status == KEPT else outcome.status, outcome.reason, outcome.summary)
+            for unit in self._fleet.units
+            for outcome in [self._over[unit.serial]]
+        )
+
+
+def _work_through(engine: Engine, job: Job, keeper: _Keeper) -> None:
+    """Work until every unit is over; processes may end under it."""
+    fruitless = 0
+    while keeper.left:
+        before = len(keeper.left)
+        # Whatever was under work when a process ended is tried with nothing beside it, so that a unit that ends its
+        # process is told from those that happened to be near.
+        suspects = keeper.store.marked() & set(keeper.left)
+        easy = [unit for unit in keeper.left.values() if unit.serial not in suspects]
+        away = [unit for unit in easy if unit.serial in keeper.unseen]
+        try:
+            if away:
+                _take(engine.run(away, replace(job, folder=None)), keeper)
+            elif easy:
+                _take(engine.run(easy, job), keeper)
+            for serial in sorted(suspects & set(keeper.left)):
+                _take(engine.run_alone(keeper.left[serial], job), keeper)
+        except WorkersLostError as error:
+            fruitless = fruitless + 1 if len(keeper.left) == before and not suspects else 0
+            if fruitless >= _FRUITLESS:
+                raise OptionError(
+                    f"worker processes ended {fruitless} times before a unit was done ({' '.join(str(error).split())})"
+                ) from None
+
+
+def _take(outcomes: Iterator[Outcome], keeper: _Keeper) -> None:
+    with closing(outcomes):  # type: ignore[type-var]
+        for outcome in outcomes:
+            keeper.take(outcome)
+
+
+def fleet_state(folder: str) -> FleetState:
+    """Return where a fleet stands, from its records alone.
+
+    Raises
+    ------
+    OptionError
+        The folder is none of a fleet.
+    """
+    store = Store(Path(folder))
+    fleet = store.manifest()
+    return FleetState(folder, fleet, tuple(_row(store, unit) for unit in fleet.units), at_work=store.at_work())
+
+
+def _row(store: Store, unit: Unit) -> Row:
+    reason = store.reason(unit.serial)
+    if reason is not None:
+        return Row(unit, FAILED, reason, None)
+    record = store.made_for(unit)
+    if record is None:
+        return Row(unit, "missing", "", None)
+    return Row(unit, DONE, "", summarise(record, record.to_dict()))

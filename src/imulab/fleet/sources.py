@@ -1,0 +1,208 @@
+"""Files by path or URL: a cluster reads from its own storage, and every file that was used is known by its hash."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import ImulabError, ReadError
+
+if TYPE_CHECKING:
+    from imulab.calibration import Calibration
+    from imulab.readers import Layout
+    from imulab.recording import Recording
+
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[A-Za-z][A-Za-z0-9+.-]*)*://")
+_BLOCK = 1 << 22
+
+
+def is_url(name: str) -> bool:
+    """Return whether a name is a URL rather than a path."""
+    return _URL.match(name) is not None
+
+
+def parent_of(path: str) -> str:
+    """Return the folder or URL that a manifest's paths are relative to."""
+    return path.rpartition("/")[0] if is_url(path) else str(Path(path).resolve().parent)
+
+
+@contextmanager
+def local_file(address: str, name: str) -> Iterator[Path]:
+    """Give a file (or folder) as one of this machine: itself, or a copy of what a URL names, for the time of the block.
+
+    Raises
+    ------
+    ReadError
+        There is no such file, the URL cannot be opened, or fsspec is not there to open it.
+    """
+    if not is_url(address):
+        yield Path(address)
+        return
+    with tempfile.TemporaryDirectory(prefix="imulab-", ignore_cleanup_errors=True) as folder:
+        yield _fetched(address, name, Path(folder))
+
+
+def _fetched(address: str, name: str, folder: Path) -> Path:
+    try:
+        import fsspec
+    except ImportError:
+        raise ReadError(f"{name}: a URL needs fsspec: pip install 'imulab[fleet]'") from None
+    target = folder / (re.sub(r"[^\w.-]", "_", address.rstrip("/").rpartition("/")[2]) or "file")
+    try:
+        system, path = fsspec.core.url_to_fs(address)
+        if system.isdir(path):
+            system.get(path.rstrip("/") + "/", str(target) + "/", recursive=True)
+        else:
+            with system.open(path, "rb") as stream, target.open("wb") as copy:
+                shutil.copyfileobj(stream, copy, _BLOCK)
+    except FileNotFoundError:
+        raise ReadError(f"{name}: no such file") from None
+    except ImportError as error:
+        raise ReadError(f"{name}: cannot be opened: {error}") from None
+    except Exception as error:  # fsspec passes on whatever its back ends raise
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ReadError(f"{name}: cannot be read: {reason}") from None
+    return target
+
+
+def sha256_of(path: Path, name: str) -> str:
+    """Return the SHA-256 of a file's bytes, or of those of a bag's files in its order.
+
+    Raises
+    ------
+    ReadError
+        It cannot be read.
+    """
+    total = hashlib.sha256()
+    try:
+        parts: Sequence[Path] = [path]
+        if path.is_dir():
+            from imulab.readers.rosfiles import files_of
+
+            parts = files_of(path, name)
+        for part in parts:
+            with part.open("rb") as stream:
+                while data := stream.read(_BLOCK):
+                    total.update(data)
+    except FileNotFoundError:
+        raise ReadError(f"{name}: no such file") from None
+    except OSError as error:
+        raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
+    return total.hexdigest()
+
+
+class UnitFiles:
+    """Access to one unit's files for `imulab.tasks`; remembers the hash of each and what the first head says.
+
+    Attributes
+    ----------
+    inputs
+        Name to SHA-256 of every file that was used, in the order of use.
+    serials
+        Serials that heads of files state, without repetition.
+    date
+        Value of the first ``date`` at the head of a file.
+    """
+
+    def __init__(self, base: str) -> None:
+        self._base = base
+        self._stack = ExitStack()
+        self._local: dict[str, Path] = {}
+        self.inputs: dict[str, str] = {}
+        self.serials: list[str] = []
+        self.date: str | None = None
+
+    def __enter__(self) -> UnitFiles:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._stack.close()
+
+    def path(self, name: str) -> Path:
+        """Return a local path for a name, which is relative to the manifest; URLs are fetched once."""
+        if name not in self._local:
+            if is_url(name):
+                address = name
+            elif is_url(self._base):
+                address = f"{self._base}/{name}"
+            else:
+                address = str(Path(self._base) / name)
+            self._local[name] = self._stack.enter_context(local_file(address, name))
+        return self._local[name]
+
+    def sha256(self, name: str) -> str:
+        """Return the SHA-256 of a file by its name."""
+        return sha256_of(self.path(name), name)
+
+    def _layout(self, name: str | None) -> Layout | None:
+        if name is None:
+            return None
+        from imulab.readers import load_layout
+
+        self.inputs[name] = self.sha256(name)
+        return load_layout(self.path(name), name)
+
+    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+        """Read a recording in blocks."""
+        from imulab.readers import read_blocks
+
+        self.inputs[name] = self.sha256(name)
+        for number, block in enumerate(read_blocks(self.path(name), self._layout(layout), name=name)):
+            if not number:
+                self.heard(block)
+            yield block
+
+    def beside(self, name: str, file: str) -> str:
+        """Return the name of a file that file `name` names relative to itself, and note `name` as used."""
+        if name not in self.inputs:
+            self.inputs[name] = self.sha256(name)
+        if is_url(file) or (not is_url(name) and Path(file).is_absolute()):
+            return file
+        folder, slash, _ = name.rpartition("/")
+        return f"{folder}{slash}{file}"
+
+    def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
+        """Read a recording as a whole; messages and the record call it as the manifest does."""
+        from imulab.readers import read
+
+        known = self._layout(layout)
+        recording = read(self.path(name), known, name=name, **part)
+        if recording.source is not None:
+            self.inputs[name] = recording.source.sha256
+        self.heard(recording)
+        return recording
+
+    def record(self, name: str) -> Calibration:
+        """Read a calibration record."""
+        from imulab.calibration import loads
+
+        try:
+            data = self.path(name).read_bytes()
+        except FileNotFoundError:
+            raise ReadError(f"{name}: no such file") from None
+        except OSError as error:
+            raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
+        self.inputs[name] = hashlib.sha256(data).hexdigest()
+        return loads(data, name)
+
+    def heard(self, recording: Recording) -> None:
+        """Remember what the head of a recording says of unit and date."""
+        serial = recording.metadata.get("serial")
+        if serial and serial not in self.serials:
+            self.serials.append(serial)
+        if self.date is None:
+            self.date = recording.metadata.get("date")
+
+    def unchanged(self, inputs: Sequence[Any]) -> bool:
+        """Return whether every file of a record's list is there with the hash that the record states."""
+        try:
+            return bool(inputs) and all(self.sha256(item["file"]) == item["sha256"] for item in inputs)
+        except (ImulabError, KeyError, TypeError):
+            return False

@@ -1,0 +1,324 @@
+"""Statistics of a line: how a parameter spreads over the units, which stand out, what drifts, what meets its limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.calibration import Parameter
+from imulab.fleet.history import Past, sources_of
+from imulab.fleet.limits import Limits
+from imulab.fleet.work import Summary
+from imulab.recording import Array
+
+_MAD_TO_SIGMA = 1.482602218505602
+_FEWEST_FOR_OUTLIERS = 8
+_SIZES = (8, 10, 12, 15, 20, 30, 50, 100, 300, 1000, 10000)
+_BEYOND = (7.90, 6.90, 6.29, 5.92, 5.24, 4.80, 4.46, 4.31, 4.34, 4.52, 4.84)
+"""Largest robust z of so many normal values: passed by one sample in a hundred (simulated, 400 to 200 000 samples)."""
+_FEWEST_FOR_DRIFT = 8
+_SHORTEST_SPAN = 1.0 / 24
+_DRIFT_LEVEL = 0.001
+_FALSE_ALARM = 0.01
+_ONE_SIDED_95 = 1.6448536269514722
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Straight line over the date: change per day with its standard uncertainty, and whether it is beyond chance."""
+
+    per_day: float
+    standard_uncertainty: float
+    significant: bool
+    start: float
+    value_at_start: float
+    days: float
+
+
+@dataclass(frozen=True)
+class Capability:
+    """``Cpk = min(USL - mean, mean - LSL) / 3 s``, its one-sided 95 % lower bound, and the units beyond the limits."""
+
+    limits: Limits
+    cpk: float
+    at_least: float
+    beyond: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ParameterStatistics:
+    """One parameter over the units.
+
+    Attributes
+    ----------
+    procedure, name, unit
+        Which.
+    serials, values, uncertainties, days
+        Of each unit: value, standard uncertainty (nan where none is stated), date in days since 1970, shape (n,).
+    mean, deviation
+        Sample mean and standard deviation (0 for one unit).
+    median, robust_deviation
+        Median, and 1.4826 times the median absolute deviation from it.
+    z
+        Robust z of each unit, shape (n,): its distance from the median in robust deviations.
+    outlier_limit
+        What a z is beyond, either way, in one normal population out of a hundred; infinite for few units.
+    drift, capability
+        None where there are too few units, no span of dates, no limits.
+    """
+
+    procedure: str
+    name: str
+    unit: str
+    serials: tuple[str, ...]
+    values: Array
+    uncertainties: Array
+    days: Array
+    mean: float
+    deviation: float
+    median: float
+    robust_deviation: float
+    z: Array
+    outlier_limit: float
+    drift: Drift | None
+    capability: Capability | None
+
+    @property
+    def outliers(self) -> NDArray[np.bool_]:
+        """Which units stand out, shape (n,)."""
+        return np.abs(self.z) > self.outlier_limit
+
+
+@dataclass(frozen=True)
+class Change:
+    """A parameter of a unit against its last calibration.
+
+    Attributes
+    ----------
+    before
+        Date of the last calibration.
+    old, new, standard_uncertainty
+        ``u = sqrt(u_new^2 + u_old^2)``, None where one is not stated.
+    deviations
+        The same chance in a normal distribution as ``(new - old) / u`` has in Student's, with the degrees of freedom
+        of both uncertainties (Welch and Satterthwaite); None without u.
+    same_files
+        Both were made from the same files: their errors are shared, and u does not apply.
+    """
+
+    serial: str
+    procedure: str
+    name: str
+    unit: str
+    before: str
+    old: float
+    new: float
+    standard_uncertainty: float | None
+    deviations: float | None
+    same_files: bool
+
+
+def days_of(text: str) -> float | None:
+    """Return an ISO 8601 date as days since 1970 (UTC where it names no zone), or None."""
+    try:
+        found = datetime.fromisoformat(text.strip())
+    except ValueError:
+        return None
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() / 86400.0
+
+
+def outlier_limit(count: int) -> float:
+    """Return the robust z that one normal population of this size in a hundred has a unit beyond."""
+    if count < _FEWEST_FOR_OUTLIERS:
+        return math.inf
+    return float(np.interp(math.log(count), np.log(_SIZES), _BEYOND))
+
+
+def parameter_units(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
+    """Return the unit of every parameter; of records in different units, that of most."""
+    votes: dict[tuple[str, str], dict[str, int]] = {}
+    for summary in summaries:
+        for name, parameter in summary.parameters.items():
+            count = votes.setdefault((summary.procedure, name), {})
+            count[parameter.unit] = count.get(parameter.unit, 0) + 1
+    return {key: max(count, key=lambda unit: count[unit]) for key, count in votes.items()}
+
+
+def line_statistics(
+    summaries: Sequence[Summary], limits: Mapping[tuple[str, str], Limits]
+) -> list[ParameterStatistics]:
+    """Return the statistics of every parameter of every procedure, in the order of the records."""
+    found = []
+    for (procedure, name), unit in parameter_units(summaries).items():
+        mine = [
+            (summary, parameter)
+            for summary in summaries
+            if summary.procedure == procedure
+            and (parameter := summary.parameters.get(name)) is not None
+            and parameter.unit == unit
+        ]
+        found.append(
+            _statistics(
+                procedure, name, unit,
+                tuple(summary.serial for summary, _ in mine),
+                np.array([parameter.value for _, parameter in mine]),
+                np.array([_nan(parameter.standard_uncertainty) for _, parameter in mine]),
+                np.array([_day(summary) for summary, _ in mine]),
+                limits.get((procedure, name)),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _statistics(
+    procedure: str,
+    name: str,
+    unit: str,
+    serials: tuple[str, ...],
+    values: Array,
+    uncertainties: Array,
+    days: Array,
+    limits: Limits | None,
+) -> ParameterStatistics:
+    count = len(values)
+    median = float(np.median(values))
+    robust = _MAD_TO_SIGMA * float(np.median(np.abs(values - median)))
+    z = (values - median) / robust if robust > 0 else np.zeros(count)
+    limit = outlier_limit(count)
+    mean = float(values.mean())
+    deviation = float(values.std(ddof=1)) if count > 1 else 0.0
+    return ParameterStatistics(
+        procedure=procedure,
+        name=name,
+        unit=unit,
+        serials=serials,
+        values=values,
+        uncertainties=uncertainties,
+        days=days,
+        mean=mean,
+        deviation=deviation,
+        median=median,
+        robust_deviation=robust,
+        z=z,
+        outlier_limit=limit,
+        drift=line_drift(days, values, np.abs(z) <= limit),
+        capability=None if limits is None else capability(values, serials, limits),
+    )
+
+
+def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | None:
+    """Fit a straight line over the date to the units that do not stand out; None for few units or one date.
+
+    ``value = a + slope (day - mean day)``; ``u(slope) = s / sqrt(sum (day - mean)^2)``, s from the residuals.
+    """
+    day, value = days[used], values[used]
+    if len(day) < _FEWEST_FOR_DRIFT or np.ptp(day) < _SHORTEST_SPAN:
+        return None
+    from scipy.special import stdtrit
+
+    centred = day - day.mean()
+    spread = float(centred @ centred)
+    slope = float(centred @ value) / spread
+    left = value - value.mean() - slope * centred
+    freedom = len(day) - 2
+    uncertainty = math.sqrt(float(left @ left) / freedom / spread)
+    start = float(day.min())
+    return Drift(
+        per_day=slope,
+        standard_uncertainty=uncertainty,
+        significant=abs(slope) > uncertainty * float(stdtrit(freedom, 1 - _DRIFT_LEVEL / 2)),
+        start=start,
+        value_at_start=float(value.mean() + slope * (start - day.mean())),
+        days=float(np.ptp(day)),
+    )
+
+
+def capability(values: Array, serials: Sequence[str], limits: Limits) -> Capability | None:
+    """Return Cpk with the overall standard deviation; None for fewer than two units or no spread.
+
+    Source: NIST/SEMATECH e-Handbook of Statistical Methods, 6.1.6; the bound is Bissell's,
+    ``Cpk - 1.645 sqrt(1 / 9n + Cpk^2 / (2 (n - 1)))``.
+    """
+    count = len(values)
+    beyond = tuple(s for s, v in zip(serials, values.tolist(), strict=True) if not limits.lower <= v <= limits.upper)
+    spread = float(values.std(ddof=1)) if count > 1 else 0.0
+    if spread <= 0:
+        return None
+    mean = float(values.mean())
+    cpk = min(limits.upper - mean, mean - limits.lower) / (3 * spread)
+    at_least = cpk - _ONE_SIDED_95 * math.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1)))
+    return Capability(limits, cpk, at_least, beyond)
+
+
+def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past]]) -> list[Change]:
+    """Return what changed in every unit since the last calibration of the same procedure before its present one."""
+    changes = []
+    for summary in summaries:
+        last = _last(summary, past.get(summary.serial, ()))
+        if last is None:
+            continue
+        same = last.sources == sources_of(summary)
+        for name, new in summary.parameters.items():
+            old = last.parameters.get(name)
+            if old is None or old.unit != new.unit:
+                continue
+            u, z = _compared(new, summary.freedom, old, last.freedom)
+            changes.append(
+                Change(
+                    summary.serial, summary.procedure, name, new.unit, last.when, old.value, new.value, u, z, same
+                )
+            )  # fmt: skip
+    return changes
+
+
+def change_limit(count: int) -> float:
+    """Return the deviations that one in so many normal changes is beyond in one set out of a hundred."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(_FALSE_ALARM / 2 / max(count, 1)))
+
+
+def _compared(
+    new: Parameter, new_freedom: float | None, old: Parameter, old_freedom: float | None
+) -> tuple[float | None, float | None]:
+    """Return the standard uncertainty of a change, and the change in equivalent normal deviations."""
+    if new.standard_uncertainty is None or old.standard_uncertainty is None:
+        return None, None
+    u = math.hypot(new.standard_uncertainty, old.standard_uncertainty)
+    if not u > 0:
+        return None, None
+    ratio = (new.value - old.value) / u
+    parts = [(p.standard_uncertainty or 0.0, f) for p, f in ((new, new_freedom), (old, old_freedom)) if f is not None]
+    share = sum((part / u) ** 4 / freedom for part, freedom in parts)
+    if share <= 0:
+        return u, ratio
+    from scipy.special import ndtri, stdtr
+
+    chance = max(float(stdtr(1 / share, -abs(ratio))), 1e-300)
+    return u, math.copysign(-float(ndtri(chance)), ratio)
+
+
+def _last(summary: Summary, past: Sequence[Past]) -> Past | None:
+    """The calibration made last before this one; the history is in the order in which records were made."""
+    mine = [item for item in past if item.procedure == summary.procedure]
+    index = next((i for i, item in enumerate(mine) if item.content_sha256 == summary.content_sha256), None)
+    if index is None:
+        mine = [item for item in mine if item.created <= summary.created]
+        index = len(mine)
+    return mine[index - 1] if index > 0 else None
+
+
+def _day(summary: Summary) -> float:
+    day = days_of(summary.when)
+    if day is None:
+        day = days_of(summary.created)
+    return math.nan if day is None else day
+
+
+def _nan(value: float | None) -> float:
+    return math.nan if value is None else value

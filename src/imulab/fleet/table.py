@@ -1,0 +1,99 @@
+"""The table of a fleet: one row per unit with every parameter, its uncertainty, and what is to be known of it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imulab.errors import OptionError
+from imulab.files import replacing
+from imulab.fleet.manifest import Unit
+from imulab.fleet.work import Summary
+
+HEAD = ("serial", "procedure", "status", "reason", "warnings", "date", "created", "software", "files", "content_sha256")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One unit: ``done``, ``failed`` or ``missing``, with its reason or the summary of its record."""
+
+    unit: Unit
+    status: str
+    reason: str
+    summary: Summary | None
+
+
+def columns_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
+    """Return the table by columns: the head, then ``name [unit]`` and ``std_name [unit]`` of every parameter."""
+    columns: dict[str, list[Any]] = {name: [] for name in HEAD}
+    for number, row in enumerate(rows):
+        found = row.summary
+        head = (
+            row.unit.serial,
+            row.unit.procedure,
+            row.status,
+            row.reason,
+            "" if found is None else " | ".join(found.warnings),
+            "" if found is None else found.date or "",
+            "" if found is None else found.created,
+            "" if found is None else found.software,
+            ";".join(row.unit.files),
+            "" if found is None else found.content_sha256,
+        )
+        for name, value in zip(HEAD, head, strict=True):
+            columns[name].append(value)
+        for name, parameter in {} if found is None else found.parameters.items():
+            for title, number_found in (
+                (f"{name} [{parameter.unit}]", parameter.value),
+                (f"std_{name} [{parameter.unit}]", parameter.standard_uncertainty),
+            ):
+                columns.setdefault(title, [None] * len(rows))[number] = number_found
+    return columns
+
+
+def check_table(path: str) -> None:
+    """Check the name of a table before the work.
+
+    Raises
+    ------
+    OptionError
+        It ends neither in .csv nor in .parquet, polars is not there to write Parquet, or there is no such folder.
+    """
+    kind = Path(path).suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise OptionError(f"{path}: expected a table that ends in .csv or .parquet")
+    if kind == ".parquet":
+        try:
+            import polars  # noqa: F401
+        except ImportError:
+            raise OptionError(f"{path}: Parquet needs polars: pip install 'imulab[tables]'") from None
+    if not Path(path).resolve().parent.is_dir():
+        raise OptionError(f"{path}: cannot be written: no such folder")
+
+
+def write_table(rows: Sequence[Row], path: str | Path) -> None:
+    """Write the table, CSV or Parquet by the name of the file, whole or not at all; numbers read back exactly."""
+    columns = columns_of(rows)
+    if Path(path).suffix.lower() == ".parquet":
+        import polars
+
+        frame = polars.DataFrame(
+            {
+                name: polars.Series(name, values, dtype=polars.String if name in HEAD else polars.Float64)
+                for name, values in columns.items()
+            }
+        )
+        with replacing(path) as stream:
+            frame.write_parquet(stream)
+        return
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for cells in zip(*columns.values(), strict=True):
+        writer.writerow(["" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells])
+    with replacing(path) as stream:
+        stream.write(text.getvalue().encode("utf-8"))

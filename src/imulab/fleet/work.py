@@ -1,0 +1,176 @@
+"""What a worker does with one unit: nothing if its record is there, else fit and write, and say how it went."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from imulab.calibration import Calibration, Parameter, json_text
+from imulab.errors import ImulabError
+from imulab.files import write_text
+from imulab.fleet.manifest import Unit
+from imulab.fleet.sources import UnitFiles
+from imulab.fleet.store import MOST_ATTEMPTS, Store, asked_of
+from imulab.tasks import run_task
+
+DONE, KEPT, FAILED, LEFT = "done", "kept", "failed", "left"
+"""Made now; there already; refused, with a reason; not touched, because another run has taken over."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all units of a run share: the folder of the records, the base of the manifest's paths, the run's token.
+
+    Without a folder the records are sent back. `driver` is the process that started this worker, where one did: a
+    worker does not outlive it.
+    """
+
+    folder: str | None
+    base: str
+    token: str
+    driver: int | None = None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run, its table and its history need to know of a record.
+
+    `inputs` are the hashes of its files; `freedom` the degrees of freedom of its uncertainties, None where the noise
+    was known.
+    """
+
+    serial: str
+    procedure: str
+    created: str
+    date: str | None
+    software: str
+    content_sha256: str
+    inputs: tuple[str, ...]
+    parameters: Mapping[str, Parameter]
+    warnings: tuple[str, ...]
+    freedom: float | None
+
+    @property
+    def when(self) -> str:
+        """Date of the recording where its head states one, otherwise that of the record."""
+        return self.date or self.created
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one unit went; `text` is the record where the worker does not see the folder."""
+
+    serial: str
+    status: str
+    reason: str = ""
+    summary: Summary | None = None
+    text: str | None = field(default=None, repr=False)
+
+
+def work(unit: Unit, job: Job) -> Outcome:
+    """Make the record of one unit, unless it is there already and was made from the same files and options."""
+    if job.driver is not None and job.driver != os.getpid():
+        _end_with(job.driver)
+    if job.folder is None:
+        return _fit(unit, job, None)
+    store = Store(Path(job.folder))
+    with store.turn(job.token) as mine:
+        if mine is False:
+            return Outcome(unit.serial, LEFT)
+        if mine is None:
+            return _fit(unit, job, None)
+        if store.begin(unit.serial) >= MOST_ATTEMPTS:
+            reason = f"its process ended {MOST_ATTEMPTS} times while it worked on this unit (killed, or out of memory)"
+            outcome = Outcome(unit.serial, FAILED, reason)
+        else:
+            outcome = _fit(unit, job, store)
+        if outcome.status == FAILED:
+            store.fail(unit, outcome.reason)
+        store.end(unit.serial)
+        return outcome
+
+
+@cache
+def _end_with(driver: int) -> None:
+    """End this process soon after the one that started it, whatever that died of; records are whole or not there."""
+
+    def watch() -> None:
+        while os.getppid() == driver:
+            time.sleep(0.2)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _fit(unit: Unit, job: Job, store: Store | None) -> Outcome:
+    try:
+        with UnitFiles(job.base) as files:
+            if store is not None:
+                there = store.made_for(unit)
+                if there is not None and files.unchanged(there.sections["fleet"].get("inputs", ())):
+                    return Outcome(unit.serial, KEPT, summary=summarise(there, there.to_dict()))
+            record = make_record(unit, files)
+        content = record.to_dict()
+        text = json_text(content)
+        if store is not None:
+            write_text(store.record(unit.serial), text)
+        return Outcome(unit.serial, DONE, summary=summarise(record, content), text=None if store is not None else text)
+    except ImulabError as error:
+        return Outcome(unit.serial, FAILED, _one_line(str(error)))
+    except Exception as error:
+        if os.environ.get("IMULAB_DEBUG"):
+            raise
+        return Outcome(unit.serial, FAILED, _one_line(f"{type(error).__name__}: {error} (a fault of imulab)"))
+
+
+def make_record(unit: Unit, files: UnitFiles) -> Calibration:
+    """Fit a unit as the single command does, and add what it was made from."""
+    record = run_task(unit.procedure, unit.files, unit.options, files, label="column {}")
+    others = [serial for serial in files.serials if serial != unit.serial]
+    says = [
+        f"the file states serial {serial!r}, the manifest {unit.serial!r}: the manifest's is used" for serial in others
+    ]
+    made = {
+        **asked_of(unit),
+        "inputs": [{"file": name, "sha256": sha256} for name, sha256 in files.inputs.items()],
+        **({} if files.date is None else {"date": files.date}),
+    }
+    return replace(
+        record,
+        sensor={**record.sensor, "serial": unit.serial},
+        warnings=(*record.warnings, *says),
+        sections={**record.sections, "fleet": made},
+    )
+
+
+def summarise(record: Calibration, content: Mapping[str, Any]) -> Summary:
+    """Return what table and history need of a record that `make_record` has made; `content` is its `to_dict`."""
+    made = record.sections["fleet"]
+    return Summary(
+        serial=record.sensor["serial"],
+        procedure=made["procedure"],
+        created=record.created,
+        date=made.get("date"),
+        software=record.software,
+        content_sha256=str(content["content_sha256"]),
+        inputs=tuple(item["sha256"] for item in made["inputs"]),
+        parameters=dict(record.parameters),
+        warnings=record.warnings,
+        freedom=_freedom(record),
+    )
+
+
+def _freedom(record: Calibration) -> float | None:
+    freedom = record.fit.get("degrees_of_freedom")
+    estimated = str(record.fit.get("noise", "known")).startswith("estimated")
+    return float(freedom) if estimated and isinstance(freedom, int | float) and freedom > 0 else None
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

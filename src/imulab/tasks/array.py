@@ -1,0 +1,66 @@
+"""A gyro array from a recording at rest and, if there is one, a recording in motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import OptionError
+from imulab.tasks.task import Files, Task
+from imulab.texts import quantity
+
+if TYPE_CHECKING:
+    from imulab.calibration import Calibration
+    from imulab.recording import Recording
+
+
+def _array_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    name, interval = label.format("interval"), texts.get("interval")
+    ends: list[float] | None = None
+    if interval is not None:
+        ends = [quantity(part, name, "time", "s") for part in interval.split(",")]
+        if len(ends) != 2 or not ends[0] < ends[1]:
+            raise OptionError(f"{name} {interval!r}: expected START,STOP, such as 468,496")
+    return {
+        "interval": ends,
+        "averaging": quantity(texts.get("averaging", "1 s"), label.format("averaging"), "time", "s"),
+        "layout": texts.get("layout"),
+    }
+
+
+def _array_fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.gyro_array.fit import calibrate_array
+
+    still = _between(access.recording(files[0], values["layout"]), values["interval"])
+    moving = access.recording(files[1], values["layout"]) if len(files) > 1 else None
+    return calibrate_array(still, moving, averaging_time=values["averaging"]).calibration
+
+
+def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
+    """Cut a recording to an interval of its time."""
+    if ends is None:
+        return recording
+    import numpy as np
+
+    shown = f"{ends[0]:g},{ends[1]:g}"
+    if "time" not in recording:
+        raise OptionError(f"{recording.name}: interval {shown} needs a column time")
+    inside = np.flatnonzero((recording.si("time") >= ends[0]) & (recording.si("time") < ends[1]))
+    if not inside.size:
+        raise OptionError(f"{recording.name}: interval {shown}: no samples there")
+    columns = {name: values[inside] for name, values in recording.columns.items()}
+    return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
+
+
+TASK = Task(
+    procedure="gyro_array",
+    files="STILL, or STILL;MOVING",
+    count=(1, 2),
+    options=("interval", "averaging", "layout"),
+    paths=("layout",),
+    values=_array_values,
+    fit=_array_fit,
+)

@@ -1,0 +1,98 @@
+"""An accelerometer triad from one recording or table of attitudes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import OptionError
+from imulab.tasks.task import Files, Task
+from imulab.texts import chosen, quantity, whole_number
+
+if TYPE_CHECKING:
+    from imulab.calibration import Calibration
+    from imulab.tumble.record import Gravity
+
+
+def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.tumble.fit import check_options
+
+    order = texts.get("order", "auto")
+    trials = texts.get("monte_carlo")
+    values: dict[str, Any] = {
+        "order": int(order) if order.isascii() and order.isdecimal() and len(order) < 3 else order,
+        "method": texts.get("method", "norm"),
+        "loss": texts.get("loss", "square"),
+        "gravity": _gravity(texts.get("gravity"), texts.get("latitude"), texts.get("height"), label),
+        "monte_carlo": None if trials is None else whole_number(trials, label.format("monte-carlo")),
+        "prior": texts.get("prior"),
+        "layout": texts.get("layout"),
+        "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
+    }
+    check_options(values["order"], values["method"], values["loss"])
+    return values
+
+
+def _tumble_fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.segment import find_attitudes
+    from imulab.tumble.fit import fit_tumble
+
+    attitudes = find_attitudes(access.recording(files[0], values["layout"], **values["part"]))
+    return fit_tumble(
+        attitudes,
+        order=values["order"],
+        gravity=values["gravity"],
+        method=values["method"],
+        loss=values["loss"],
+        prior=None if values["prior"] is None else access.record(values["prior"]),
+        monte_carlo=values["monte_carlo"],
+        progress=progress,
+    ).calibration
+
+
+def _gravity(gravity: str | None, latitude: str | None, height: str | None, label: str) -> Gravity | float | None:
+    from imulab.gravity import normal_gravity
+    from imulab.tumble.record import Gravity
+
+    names = {name: label.format(name) for name in ("gravity", "latitude", "height")}
+    if gravity is not None:
+        if latitude is not None or height is not None:
+            raise OptionError(
+                f"{names['gravity']} together with {names['latitude']} or {names['height']}: expected one or the other"
+            )
+        return quantity(gravity, names["gravity"], "acceleration", "m/s^2")
+    if latitude is None:
+        if height is not None:
+            raise OptionError(f"{names['height']} without {names['latitude']}: expected both")
+        return None
+    angle = quantity(latitude, names["latitude"], "angle", "deg")
+    above = quantity(height, names["height"], "length", "m") if height is not None else 0.0
+    value = normal_gravity(angle, above)
+    return Gravity(value, f"normal gravity at latitude {math.degrees(angle):.6g} deg, height {above:g} m (WGS 84)")
+
+
+TASK = Task(
+    procedure="tumble",
+    files="one recording or table of attitudes",
+    count=(1, 1),
+    options=(
+        "order",
+        "method",
+        "gravity",
+        "latitude",
+        "height",
+        "loss",
+        "monte_carlo",
+        "prior",
+        "layout",
+        "topic",
+        "instance",
+        "window",
+    ),
+    paths=("prior", "layout"),
+    values=_tumble_values,
+    fit=_tumble_fit,
+)

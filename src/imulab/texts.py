@@ -1,0 +1,83 @@
+"""Texts of options, as a person writes them on the command line or in a manifest, to values in SI."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from imulab.errors import OptionError, UnitError
+from imulab.units import parse_unit, to_si
+
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
+
+
+def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
+    """Return a text such as ``0.7mg`` or ``5 s`` in SI.
+
+    Raises
+    ------
+    OptionError
+        It is no number with a unit of this kind.
+    """
+    match = _QUANTITY.fullmatch(text)
+    expected = f"{option} {text!r}: expected a number, or one with a unit of {kind} such as 1 {default_unit}"
+    if match is None:
+        raise OptionError(expected)
+    try:
+        unit = parse_unit(match[2].strip() if match[2] else default_unit)
+    except UnitError as error:
+        raise OptionError(f"{option} {text!r}: {error}") from None
+    if unit.quantity != kind:
+        raise OptionError(expected)
+    return to_si(float(match[1]), unit.symbol)
+
+
+def whole_number(text: str, option: str) -> int:
+    """Return a text as a whole number.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        raise OptionError(f"{option} {text!r}: expected a whole number") from None
+
+
+def chosen(topic: str | None, instance: str | None, window: str | None, label: str = "--{}") -> dict[str, Any]:
+    """Return the options of `read` that choose a part of a file; `label` is how messages call an option.
+
+    Raises
+    ------
+    OptionError
+        The instance is no number, or the window is not FROM:TO.
+    """
+    part: tuple[float | None, ...] | None = None
+    if window is not None:
+        name = label.format("window")
+        ends = window.split(":")
+        if len(ends) != 2 or not any(end.strip() for end in ends):
+            raise OptionError(f"{name} {window!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
+        part = tuple(quantity(end, name, "time", "s") if end.strip() else None for end in ends)
+    number = None if instance is None else whole_number(instance, label.format("instance"))
+    return {"topic": topic, "instance": number, "window": part}
+
+
+def number(text: str, option: str) -> float:
+    """Return a text as a finite number.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not math.isfinite(value):
+        raise OptionError(f"{option} {text!r}: expected a number")
+    return value

@@ -1,0 +1,168 @@
+"""History: SQLite by default, PostgreSQL where a server can be started; the next run knows the last."""
+
+import csv
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from fleets import attitudes, make_fleet, write_attitudes, write_manifest
+from imulab.cli import main
+from imulab.errors import OptionError
+from imulab.fleet.history import open_history
+from imulab.fleet.run import run_fleet
+
+
+def run(manifest, folder, **options):
+    return run_fleet(str(manifest), str(folder), workers=1, **options)
+
+
+def again(folder, units):
+    for i in range(units):
+        write_attitudes(folder / f"u{i}.csv", attitudes(500 + i))
+
+
+def check_history(manifest, out, url):
+    """Two calibrations of three units, and one of them a third time: each is there once, oldest first, exactly."""
+    first = run(manifest, out, history=url)
+    run(manifest, out, history=url)
+    again(manifest.parent, 3)
+    second = run(manifest, out, history=url)
+    with open_history(url) as history:
+        past = history.of([f"SN00{i}" for i in range(3)] + ["SN999"])
+    assert set(past) == {"SN000", "SN001", "SN002"}
+    for row, other in zip(first.rows, second.rows, strict=True):
+        kept = past[row.unit.serial]
+        assert [item.content_sha256 for item in kept] == [s.summary.content_sha256 for s in (row, other)]
+        assert kept[0].parameters == row.summary.parameters  # to the last bit
+        assert kept[0].freedom == row.summary.freedom
+        assert kept[0].sources != kept[1].sources
+
+
+def test_sqlite_in_the_folder_is_the_default(tmp_path):
+    manifest = make_fleet(tmp_path / "in", 3, order=1)
+    run(manifest, tmp_path / "out")
+    assert (tmp_path / "out" / "history.sqlite").is_file()
+    check_history(manifest, tmp_path / "again", f"sqlite:///{tmp_path / 'line.sqlite'}")
+    assert not (tmp_path / "again" / "history.sqlite").exists()
+
+
+def test_no_history_on_request(tmp_path):
+    run(make_fleet(tmp_path / "in", 1, order=1), tmp_path / "out", history="none")
+    assert not (tmp_path / "out" / "history.sqlite").exists()
+
+
+def test_a_history_that_lost_a_run_is_filled_by_the_next(tmp_path):
+    """The driver may be killed between record and history: the record is the truth."""
+    manifest = make_fleet(tmp_path / "in", 2, order=1)
+    run(manifest, tmp_path / "out")
+    (tmp_path / "out" / "history.sqlite").unlink()
+    assert run(manifest, tmp_path / "out").kept == 2
+    with open_history(f"sqlite:///{tmp_path / 'out' / 'history.sqlite'}") as history:
+        assert [len(items) for items in history.of(["SN000", "SN001"]).values()] == [1, 1]
+
+
+def test_a_file_that_is_no_history_is_refused_with_its_name(tmp_path, capsys):
+    manifest = make_fleet(tmp_path / "in", 1, order=1)
+    (tmp_path / "bad.sqlite").write_text("this is text, and no database at all")
+    url = f"sqlite:///{tmp_path / 'bad.sqlite'}"
+    assert main(["fleet", "run", str(manifest), "-o", str(tmp_path / "out"), "--history", url]) == 2
+    assert capsys.readouterr().err == f"imulab: history {url}: file is not a database\n"
+    assert not (tmp_path / "out").exists()
+    other = tmp_path / "other.sqlite"
+    engine = create_engine(f"sqlite:///{other}")
+    with engine.begin() as connection:
+        connection.execute(text("CREATE TABLE imulab_calibrations (id INTEGER)"))
+    engine.dispose()
+    assert main(["fleet", "run", str(manifest), "-o", str(tmp_path / "out"), "--history", f"sqlite:///{other}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "other.sqlite: " in error
+
+
+@pytest.fixture(scope="module")
+def postgres():
+    """URL of a private PostgreSQL server on the loopback, run by a user other than root."""
+    found = [shutil.which("postgres"), *sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))]
+    programs = [Path(path).parent for path in found if path]
+    if not programs:
+        pytest.skip("no PostgreSQL server on this machine (Debian package postgresql)")
+    pytest.importorskip("psycopg")
+    user = {}
+    if os.geteuid() == 0:
+        user = {"user": "nobody", "group": "nogroup"}
+        try:
+            subprocess.run(["true"], check=True, **user)
+        except (LookupError, ValueError, PermissionError):
+            pytest.skip("PostgreSQL does not run as root, and there is no user nobody")
+    folder = Path(tempfile.mkdtemp(prefix="imulab-postgres-"))
+    if user:
+        shutil.chown(folder, **user)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    run_as = {"cwd": folder, "check": True, "capture_output": True, **user}
+    data = str(folder / "data")
+    subprocess.run(
+        [programs[-1] / "initdb", "-D", data, "-U", "line", "--auth=trust", "--no-sync", "-E", "UTF8"], **run_as
+    )
+    options = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={folder} -c fsync=off"
+    pg_ctl = [programs[-1] / "pg_ctl", "-D", data, "-w", "-l", str(folder / "log")]
+    subprocess.run([*pg_ctl, "-o", options, "start"], **run_as)
+    yield f"postgresql://line@127.0.0.1:{port}/postgres"
+    subprocess.run([*pg_ctl, "-m", "immediate", "stop"], **run_as)
+    shutil.rmtree(folder)
+
+
+def test_postgresql(tmp_path, postgres):
+    manifest = make_fleet(tmp_path / "in", 3, order=1)
+    check_history(manifest, tmp_path / "out", postgres)
+    assert not (tmp_path / "out" / "history.sqlite").exists()
+    assert main(["fleet", "report", str(tmp_path / "out"), "-o", str(tmp_path / "r.html"), "--history", postgres]) == 0
+    assert "change since each unit" in (tmp_path / "r.html").read_text()
+
+
+def test_two_lines_write_into_one_history(tmp_path, postgres):
+    """Folders of two lines, one unit on both: each calibration is there once."""
+    rows = [{"serial": "BOTH", "procedure": "tumble", "file": "u.csv", "order": "1"}]
+    for line in ("a", "b"):
+        (tmp_path / line).mkdir()
+        write_attitudes(tmp_path / line / "u.csv", attitudes(900 + ord(line)))
+        run(write_manifest(tmp_path / line / "m.csv", rows), tmp_path / line / "out", history=postgres)
+    with open_history(postgres) as history:
+        assert len(history.of(["BOTH"])["BOTH"]) == 2
+
+
+def test_an_unreachable_postgresql_is_reported_without_its_password(tmp_path, capsys):
+    pytest.importorskip("psycopg")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    manifest = make_fleet(tmp_path / "in", 1, order=1)
+    url = f"postgresql://line:secret@127.0.0.1:{port}/x"
+    assert main(["fleet", "run", str(manifest), "-o", str(tmp_path / "out"), "--history", url]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"imulab: history postgresql://line:***@127.0.0.1:{port}/x: " in error
+    assert "secret" not in error
+
+
+def test_the_table_is_written_where_the_history_fails(tmp_path):
+    manifest = make_fleet(tmp_path / "in", 1, order=1)
+    run(manifest, tmp_path / "out")
+    (tmp_path / "out" / "parameters.csv").unlink()
+    (tmp_path / "out" / "history.sqlite").write_text("gone bad, and no database any more, as one sees")
+    state = run(manifest, tmp_path / "out")
+    assert state.notes[0].startswith("no history is kept: history sqlite:///")
+    with (tmp_path / "out" / "parameters.csv").open() as stream:
+        assert [row["status"] for row in csv.DictReader(stream)] == ["done"]
+
+
+def test_a_history_needs_a_url():
+    with pytest.raises(OptionError, match="expected a URL such as sqlite"), open_history("history.sqlite"):
+        pass
