@@ -85,7 +85,7 @@ def test_apply_takes_the_drift_out_of_the_test_s_own_recording(record):
 
 
 def test_apply_refuses_what_it_cannot_correct(record):
-    with pytest.raises(RecordError, match="no x_direction: it was made without table_angle"):
+    with pytest.raises(RecordError, match="no x_direction: it was reduced without table_angle"):
         il.apply(record_of(False), flight())
     with pytest.raises(DataError, match=r"flight.csv: no column dtg_x or dtg_y; found time fog"):
         il.apply(
@@ -102,6 +102,17 @@ def test_apply_refuses_what_it_cannot_correct(record):
         il.apply(record, lame)
     with pytest.raises(RecordError, match="no curve for dtg_y"):
         il.apply(record_of(y=None), flight())
+
+
+def test_a_record_without_direction_is_refused_by_its_name(imulab, tmp_path):
+    record_of(False).save(tmp_path / "r.json")
+    il.write_csv(flight(), tmp_path / "f.csv")
+    for command in (["apply", "r.json", "f.csv", "-o", "c.csv"], ["export", "--to", "c", "r.json", "-o", "fw"]):
+        done = imulab(*command)
+        assert done.returncode == 2
+        assert done.stderr.startswith("imulab: r.json: the record has no x_direction: it was reduced without table_angle")
+        assert done.stderr.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["f.csv", "r.json"]
 
 
 def test_apply_warns_once_beyond_the_highest_level(record, imulab, tmp_path):

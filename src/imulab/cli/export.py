@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.options import whole_number
+from imulab.cli.options import naming, whole_number
 from imulab.errors import OptionError
 
 _DEVICE_IDS = 2**32
@@ -28,6 +28,7 @@ def export(
     from imulab.calibration import load
     from imulab.exporters import EXPORTERS, ExportOptions
     from imulab.exporters import export as write
+    from imulab.tables import tables_of
 
     if to not in EXPORTERS:
         raise OptionError(f"--to {to!r}: unknown target; known targets: {' '.join(EXPORTERS)}")
@@ -37,7 +38,12 @@ def export(
     if not output or (Path(output).exists() and not Path(output).is_dir()):
         raise OptionError(f"{output!r}: expected a folder to write to, found a file")
     options = ExportOptions(lossy=lossy, device_id=number, noise=_noise(noise) if noise else {})
-    for file in write(to, [load(name) for name in records], output, options):
+    loaded = [load(name) for name in records]
+    if to in ("c", "blob"):
+        for name, record in zip(records, loaded, strict=True):
+            with naming(name):
+                tables_of(record)
+    for file in write(to, loaded, output, options):
         print(f"{to}: {file}")
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.errors import OptionError, ReadError
+from imulab.errors import ImulabError, OptionError, ReadError
 from imulab.texts import chosen as chosen
 from imulab.texts import quantity as quantity
 from imulab.texts import whole_number as whole_number
@@ -119,6 +119,17 @@ def is_json(file: str) -> bool:
         raise ReadError(f"{file}: no such file") from None
     except OSError as error:
         raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
+
+
+@contextmanager
+def naming(file: str) -> Iterator[None]:
+    """Put the name of a file in front of what is refused for its sake, where the message does not have it."""
+    try:
+        yield
+    except ImulabError as error:
+        if str(error).startswith(file):
+            raise
+        raise type(error)(f"{file}: {error}") from None
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from imulab.cli.options import (
     chosen,
     heard,
     is_json,
+    naming,
     warn,
 )
 from imulab.errors import ImulabError, OptionError
@@ -46,7 +47,7 @@ def apply(
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
-    from imulab.applying import apply_blocks
+    from imulab.applying import apply_blocks, loaded
     from imulab.blob import load_any
     from imulab.readers import read_blocks
 
@@ -56,6 +57,9 @@ def apply(
     check_outputs([output], files)
     part = chosen(topic, instance, window)
     records = [load_any(name) for name in names]
+    for name, record in zip(names, records, strict=True):
+        with naming(name):
+            loaded(record)
     blocks = heard(read_blocks(file, layout, **part), notes=False)
     write_out(apply_blocks(records, _warned(records, blocks)), output)
 
