@@ -404,3 +404,36 @@ def test_a_flight_log_is_fitted_where_the_vehicle_stood_still():
     time = np.arange(0, 300.0)
     want = evaluate(il.fit_warmup(cut, **options).table, time, 10.0)
     np.testing.assert_allclose(evaluate(fit.table, time, 10.0), want, atol=2 * HOUR)
+
+
+def test_a_log_that_is_flight_for_the_most_part_is_fitted_where_it_stood_still():
+    """350 s at rest and 1250 s of flight, whose turns move the bins' means too: the same table as from the rest."""
+    rng = np.random.default_rng(8)
+    logs, cut = [], []
+    for t in (0, 20):
+        for c in (1, 2):
+            whole = cycle_of(lambda s, t=t: (1 + t / 40) * flat(s), t, name=f"log{t}{c}", duration=1600)
+            time = whole.column("time")
+            turns = 0.5 * np.sin(time / 9) + 0.05 * rng.standard_normal(len(time))
+            flying = np.where(time > 350, turns, 0.0)
+            noise = 1e-6 * rng.standard_normal((2, len(time)))
+            columns = {axis: whole.column(axis) + flying + noise[i] for i, axis in enumerate(("gyro_x", "accel_x"))}
+            logs.append(whole.with_columns(columns, {}))
+            early = {name: values[time < 349] for name, values in logs[-1].columns.items()}
+            cut.append(replace(logs[-1], columns=early))
+    options = {"temperatures": [0, 20], "settling_time": END, "model": "knot-log-cubic"}
+    fit = il.fit_warmup(logs, **options)
+    assert any("log01 (1251 s, first at 349 s)" in message for message in fit.calibration.warnings)
+    time = np.arange(0, 300.0)
+    want = evaluate(il.fit_warmup(cut, **options).table, time, 10.0)
+    np.testing.assert_allclose(evaluate(fit.table, time, 10.0), want, atol=2 * HOUR)
+
+
+def test_a_cycle_that_moves_throughout_is_known_by_the_others():
+    rng = np.random.default_rng(9)
+    cycles = [cycle_of(flat, t, name=f"c{t}{c}") for t in (0, 20) for c in (1, 2)]
+    for cycle in cycles:
+        cycle.columns["gyro_x"] += 1e-6 * rng.standard_normal(len(cycle))
+    cycles[2].columns["gyro_x"] += 1e-4 * rng.standard_normal(len(cycles[2]))
+    with pytest.raises(DataError, match="c201: the unit moved from 0 s on: 0 s at rest are too few"):
+        il.fit_warmup(cycles, temperatures=[0, 20], settling_time=END)
