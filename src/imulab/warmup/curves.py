@@ -180,8 +180,11 @@ def make_curves(
     still = [_still(cycle, level) for cycle, level in zip(cycles, quiet_levels(cycles), strict=True)]
     end = np.array([bins.stop[-1] for bins, _ in still])
     settled = True
-    if settling_time is None:
-        settling_time, settled = _choose_settling_time(cycles, [bins for bins, _ in still], group, end, limit)
+    serials = [cycle.serial or "" for cycle in cycles]
+    unit = np.array([sorted(set(serials)).index(serial) for serial in serials])
+    if settling_time is None:  # the longest over temperatures and units
+        _, each = np.unique(unit * len(temperatures) + group, return_inverse=True)
+        settling_time, settled = _choose_settling_time(cycles, [bins for bins, _ in still], each, end, limit)
     for cycle, (bins, _) in zip(cycles, still, strict=True):
         early = int((bins.stop <= settling_time + _NEARLY).sum())
         if early < _FEWEST:
@@ -205,13 +208,12 @@ def make_curves(
         nodes[i, where], shares[i, where] = wide.nodes, wide.shares
         seconds[i, where] = wide.count / np.median(bins.count)
         mean[i, where] = wide.mean - reference[i]
-    serials = [cycle.serial or "" for cycle in cycles]
     curves = Curves(
         cycles=tuple(cycles),
         temperatures=temperatures,
         group=group,
         power_on=np.array([cycle.temperature for cycle in cycles]),
-        unit=np.array([sorted(set(serials)).index(serial) for serial in serials]),
+        unit=unit,
         settling_time=settling_time,
         edges=edges,
         nodes=nodes,
@@ -323,7 +325,7 @@ def _choose_settling_time(
 ) -> tuple[float, bool]:
     """Return the first time after which every mean curve stays below its limit, rounded up to 10 s, and whether any is.
 
-    The curves are referenced to what follows that time, so that it is found by iteration from three quarters of the
+    There is a curve for each group: a temperature of a unit. They are referenced to what follows that time, so that it is found by iteration from three quarters of the
     shortest cycle.
     """
     shortest = float(np.floor(end.min()))
