@@ -7,7 +7,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.options import AsJson, LayoutFile, OutputFile, ReportFile, check_outputs, quantity, warn, whole_number
+from imulab.cli.options import (
+    AsJson,
+    Instance,
+    LayoutFile,
+    OutputFile,
+    ReportFile,
+    Topic,
+    Window,
+    check_outputs,
+    chosen,
+    heard,
+    quantity,
+    warn,
+    whole_number,
+)
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
@@ -128,6 +142,9 @@ def simulate(
 def fit(
     files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings, one power cycle each.")],
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     model: Annotated[
         str, typer.Option(help="auto, interval-cubic, knot-cubic, knot-log-cubic or exponential.")
     ] = "auto",
@@ -162,6 +179,7 @@ def fit(
     from imulab.warmup.fit import fit_warmup
 
     check_outputs([output, report], [*files, *([layout] if layout else [])])
+    part = chosen(topic, instance, window)
     latest = quantity(latest_start, "--latest-start", "time", "s")
     options: dict[str, Any] = {
         "temperatures": temperature_list(temperatures),
@@ -169,10 +187,11 @@ def fit(
         "settling_time": None if settling_time is None else quantity(settling_time, "--settling-time", "time", "s"),
         "settling_limit": _limit(settling_limit),
         "taper_time": quantity(taper_time, "--taper-time", "time", "s"),
-        "axes": None if axes is None else [name.strip() for name in axes.split(",")],
+        "axes": None if axes is None else _names(axes, "--axes"),
     }
     cycles = [
-        read_cycle(name, layout, latest_start=latest, temperature_from_column=temperature_column) for name in files
+        read_cycle(name, layout, part, latest_start=latest, temperature_from_column=temperature_column)
+        for name in files
     ]
     result = fit_warmup(cycles, model=model, exit_rule=exit_rule, pool=pool, **options)
     finish(result.calibration, output, report, json=json)
@@ -183,16 +202,18 @@ def table(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Table (.csv) or record to write.")],
 ) -> None:
     """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
+    from imulab.blob import is_blob
     from imulab.calibration import load
     from imulab.cli.options import is_json
     from imulab.files import write_text
     from imulab.warmup.spreadsheet import read_table, record_of_table, write_table
 
     check_outputs([output], [file])
-    if is_json(file):
+    if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason
+        text = write_table(load(file))
         if not output.lower().endswith(".csv"):
             raise OptionError(f"{output}: expected a name that ends in .csv")
-        write_text(output, write_table(load(file)))
+        write_text(output, text)
         print(f"table: {output}")
         return
     if output.lower().endswith(".csv"):
@@ -201,14 +222,16 @@ def table(
     print(f"record: {output}")
 
 
-def read_cycle(name: str, layout: str | None = None, *, latest_start: float, temperature_from_column: bool) -> Cycle:
-    """Read one power cycle block by block."""
+def read_cycle(
+    name: str, layout: str | None, part: dict[str, Any], *, latest_start: float, temperature_from_column: bool
+) -> Cycle:
+    """Read one power cycle, or a part of the file (see `chosen`), block by block."""
     from imulab.readers import load_layout, read_blocks
     from imulab.warmup.cycles import find_power_cycle
 
     shape = load_layout(layout) if layout else None
     return find_power_cycle(
-        read_blocks(name, shape),
+        heard(read_blocks(name, shape, **part), notes=False),
         latest_start=latest_start,
         temperature_from_column=temperature_from_column,
         source=_source(name),
@@ -240,6 +263,13 @@ def temperature_list(text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         raise OptionError(f"--temperatures {text!r}: expected numbers such as -40,-30,0") from None
+
+
+def _names(text: str, option: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise OptionError(f"{option} {text!r}: expected names of columns, each once, such as gyro_x,gyro_y")
+    return names
 
 
 def _number(text: str, option: str) -> float:

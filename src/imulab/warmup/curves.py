@@ -325,8 +325,8 @@ def _choose_settling_time(
 ) -> tuple[float, bool]:
     """Return the first time after which every mean curve stays below its limit, rounded up to 10 s, and whether any is.
 
-    There is a curve for each group: a temperature of a unit. They are referenced to what follows that time, so that it is found by iteration from three quarters of the
-    shortest cycle.
+    There is a curve for each group: a temperature of a unit. They are referenced to what follows that time, so that it
+    is found by iteration from three quarters of the shortest cycle.
     """
     shortest = float(np.floor(end.min()))
     latest = 10.0 * np.floor((shortest - SETTLED) / 10)
