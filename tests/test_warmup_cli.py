@@ -173,6 +173,7 @@ def test_the_table_goes_through_a_spreadsheet_to_the_last_bit(chamber, tmp_path,
         ("-20.0,0.0,gyro_x", "-20.0,-1.0,gyro_x", "no row for gyro_y"),
         ("rad/s,", "rad/s,x", "line 7: expected a number, found 'x"),
         ("-20.0,0.0,gyro_x,", "-20.0,0.0,gyro_x,,", "line 7: expected 8 fields, found 9"),
+        ("unit,c0,c1,c2,c3", "unit,c3,c2,c1,c0", "line 6: expected the titles from [degC],to [degC],axis,unit,c0,c1"),
     ],
 )
 def test_a_damaged_spreadsheet_is_refused(chamber, tmp_path, old, new, words, capsys):
@@ -183,6 +184,35 @@ def test_a_damaged_spreadsheet_is_refused(chamber, tmp_path, old, new, words, ca
     (tmp_path / "t.csv").write_text(text.replace(old, new, 1))
     assert words in refused(capsys, "warmup", "table", tmp_path / "t.csv", "-o", tmp_path / "t.json")
     assert not (tmp_path / "t.json").exists()
+
+
+def test_a_spreadsheet_of_four_time_constants_is_refused_since_no_unit_holds_it(tmp_path, capsys):
+    lines = ["# model: exponential", "# settling_time: 300 s", "# time_constants: 10 20 40 80 s"]
+    lines += ["temperature [degC],axis,unit,A1,A2,A3,A4"]
+    lines += [f"{t},gyro_x,deg/h,1,2,3,4" for t in (0, 20)]
+    (tmp_path / "t.csv").write_text("\n".join(lines) + "\n")
+    message = refused(capsys, "warmup", "table", tmp_path / "t.csv", "-o", tmp_path / "t.json")
+    assert "time_constants 10 20 40 80; expected one to 3" in message
+    assert not (tmp_path / "t.json").exists()
+
+
+def test_table_refuses_a_blob_with_the_reason(chamber, tmp_path, capsys):
+    assert main(["export", "--to", "blob", str(chamber / "auto.json"), "-o", str(tmp_path)]) == 0
+    capsys.readouterr()
+    for name in ("t.csv", "t.json"):
+        message = refused(capsys, "warmup", "table", tmp_path / "unit.blob", "-o", tmp_path / name)
+        assert "unit.blob: a blob, which holds a unit's numbers without uncertainties" in message
+
+
+def test_a_window_chooses_the_part_of_each_file(chamber, tmp_path):
+    files = sorted(map(str, chamber.glob("cycle*.csv")))
+    options = [*SMALL, "--settling-time", "300", "--model", "knot-cubic"]
+    assert main(["warmup", "fit", *files, *options, "--window", ":400", "-o", str(tmp_path / "w.json")]) == 0
+    windowed = il.load(tmp_path / "w.json")
+    assert {round(cycle["end"]) for cycle in windowed.data["cycles"]} <= {400, 401}
+    recordings = [il.read(file, window=(None, 400.0)) for file in files]
+    same = il.fit_warmup(recordings, temperatures=[-20, 0, 20], settling_time=300, model="knot-cubic")
+    np.testing.assert_allclose(windowed.sections["table"]["coefficients"], same.table.coefficients, rtol=1e-9)
 
 
 def test_plan_writes_the_programme_and_says_what_is_missing(tmp_path, capsys):
@@ -217,6 +247,13 @@ def test_plan_writes_the_programme_and_says_what_is_missing(tmp_path, capsys):
         (["fit", "nowhere.csv"], "nowhere.csv: no such file"),
         (["fit", "nowhere.csv", "--settling-time", "5 m"], "--settling-time"),
         (["fit", "nowhere.csv", "-o", "no/such/r.json"], "no such folder"),
+        (
+            ["fit", "nowhere.csv", "--axes", "gyro_x,gyro_x"],
+            "--axes 'gyro_x,gyro_x': expected names of columns, each once",
+        ),
+        (["fit", "nowhere.csv", "--axes", ""], "--axes ''"),
+        (["fit", "nowhere.csv", "--instance", "first"], "--instance"),
+        (["fit", "nowhere.csv", "--window", "10"], "--window '10': expected FROM:TO"),
         (["table", "nowhere.json", "-o", "t.csv"], "nowhere.json: no such file"),
     ],
 )

@@ -67,13 +67,20 @@ class Unit:
         return out, _runtime.centrifuge(self._unit, _columns(force), tuple(out))
 
     def warmup(
-        self, temperature: float, tick: float, ticks: NDArray[np.uint32], output: Sequence[Array | None]
+        self,
+        temperature: float,
+        tick: float,
+        ticks: NDArray[np.uint32],
+        output: Sequence[Array | None],
+        *,
+        in_place: bool = False,
     ) -> tuple[list[Array | None], bool]:
         """Return outputs less the warm-up bias, and whether the table covers the power-on temperature, degC.
 
         `ticks` counts time since power-on in ticks of `tick` seconds; None stands for a column that is not there.
+        The columns given are left as they are, unless `in_place`.
         """
-        out = [None if column is None else np.array(column, dtype=np.float64) for column in output]
+        out = list(output) if in_place else [None if c is None else np.array(c, dtype=np.float64) for c in output]
         count = np.ascontiguousarray(ticks, dtype=np.uint32)
         return out, _runtime.warmup(self._unit, float(temperature), float(tick), count, tuple(out))
 

@@ -72,11 +72,11 @@ class GivenFiles:
 
         return load(name)
 
-    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
-        """Read a recording in blocks."""
+    def blocks(self, name: str, layout: str | None, **part: Any) -> Iterator[Recording]:
+        """Read a recording in blocks, and warn where it was cut."""
         from imulab.readers import read_blocks
 
-        return read_blocks(name, layout)
+        return heard(read_blocks(name, layout, **part), notes=False)
 
     def path(self, name: str) -> Path:
         """Return the path of a file."""

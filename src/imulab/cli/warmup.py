@@ -10,9 +10,12 @@ import typer
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
+    Instance,
     LayoutFile,
     OutputFile,
     ReportFile,
+    Topic,
+    Window,
     check_outputs,
     quantity,
     warn,
@@ -134,6 +137,9 @@ def simulate(
 def fit(
     files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings, one power cycle each.")],
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     model: Annotated[
         str, typer.Option(help="auto, interval-cubic, knot-cubic, knot-log-cubic or exponential.")
     ] = "auto",
@@ -181,6 +187,9 @@ def fit(
         "latest_start": latest_start,
         "temperature_column": "yes" if temperature_column else "no",
         "layout": layout,
+        "topic": topic,
+        "instance": instance,
+        "window": window,
     }
     finish(run_task("warmup", files, options, GivenFiles()), output, report, json=json)
 
@@ -190,16 +199,18 @@ def table(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Table (.csv) or record to write.")],
 ) -> None:
     """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
+    from imulab.blob import is_blob
     from imulab.calibration import load
     from imulab.cli.options import is_json
     from imulab.files import write_text
     from imulab.warmup.spreadsheet import read_table, record_of_table, write_table
 
     check_outputs([output], [file])
-    if is_json(file):
+    if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason
+        text = write_table(load(file))
         if not output.lower().endswith(".csv"):
             raise OptionError(f"{output}: expected a name that ends in .csv")
-        write_text(output, write_table(load(file)))
+        write_text(output, text)
         print(f"table: {output}")
         return
     if output.lower().endswith(".csv"):

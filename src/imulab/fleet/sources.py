@@ -149,12 +149,12 @@ class UnitFiles:
         self.inputs[name] = self.sha256(name)
         return load_layout(self.path(name), name)
 
-    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+    def blocks(self, name: str, layout: str | None, **part: Any) -> Iterator[Recording]:
         """Read a recording in blocks."""
         from imulab.readers import read_blocks
 
         self.inputs[name] = self.sha256(name)
-        for number, block in enumerate(read_blocks(self.path(name), self._layout(layout), name=name)):
+        for number, block in enumerate(read_blocks(self.path(name), self._layout(layout), name=name, **part)):
             if not number:
                 self.heard(block)
             yield block

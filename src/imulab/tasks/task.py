@@ -22,7 +22,7 @@ class Files(Protocol):
     def record(self, name: str) -> Calibration:
         """Return a calibration record."""
 
-    def blocks(self, name: str, layout: str | None) -> Iterator[Recording]:
+    def blocks(self, name: str, layout: str | None, **part: Any) -> Iterator[Recording]:
         """Return a recording in blocks; options as for `imulab.read_blocks`."""
 
     def path(self, name: str) -> Path:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
 from imulab.tasks.task import Files, Task, source_of
-from imulab.texts import number, quantity
+from imulab.texts import chosen, number, quantity
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
@@ -38,7 +38,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "exit_rule": texts.get("exit", "zero"),
         "taper_time": quantity(texts.get("taper_time", "60 s"), name("taper-time"), "time", "s"),
         "pool": texts.get("pool", "unit"),
-        "axes": None if axes is None else [axis.strip() for axis in axes.split(",")],
+        "axes": None if axes is None else _names(axes, name("axes")),
     }
     check_options(
         *(
@@ -51,6 +51,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "latest_start": quantity(texts.get("latest_start", "5 s"), name("latest-start"), "time", "s"),
         "temperature_column": _SWITCH[column],
         "layout": texts.get("layout"),
+        "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
     }
 
 
@@ -62,7 +63,7 @@ def _fit(
 
     def cycle(name: str) -> Cycle:
         return find_power_cycle(
-            access.blocks(name, values["layout"]),
+            access.blocks(name, values["layout"], **values["part"]),
             latest_start=values["latest_start"],
             temperature_from_column=values["temperature_column"],
             source=source_of(access, name),
@@ -83,6 +84,13 @@ def temperature_list(text: str, option: str = "--temperatures") -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         raise OptionError(f"{option} {text!r}: expected numbers such as -40,-30,0") from None
+
+
+def _names(text: str, option: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise OptionError(f"{option} {text!r}: expected names of columns, each once, such as gyro_x,gyro_y")
+    return names
 
 
 def _limit(text: str, option: str) -> dict[str, float]:
@@ -119,6 +127,9 @@ TASK = Task(
         "latest_start",
         "temperature_column",
         "layout",
+        "topic",
+        "instance",
+        "window",
     ),
     paths=("layout",),
     values=_values,

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.calibration import Calibration
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.recording import Recording
+from imulab.recording import Array, Recording
 from imulab.runtime import Unit
 from imulab.units import conversion_factor
 from imulab.warmup.model import Table, table_from
@@ -17,6 +18,7 @@ from imulab.warmup.poweron import power_on_temperature
 
 _TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
 _LAST_TICK = 2**32 - 1
+_PIECE = 8192  # samples at a time: what is between input and output stays in the cache
 
 
 def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -48,23 +50,35 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     if temperature is None:
         return recording
     tick = _TICK if columns["end"] < _LONG else _LONG_TICK
-    known = np.isfinite(time)
-    ticks = np.clip(np.rint(np.where(known, time, 0.0) / tick), 0, _LAST_TICK).astype(np.uint32)
-    # In the unit of the table the core subtracts at once; in another one its curve is scaled first.
-    direct = [factor == 1.0 for factor in factors]
-    given = [
-        recording.columns[axis] if alike else np.zeros(len(recording))
-        for axis, alike in zip(columns["axes"], direct, strict=True)
-    ]
-    taken, active = unit.warmup(temperature, tick, ticks, given)
-    if not active:
-        return recording
-    corrected = {}
-    for axis, alike, factor, values in zip(columns["axes"], direct, factors, taken, strict=True):
-        assert values is not None
-        column = values if alike else recording.columns[axis] + factor * values
-        corrected[axis] = column if known.all() else np.where(known, column, np.nan)
+    axes = list(columns["axes"])
+    corrected = {axis: np.empty(len(recording)) for axis in axes}
+    for start in range(0, len(recording), _PIECE):
+        piece = slice(start, start + _PIECE)
+        ticks, unknown = _ticks(time[piece], tick)
+        for axis, factor in zip(axes, factors, strict=True):
+            # In the unit of the table the core subtracts at once; in another one its curve is scaled first.
+            corrected[axis][piece] = recording.columns[axis][piece] if factor == 1.0 else 0.0
+        given = [corrected[axis][piece] for axis in axes]
+        _, active = unit.warmup(temperature, tick, ticks, given, in_place=True)
+        if not active:
+            return recording
+        for axis, factor, values in zip(axes, factors, given, strict=True):
+            if factor != 1.0:
+                values *= factor
+                values += recording.columns[axis][piece]
+            if unknown is not None:
+                values[unknown] = np.nan
     return recording.with_columns(corrected, {})
+
+
+def _ticks(time: Array, tick: float) -> tuple[NDArray[np.uint32], NDArray[np.bool_] | None]:
+    """Return times in whole ticks, and which of them are no numbers, if any."""
+    count = np.rint(time / tick)
+    if count.min() >= 0 and count.max() <= _LAST_TICK:  # also False where a time is NaN
+        return count.astype(np.uint32), None
+    unknown = ~np.isfinite(time)
+    count[unknown] = 0
+    return np.clip(count, 0, _LAST_TICK).astype(np.uint32), unknown if unknown.any() else None
 
 
 def temperature_warning(low: float, high: float, recording: Recording) -> str | None:

@@ -18,6 +18,7 @@ _WIDTH, _GROWTH = 2.0, 0.15
 """Bins are two seconds wide at first, later this share of the time since power-on: few, so that noise weighs little."""
 _MOVED = 9.0
 _MOVED_RANGE = 0.02
+_QUIET = 60  # s
 _FEWEST = 10
 _NEARLY = 1e-9
 
@@ -176,11 +177,14 @@ def make_curves(
         A cycle fits no temperature, is too short, or moved most of the time.
     """
     group = assign_temperatures(cycles, temperatures, tolerance)
-    still = [_still(cycle) for cycle in cycles]
+    still = [_still(cycle, level) for cycle, level in zip(cycles, quiet_levels(cycles), strict=True)]
     end = np.array([bins.stop[-1] for bins, _ in still])
     settled = True
-    if settling_time is None:
-        settling_time, settled = _choose_settling_time(cycles, [bins for bins, _ in still], group, end, limit)
+    serials = [cycle.serial or "" for cycle in cycles]
+    unit = np.array([sorted(set(serials)).index(serial) for serial in serials])
+    if settling_time is None:  # the longest over temperatures and units
+        _, each = np.unique(unit * len(temperatures) + group, return_inverse=True)
+        settling_time, settled = _choose_settling_time(cycles, [bins for bins, _ in still], each, end, limit)
     for cycle, (bins, _) in zip(cycles, still, strict=True):
         early = int((bins.stop <= settling_time + _NEARLY).sum())
         if early < _FEWEST:
@@ -204,13 +208,12 @@ def make_curves(
         nodes[i, where], shares[i, where] = wide.nodes, wide.shares
         seconds[i, where] = wide.count / np.median(bins.count)
         mean[i, where] = wide.mean - reference[i]
-    serials = [cycle.serial or "" for cycle in cycles]
     curves = Curves(
         cycles=tuple(cycles),
         temperatures=temperatures,
         group=group,
         power_on=np.array([cycle.temperature for cycle in cycles]),
-        unit=np.array([sorted(set(serials)).index(serial) for serial in serials]),
+        unit=unit,
         settling_time=settling_time,
         edges=edges,
         nodes=nodes,
@@ -240,17 +243,45 @@ def bin_edges(stop: float) -> Array:
     return np.array(edges)
 
 
-def _still(cycle: Cycle) -> tuple[Bins, tuple[float, float]]:
+def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
+    """Return the variance within a bin at rest, shape (axes,) for each cycle.
+
+    Of each cycle the quietest minute (a vehicle may fly for most of its log); if the cycles of the same sample rate
+    are mostly quieter than that, theirs (a cycle may move throughout).
+    """
+    own = np.array([_quietest(cycle.bins.variance) for cycle in cycles])
+    rate = np.array([np.median(cycle.bins.count) for cycle in cycles])
+    levels = []
+    for level, mine in zip(own, rate, strict=True):
+        usual = np.median(own[np.abs(rate / mine - 1) < 0.1], axis=0)
+        levels.append(np.where(usual > 0, np.minimum(level, usual), level))
+    return levels
+
+
+def _quietest(variance: Array) -> Array:
+    """Least median over any minute, or over any quarter of what is shorter than four."""
+    width = max(min(_QUIET, len(variance) // 4), 1)
+    windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)
+    return np.asarray(np.median(windows, axis=-1).min(axis=0))
+
+
+def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
     """Return the bins in which the unit stood still; seconds left out, and when it first moved.
 
-    A bin counts as moved when its variance is far above that of the quiet bins and of the warm-up curve itself.
+    A bin counts as moved when its variance is far above `quiet` and above what the warm-up curve itself makes of it.
     """
     bins = cycle.bins
-    quiet = np.quantile(bins.variance, 0.25, axis=0)
-    spread = np.quantile(bins.mean, 0.95, axis=0) - np.quantile(bins.mean, 0.05, axis=0)
-    limit = _MOVED * (1 + 10 / bins.count[:, None]) * quiet + (_MOVED_RANGE * spread) ** 2
     slope = np.gradient(bins.mean, axis=0) if len(bins) > 1 else 0.0
-    moved = (bins.variance - np.square(slope) / 12 > limit).any(axis=1) & (bins.count > 2)
+    excess = bins.variance - np.square(slope) / 12
+    noise = _MOVED * (1 + 10 / bins.count[:, None]) * quiet
+    moved = np.zeros(len(bins), dtype=np.bool_)
+    while not moved.all():
+        # The curve's range is that of the bins at rest: in motion it would hide the motion.
+        spread = np.subtract(*np.quantile(bins.mean[~moved], [0.95, 0.05], axis=0))
+        found = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
+        if not (found & ~moved).any():
+            break
+        moved |= found
     if not moved.any():
         return bins, (0.0, 0.0)
     near = np.convolve(moved, [1, 1, 1], mode="same") > 0
@@ -294,8 +325,8 @@ def _choose_settling_time(
 ) -> tuple[float, bool]:
     """Return the first time after which every mean curve stays below its limit, rounded up to 10 s, and whether any is.
 
-    The curves are referenced to what follows that time, so that it is found by iteration from three quarters of the
-    shortest cycle.
+    There is a curve for each group: a temperature of a unit. They are referenced to what follows that time, so that it
+    is found by iteration from three quarters of the shortest cycle.
     """
     shortest = float(np.floor(end.min()))
     latest = 10.0 * np.floor((shortest - SETTLED) / 10)

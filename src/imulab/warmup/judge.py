@@ -10,7 +10,7 @@ from imulab.errors import DataError
 from imulab.recording import Array
 from imulab.warmup.curves import Curves
 from imulab.warmup.model import Table, edge_jumps, exit_jump
-from imulab.warmup.solve import Solution, coefficients_of, find_scales, solve, statistics
+from imulab.warmup.solve import Solution, coefficients_of, find_scales, fitted_noise, solve, statistics
 
 CANDIDATES = (("interval-cubic", 0), ("knot-cubic", 0), ("knot-log-cubic", 1), ("exponential", 2), ("exponential", 3))
 """Models that are compared, and how many time scales each has."""
@@ -96,7 +96,7 @@ def judge(curves: Curves, model: str, count: int, weights: Array, *, by_unit: bo
     sums = statistics(curves, model, scales)
     solution = solve(curves, model, scales, sums, weights)
     noise = curves.expected_noise()
-    left = sums.mean_square(coefficients_of(curves, solution.table)) - noise
+    left = sums.mean_square(coefficients_of(curves, solution.table)) - fitted_noise(curves, solution, sums)
     cycle = _leave_cycles(curves, model, scales, weights, noise, by_unit)
     temperature, others = _leave_temperatures(curves, model, scales, weights, noise)
     times = np.linspace(0.0, curves.settling_time, 301)
@@ -208,6 +208,9 @@ class Repeatability:
     ----------
     cycle
         Deviation of a cycle from the mean of its unit and temperature, shape (axes,); NaN where none was repeated.
+    uncertainty
+        Of `cycle`: with n degrees of freedom and a white part w^2 taken off, its square r^2 is known to
+        (r^2 + w^2) sqrt(2 / n); so what is lost in the noise (r = 0) is known to w (2 / n)^(1/4), shape (axes,).
     freedom
         Degrees of freedom.
     by_temperature
@@ -217,6 +220,7 @@ class Repeatability:
     """
 
     cycle: Array
+    uncertainty: Array
     freedom: int
     by_temperature: Array
     unit: Array | None
@@ -252,6 +256,8 @@ def repeatability(curves: Curves) -> Repeatability:
             units += len(means) - 1
     total = int(freedom.sum())
     cycle = np.sqrt(np.maximum(within.sum(axis=0) / total, 0.0)) if total else np.full(a, np.nan)
+    known = (np.nan_to_num(cycle) ** 2 + noise.mean(axis=0)) * np.sqrt(2 / max(total, 1))
+    uncertainty = np.sqrt(cycle**2 + known) - cycle
     each = np.sqrt(np.maximum(within / np.maximum(freedom, 1)[:, None], 0.0))
     each[freedom == 0] = np.nan
     unit = None
@@ -259,7 +265,7 @@ def repeatability(curves: Curves) -> Repeatability:
         pairs = len(set(zip(curves.unit.tolist(), curves.group.tolist(), strict=True)))
         one = np.where(np.isfinite(cycle), cycle, 0.0) ** 2 + noise.mean(axis=0)
         unit = np.sqrt(np.maximum(between / units - one * members / pairs, 0.0))
-    return Repeatability(cycle, total, each, unit)
+    return Repeatability(cycle, uncertainty, total, each, unit)
 
 
 def _squares(deviations: Array, metric: Array) -> Array:

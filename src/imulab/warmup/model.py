@@ -20,6 +20,8 @@ from imulab.units import conversion_factor, parse_unit
 
 MODELS = ("interval-cubic", "knot-cubic", "knot-log-cubic", "exponential")
 EXITS = ("zero", "hold", "taper")
+MOST_CONSTANTS = 3
+"""Time constants of an exponential that the unit has room for."""
 SOURCE_TEMPERATURES = (-40.0, -30.0, -20.0, -10.0, 0.0, 40.0, 50.0, 60.0)
 """Calibration temperatures of the source, degC."""
 
@@ -231,10 +233,18 @@ def check_table(table: Table) -> None:
         (not np.isfinite(table.coefficients).all(), "coefficients that are not finite"),
         (not 0 < table.settling_time < np.inf, f"settling_time {table.settling_time:g}; expected more than 0"),
         (not 0 < table.taper_time < np.inf, f"taper_time {table.taper_time:g}; expected more than 0"),
-        (table.time_scale is not None and not table.time_scale > 0, f"time_scale {table.time_scale}"),
         (
-            table.model == "exponential" and (not table.time_constants or not min(table.time_constants) > 0),
-            f"time_constants {table.time_constants}; expected more than 0",
+            table.time_scale is not None and not 0 < table.time_scale < np.inf,
+            f"time_scale {table.time_scale}; expected more than 0",
+        ),
+        (
+            table.model == "exponential"
+            and (
+                not 1 <= len(table.time_constants) <= MOST_CONSTANTS
+                or not all(0 < tau < np.inf for tau in table.time_constants)
+            ),
+            f"time_constants {' '.join(f'{tau:g}' for tau in table.time_constants)}; expected one to {MOST_CONSTANTS}, "
+            "each more than 0",
         ),
     ]
     for wrong, what in problems:

@@ -43,6 +43,13 @@ def _ends(curves: Curves, settled: bool) -> list[str]:
             f"not settled: the curves still change when the recordings end; T_M = {curves.settling_time:g} s leaves "
             f"{SETTLED:g} s for the reference: record longer"
         )
+    reached = np.array([curves.end[curves.group == k].max() for k in range(len(curves.temperatures))])
+    beyond = [f"{t:g}" for t, e in zip(curves.temperatures, reached, strict=True) if e < curves.settling_time - 1]
+    if beyond:
+        found.append(
+            f"no cycle at {' '.join(beyond)} degC lasts to T_M = {curves.settling_time:g} s: the table goes on from "
+            f"{reached.min():g} s without data, and a cubic may go anywhere there"
+        )
     short = [
         f"{c.name} ({end:.6g} s)" for c, end, half in zip(curves.cycles, curves.end, curves.halved, strict=True) if half
     ]

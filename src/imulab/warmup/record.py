@@ -60,6 +60,7 @@ def make_record(
             "models": [_row(row, row is chosen) for row in rows],
             "repeatability": {
                 "cycle": _numbers(spread.cycle),
+                "standard_uncertainty": _numbers(spread.uncertainty),
                 "by_temperature": _numbers(spread.by_temperature),
                 "degrees_of_freedom": spread.freedom,
                 "unit": None if spread.unit is None else _numbers(spread.unit),
@@ -95,11 +96,9 @@ def _parameters(
             blocks.append((names, known))
     for i, (axis, unit) in enumerate(zip(curves.axes, curves.units, strict=True)):
         if spread.freedom:
-            # A root mean square over n degrees of freedom is known to 1 / sqrt(2 n) of itself.
-            value = float(spread.cycle[i])
-            uncertainty = float(value / np.sqrt(2 * spread.freedom))
+            uncertainty = float(spread.uncertainty[i])
             name = f"repeatability_{axis}"
-            found[name] = Parameter(value, uncertainty, unit)
+            found[name] = Parameter(float(spread.cycle[i]), uncertainty, unit)
             blocks.append(((name,), np.array([[uncertainty**2]])))
         if spread.unit is not None:
             found[f"unit_spread_{axis}"] = Parameter(float(spread.unit[i]), None, unit)

@@ -40,12 +40,15 @@ class Statistics:
         ``sum w y^2``, shape (c, axes).
     weight
         ``sum w``, shape (c,).
+    total
+        ``sum w b``, shape (c, p).
     """
 
     normal: Array
     moment: Array
     square: Array
     weight: Array
+    total: Array
 
     def mean_square(self, coefficients: Array) -> Array:
         """Return the mean squared residual of each cycle for its coefficients (c, axes, p): shape (c, axes)."""
@@ -65,6 +68,7 @@ def statistics(curves: Curves, model: str, scales: Sequence[float]) -> Statistic
         moment=np.einsum("cbp,cba->cpa", weighted, curves.mean),
         square=np.einsum("cb,cba->ca", curves.seconds, curves.mean**2),
         weight=curves.seconds.sum(axis=1),
+        total=weighted.sum(axis=1),
     )
 
 
@@ -253,6 +257,41 @@ def coefficients_of(curves: Curves, table: Table) -> Array:
     inside = np.clip(curves.power_on, table.temperatures[0], table.temperatures[-1])
     rows = [table.coefficients_at(float(temperature)) for temperature in inside]
     return np.stack([row for row in rows if row is not None])
+
+
+def fitted_noise(curves: Curves, solution: Solution, sums: Statistics) -> Array:
+    """Return the mean square that white noise leaves in the cycles of a fit, shape (c, axes).
+
+    Less than in cycles that the fit has not seen, since the fit follows some of the noise: with y = X theta for a cycle
+    of b bins, N = X' W X, B = N + X' W 1 1' W X / s for a reference of s seconds, M = sum w N and Q = sum w^2 B,
+    ``b + T / s - 2 w tr(B M^-1) + tr(N M^-1 Q M^-1)`` per T seconds. Amplitudes carried along slopes count as fixed.
+    """
+    w, kept = solution.weights, np.arange(len(curves.temperatures))
+    both = sums.normal + sums.total[:, :, None] * sums.total[:, None, :] / curves.reference_seconds[:, None, None]
+    if solution.table.model == "interval-cubic":
+        edges = curves.temperatures
+        row = np.clip(np.searchsorted(edges, curves.power_on, side="right") - 1, 0, len(edges) - 2)
+        share, taken = membership(curves, kept), np.zeros(len(w))
+        for r in range(len(edges) - 1):
+            taken[row == r] = _taken(sums.normal, both, np.ones((len(w), 1)), w * share[:, r])[row == r]
+    elif solution.table.model == "exponential":
+        taken = _taken(sums.normal, both, (curves.group[:, None] == kept).astype(np.float64), w)
+    else:
+        taken = _taken(sums.normal, both, hats(curves, kept), w)
+    share = np.maximum((curves.seconds > 0).sum(axis=1) + sums.weight / curves.reference_seconds - taken, 0.0)
+    return np.asarray((share / sums.weight)[:, None] * curves.noise)
+
+
+def _taken(normal: Array, both: Array, hat: Array, weights: Array) -> Array:
+    """What a fit takes of the noise in each cycle, shape (c,): of variances of one second's mean."""
+    size = hat.shape[1] * normal.shape[1]
+    spread = np.einsum("cj,ck->cjk", hat, hat)
+    own = np.einsum("cjk,cpq->cjpkq", spread, normal).reshape(-1, size, size)
+    noisy = np.einsum("cjk,cpq->cjpkq", spread, both).reshape(-1, size, size)
+    inverse = np.linalg.inv(np.einsum("c,cxy->xy", weights, own))
+    seen = inverse @ np.einsum("c,cxy->xy", weights**2, noisy) @ inverse
+    found: Array = 2 * weights * np.einsum("cxy,yx->c", noisy, inverse) - np.einsum("cxy,yx->c", own, seen)
+    return found
 
 
 def scatter(curves: Curves, sums: Statistics, cluster: Index) -> tuple[Array, Array, float]:

@@ -45,10 +45,7 @@ def write_table(record: Calibration) -> str:
         settings["time_constants"] = " ".join(map(repr, table.time_constants)) + " s"
     if "serial" in record.sensor:
         settings["serial"] = record.sensor["serial"]
-    letter = "A" if table.time_constants else "c"
-    first = 1 if table.time_constants else 0
-    titles = ["from [degC]", "to [degC]"] if interval else ["temperature [degC]"]
-    titles += ["axis", "unit", *(f"{letter}{first + j}" for j in range(table.coefficients.shape[2]))]
+    titles = _titles(table.model, table.coefficients.shape[2])
     lines = [f"# {key}: {value}" for key, value in settings.items()] + [",".join(titles)]
     edges = table.temperatures.tolist()
     for r, block in enumerate(table.coefficients.tolist()):
@@ -56,6 +53,12 @@ def write_table(record: Calibration) -> str:
         for axis, unit, row in zip(table.axes, table.units, block, strict=True):
             lines.append(",".join([*map(repr, place), axis, unit, *map(repr, row)]))
     return "\n".join(lines) + "\n"
+
+
+def _titles(model: str, size: int) -> list[str]:
+    places = ["from [degC]", "to [degC]"] if model == "interval-cubic" else ["temperature [degC]"]
+    terms = [f"A{j + 1}" if model == "exponential" else f"c{j}" for j in range(size)]
+    return [*places, "axis", "unit", *terms]
 
 
 def read_table(path: str | Path) -> tuple[Table, str | None]:
@@ -103,6 +106,10 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     constants = tuple(_seconds(path, settings, "time_constants")) if model == "exponential" else ()
     size = len(constants) or 4
     lead = 2 if interval else 1
+    number, titles = rows[0]
+    expected = _titles(model, size)
+    if titles != expected:
+        raise ReadError(f"{path}: line {number}: expected the titles {','.join(expected)}, found {','.join(titles)}")
     units: dict[str, str] = {}
     found: dict[tuple[float, ...], dict[str, list[float]]] = {}
     for number, cells in rows[1:]:
