@@ -164,6 +164,30 @@ def test_a_gap_of_the_gyroscope_is_not_bridged(file, streams):
     )
 
 
+def test_streams_one_behind_the_other_are_joined_or_refused_but_never_lost(file, streams, monkeypatch):
+    """A log that holds all accelerometer samples, then all of the gyroscope's."""
+    accel_times, gyro_times, accel, gyro = streams
+    mine, theirs = list(sensor(3, accel_times, accel)), list(sensor(4, gyro_times, gyro))
+    subscriptions = [(0, 3, "sensor_accel"), (0, 4, "sensor_gyro")]
+
+    def log(messages, name):
+        return file(ulog(FORMATS, subscriptions, [message for _, message in messages]), name)
+
+    path = log([*mine, *theirs], "behind.ulg")
+    check(il.read(path), streams)
+    monkeypatch.setattr("imulab.readers.streams._ROWS", 50)
+    monkeypatch.setattr("imulab.readers.streams._PATIENCE", 200)
+    monkeypatch.setattr("imulab.readers.logs.BLOCK_BYTES", 1000)
+    with pytest.raises(ReadError, match=r"samples of the gyroscope lie more than 100 samples behind those of the acc"):
+        il.read(path)
+    # One that only ends early does not hold up the other.
+    ended = log(sorted([*mine, *theirs[:200]], key=lambda m: m[0]), "ended.ulg")
+    recording = il.read(ended)
+    np.testing.assert_array_equal(recording.triad("accel"), accel)
+    late = accel_times > gyro_times[199] + 12_500
+    np.testing.assert_array_equal(np.isnan(recording.column("gyro_x")), late)
+
+
 def test_a_cut_ulog_is_read_up_to_the_cut_with_a_warning(file, streams, imulab):
     whole = px4_log(*streams)
     path = file(whole[: len(whole) // 2 + 7])
@@ -296,6 +320,14 @@ def test_old_logs_have_one_message_name_an_instance_and_milliseconds(file):
     second = il.read(path, instance=1)
     np.testing.assert_array_equal(second.triad("accel"), -accel)
     np.testing.assert_array_equal(second.time, np.arange(50) * 20 / 1000)
+
+
+@pytest.mark.parametrize("title", ["T", "Temp"])
+def test_the_temperature_of_new_and_old_imu_messages(file, title):
+    fields = "QfffffffIf", f"TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,Spare,ErrA,{title}"
+    rows = [("IMU", (i * 1000, 0, 0, 0, 1, 2, 3, 0, 0, 20.0 + i)) for i in range(9)]
+    recording = il.read(file(dataflash({"IMU": (150, *fields)}, rows), "old.bin"))
+    np.testing.assert_array_equal(recording.column("temperature"), 20.0 + np.arange(9))
 
 
 def test_scaled_fields_are_scaled(file):
