@@ -111,8 +111,10 @@ class _Clock:
         self.last = float(time[-1])
 
     def text(self) -> list[str]:
-        if self.broken or self.first is None or np.isnan(self.usual):
+        if self.broken or self.first is None:
             return []
+        if np.isnan(self.usual):
+            return ["duration 0 s, rate unknown: a single sample"]
         rising = self.usual > 0
         rate = f"{1 / self.usual:.6g} Hz" if rising else "unknown, time does not rise"
         widest = f" (the widest {self.widest:.6g} s)" if self.gaps and rising else ""
