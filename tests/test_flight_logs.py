@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import ImulabError, OptionError, ReadError
 from reference.flightlogs import dataflash, ulog
 
@@ -371,3 +372,19 @@ def test_a_damaged_dataflash_log_is_refused(file, samples, case):
 def test_a_text_log_of_ardupilot_asks_for_the_binary_one(file):
     with pytest.raises(ReadError, match=r"an ArduPilot log as text; expected the binary log \(\.bin\)"):
         il.read(file(b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n", "log.log"))
+
+
+def test_a_refusal_stays_one_line_where_there_is_also_something_to_warn_of(file, streams, imulab, tmp_path):
+    cut = file(px4_log(*streams)[:-5], "cut.ulg")
+    for unit, lines in (("count", 1), ("m/s^2", 2)):
+        terms = {"bias": (0.0, "m/s^2"), "scale_factor": (1.0, f"{unit}/(m/s^2)")}
+        parameters = {f"{stem}_{a}": Parameter(v, None, of) for stem, (v, of) in terms.items() for a in AXES}
+        parameters |= {f"misalignment_{pair}": Parameter(0.0, None, "rad") for pair in ("yx", "zx", "zy")}
+        model = {"order": 1, "output_unit": unit, "temperature": {"value": -60.0, "unit": "degC"}}
+        Calibration("tumble", parameters, Covariance((), ()), model, {}).save(tmp_path / "rec.json")
+        done = imulab("apply", "rec.json", cut, "-o", "out.csv")
+        assert done.stderr.count("\n") == lines, done.stderr
+        assert (tmp_path / "out.csv").exists() == (unit == "m/s^2")
+        assert ("outputs in count" in done.stderr) == (done.returncode == 2) == (unit == "count")
+    assert "truncated" in done.stderr
+    assert "K away" in done.stderr
