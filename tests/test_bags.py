@@ -129,6 +129,18 @@ def test_a_single_message_without_a_reading_is_nan(tmp_path, truth):
     assert not np.isnan(recording.triad("gyro")).any()
 
 
+def test_a_quantity_that_is_reported_from_the_second_chunk_on_is_there(tmp_path, truth, monkeypatch):
+    """A filter that starts up: its first messages have no rate."""
+    stamps, accel, gyro = truth
+    gyro = gyro.copy()
+    gyro[:150] = np.nan
+    path = official(tmp_path / "a.mcap", (stamps, accel, gyro))
+    recording = il.read(path)
+    np.testing.assert_array_equal(recording.triad("gyro"), gyro)
+    monkeypatch.setattr("imulab.readers.rosbag._ENOUGH", 60)
+    assert "gyro_x" not in il.read(path)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_frames_of_different_length_in_one_topic(tmp_path, truth, kind):
     stamps, accel, gyro = truth

@@ -196,15 +196,17 @@ def test_matlab_5_vectors_matrices_and_structs(tmp_path, truth, layout, compress
         "m": np.column_stack([truth["x"], truth["y"]]),
         "imu": {"y": truth["y"], "deep": {"y": truth["y"]}},
         "name": "text",
+        "z": truth["x"] * 1j,
     }
     scipy.io.savemat(path, content, do_compression=compressed)
     for x, y in (("x", "imu/y"), ("m[0]", "m[1]"), ("x", "imu/deep/y")):
         check(il.read(path, layout(LAYOUT.format(t="t", x=x, y=y))), truth)
     for x, message in (
-        ("q", "takes accel_x from 'q', found t x m imu name"),
+        ("q", "takes accel_x from 'q', found t x m imu name z"),
         ("imu/q", "takes accel_x from 'imu/q', found y deep"),
         ("m", "say which column"),
-        ("imu", "expected numbers, found a struct"),
+        ("imu", "expected real numbers, found a struct"),
+        ("z", "expected real numbers, found complex ones"),
         ("t/x", "found no struct"),
         ("name", "expected"),
     ):

@@ -100,7 +100,7 @@ def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarr
         variable = inside[part]
         inside = variable.fields
     if variable.numbers is None:
-        raise ReadError(f"{where}: expected numbers, found {_CLASSES.get(variable.kind, 'something else')}")
+        raise ReadError(f"{where}: expected real numbers, found {_CLASSES.get(variable.kind, 'complex ones')}")
     return variable.numbers
 
 
