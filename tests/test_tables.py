@@ -407,3 +407,10 @@ def test_what_other_writers_keep_in_parquet_metadata_is_left_out(tmp_path):
 def test_show_states_the_duration_of_a_single_sample(tmp_path, imulab):
     (tmp_path / "a.csv").write_text("time [s],accel_x [g]\n5,1\n")
     assert "duration 0 s" in imulab("show", "a.csv").stdout
+
+
+def test_show_says_where_time_runs_backwards(tmp_path, imulab):
+    (tmp_path / "a.csv").write_text("time [s],accel_x [g]\n0,1\n1,1\n2,1\n1.5,1\n2.5,1\n")
+    (tmp_path / "b.csv").write_text("time [s],accel_x [g]\n0,1\n1,1\n2,1\n")
+    assert "time runs backwards once" in imulab("show", "a.csv").stdout
+    assert "backwards" not in imulab("show", "b.csv").stdout
