@@ -129,6 +129,18 @@ def test_a_single_message_without_a_reading_is_nan(tmp_path, truth):
     assert not np.isnan(recording.triad("gyro")).any()
 
 
+def test_a_quantity_that_is_reported_from_the_second_chunk_on_is_there(tmp_path, truth, monkeypatch):
+    """A filter that starts up: its first messages have no rate."""
+    stamps, accel, gyro = truth
+    gyro = gyro.copy()
+    gyro[:150] = np.nan
+    path = official(tmp_path / "a.mcap", (stamps, accel, gyro))
+    recording = il.read(path)
+    np.testing.assert_array_equal(recording.triad("gyro"), gyro)
+    monkeypatch.setattr("imulab.readers.rosbag._ENOUGH", 60)
+    assert "gyro_x" not in il.read(path)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_frames_of_different_length_in_one_topic(tmp_path, truth, kind):
     stamps, accel, gyro = truth
@@ -290,6 +302,11 @@ def test_files_of_the_official_mcap_library(tmp_path, truth, method, chunks):
     check(il.read(official(tmp_path / "b.mcap", truth, **options)), truth)
 
 
+@pytest.mark.parametrize("missing", ["repeat_schemas", "repeat_channels"])
+def test_a_summary_that_lacks_schemas_or_channels_is_no_loss(tmp_path, truth, missing):
+    check(il.read(official(tmp_path / "a.mcap", truth, **{missing: False})), truth)
+
+
 def test_a_damaged_chunk_is_noticed_by_its_checksum(tmp_path, truth):
     from mcap.writer import CompressionType
 
@@ -318,6 +335,29 @@ def test_a_folder_that_is_no_bag_or_lacks_a_file(tmp_path, truth):
     data_file(path).rename(path / "renamed.mcap")
     with pytest.raises(ReadError, match=r"rec\.mcap is listed in metadata\.yaml, but it is not there"):
         il.read(path)
+
+
+def test_of_a_folder_only_the_listed_files_are_read_in_their_order(tmp_path, truth):
+    path = bags.write(tmp_path, "mcap", imus(truth))
+    shutil.copy(data_file(path), path / "a_copy.mcap")
+    check(il.read(path), truth)
+
+
+def test_a_sqlite_bag_with_messages_that_are_not_in_it_yet_is_refused(tmp_path, truth, imulab):
+    path = bags.write(tmp_path, "sqlite", imus(truth))
+    file = data_file(path)
+    db = sqlite3.connect(file)
+    db.execute("PRAGMA journal_mode=WAL")
+    db.execute("PRAGMA wal_autocheckpoint=0")
+    db.execute("INSERT INTO messages (topic_id, timestamp, data) SELECT topic_id, timestamp + 1, data FROM messages")
+    db.commit()
+    done = imulab("show", path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert f"the bag was not closed: {file.name}-wal" in done.stderr
+    db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    assert len(il.read(path)) == 2 * COUNT
+    db.close()
 
 
 def test_messages_that_are_no_imu_are_refused(tmp_path):

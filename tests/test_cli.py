@@ -219,3 +219,12 @@ def test_a_link_keeps_its_name_and_a_device_stays_a_device(imulab, tmp_path):
     done = imulab("tumble", "fit", "t.csv", "--gravity", G, "--order", "1", "-o", "/dev/null", "--json")
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "/dev/null").is_file()
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_a_full_device_behind_a_link_is_named_as_it_was_given(imulab, tmp_path, ending):
+    (tmp_path / "a.csv").write_text("time [s],accel_x [g]\n0,1\n1,2\n")
+    (tmp_path / f"out.{ending}").symlink_to("/dev/full")
+    done = imulab("convert", "a.csv", "-o", f"out.{ending}")
+    assert done.returncode == 2
+    assert done.stderr == f"imulab: out.{ending}: cannot be written: No space left on device\n"

@@ -250,7 +250,12 @@ REFUSALS = {
     "gyro counts": ("px4", lambda: record(gyro="count"), "gyroscopes with outputs in count"),
     "scale": ("ardupilot", lambda: record(scale=0.7), r"scale of axis x is 1\.4.*0\.8 to 1\.2"),
     "px4 scale": ("px4", lambda: record(scale=20.0), r"scale of axis x is 0\.0.*0\.1 to 3"),
-    "warmup": ("px4", lambda: other("warmup"), "warmup record cannot be exported.*time since power-on.*--to c"),
+    "warmup": ("px4", lambda: other("warmup"), "cannot be exported.*time since power-on, only.*temperature.*--to c"),
+    "warmup 3": (
+        "kalibr",
+        lambda: other("warmup"),
+        "kalibr has no parameter that follows the time since power-on; use",
+    ),
     "warmup 2": ("ardupilot", lambda: other("warmup"), "warmup record cannot be exported.*time since power-on"),
     "array": ("kalibr", lambda: other("gyro_array"), "gyro_array record cannot be exported"),
     "centrifuge": ("ros", lambda: other("centrifuge"), "centrifuge record cannot be exported"),
@@ -330,13 +335,13 @@ def test_noise_that_is_not_known_is_a_comment_and_a_wrong_file_is_refused(tmp_pa
     assert "gyroscope_noise_density" not in imu
     assert "# gyroscope_noise_density is not known: not measured" in file.read_text()
     for wrong, message in (
-        ({"a": 1}, "lacks 'columns'"),
-        (noise(accel_x={"unit": "m/s^2"}), "lacks angle_random_walk of accel_x"),
+        ({"a": 1}, "^n.json: lacks 'columns'"),
+        (noise(accel_x={"unit": "m/s^2"}), "^n.json: lacks angle_random_walk of accel_x"),
         (noise(accel_x={"unit": "count", "angle_random_walk": {"value": 1.0}}), "accel_x in 'count'"),
         (noise(gyro_y={"unit": "rad/s", "angle_random_walk": {"value": "x"}}), "gyro_y = 'x'"),
     ):
         with pytest.raises(OptionError, match=message):
-            export("openvins", [record(3)], tmp_path / "no", ExportOptions(noise=wrong))
+            export("openvins", [record(3)], tmp_path / "no", ExportOptions(noise=wrong, noise_file="n.json"))
         assert not (tmp_path / "no").exists()
 
 
@@ -349,6 +354,7 @@ def test_the_command_writes_one_file_and_refuses_in_one_line(imulab, tmp_path):
     record(9, unit="count", scale=100.0).save(tmp_path / "count.json")
     (tmp_path / "noise.json").write_text(json.dumps(noise()))
     (tmp_path / "taken").write_text("")
+    (tmp_path / "empty.json").write_text("{}")
     endings = {"px4": ".params", "ardupilot": ".param", "kalibr": ".yaml", "openvins": ".yaml", "ros": ".yaml"}
     for target, ending in endings.items():
         done = imulab(
@@ -367,6 +373,15 @@ def test_the_command_writes_one_file_and_refuses_in_one_line(imulab, tmp_path):
         (["--to", "px4", "exact.json", "-o", "taken"], ["taken", "folder"]),
         (["--to", "kalibr", "exact.json", "-o", "no", "--noise", "none.json"], ["none.json: no such file"]),
         (["--to", "kalibr", "exact.json", "-o", "no", "--noise", "taken"], ["taken", "no JSON"]),
+        (
+            ["--to", "kalibr", "exact.json", "-o", "no", "--noise", "exact.json"],
+            ["exact.json: expected what 'imulab allan"],
+        ),
+        (
+            ["--to", "kalibr", "exact.json", "-o", "no", "--noise", "empty.json"],
+            ["empty.json: expected what 'imulab allan"],
+        ),
+        (["--to", "px4", "exact.json", "-o", ""], ["expected a folder"]),
         (["--to", "px4", "noise.json", "-o", "no"], ["noise.json: not a calibration record"]),
     ):
         done = imulab("export", *arguments)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import ImulabError, OptionError, ReadError
 from reference.flightlogs import dataflash, ulog
 
@@ -164,6 +165,30 @@ def test_a_gap_of_the_gyroscope_is_not_bridged(file, streams):
     )
 
 
+def test_streams_one_behind_the_other_are_joined_or_refused_but_never_lost(file, streams, monkeypatch):
+    """A log that holds all accelerometer samples, then all of the gyroscope's."""
+    accel_times, gyro_times, accel, gyro = streams
+    mine, theirs = list(sensor(3, accel_times, accel)), list(sensor(4, gyro_times, gyro))
+    subscriptions = [(0, 3, "sensor_accel"), (0, 4, "sensor_gyro")]
+
+    def log(messages, name):
+        return file(ulog(FORMATS, subscriptions, [message for _, message in messages]), name)
+
+    path = log([*mine, *theirs], "behind.ulg")
+    check(il.read(path), streams)
+    monkeypatch.setattr("imulab.readers.streams._ROWS", 50)
+    monkeypatch.setattr("imulab.readers.streams._PATIENCE", 200)
+    monkeypatch.setattr("imulab.readers.logs.BLOCK_BYTES", 1000)
+    with pytest.raises(ReadError, match=r"samples of the gyroscope lie more than 100 samples behind those of the acc"):
+        il.read(path)
+    # One that only ends early does not hold up the other.
+    ended = log(sorted([*mine, *theirs[:200]], key=lambda m: m[0]), "ended.ulg")
+    recording = il.read(ended)
+    np.testing.assert_array_equal(recording.triad("accel"), accel)
+    late = accel_times > gyro_times[199] + 12_500
+    np.testing.assert_array_equal(np.isnan(recording.column("gyro_x")), late)
+
+
 def test_a_cut_ulog_is_read_up_to_the_cut_with_a_warning(file, streams, imulab):
     whole = px4_log(*streams)
     path = file(whole[: len(whole) // 2 + 7])
@@ -298,6 +323,14 @@ def test_old_logs_have_one_message_name_an_instance_and_milliseconds(file):
     np.testing.assert_array_equal(second.time, np.arange(50) * 20 / 1000)
 
 
+@pytest.mark.parametrize("title", ["T", "Temp"])
+def test_the_temperature_of_new_and_old_imu_messages(file, title):
+    fields = "QfffffffIf", f"TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,Spare,ErrA,{title}"
+    rows = [("IMU", (i * 1000, 0, 0, 0, 1, 2, 3, 0, 0, 20.0 + i)) for i in range(9)]
+    recording = il.read(file(dataflash({"IMU": (150, *fields)}, rows), "old.bin"))
+    np.testing.assert_array_equal(recording.column("temperature"), 20.0 + np.arange(9))
+
+
 def test_scaled_fields_are_scaled(file):
     messages = {"IMU": (150, "Qccceeec", "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,T")}
     recording = il.read(file(dataflash(messages, [("IMU", (5, 1, 2, 3, 981, -5, 0, 2150))] * 3), "c.bin"))
@@ -339,3 +372,19 @@ def test_a_damaged_dataflash_log_is_refused(file, samples, case):
 def test_a_text_log_of_ardupilot_asks_for_the_binary_one(file):
     with pytest.raises(ReadError, match=r"an ArduPilot log as text; expected the binary log \(\.bin\)"):
         il.read(file(b"FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n", "log.log"))
+
+
+def test_a_refusal_stays_one_line_where_there_is_also_something_to_warn_of(file, streams, imulab, tmp_path):
+    cut = file(px4_log(*streams)[:-5], "cut.ulg")
+    for unit, lines in (("count", 1), ("m/s^2", 2)):
+        terms = {"bias": (0.0, "m/s^2"), "scale_factor": (1.0, f"{unit}/(m/s^2)")}
+        parameters = {f"{stem}_{a}": Parameter(v, None, of) for stem, (v, of) in terms.items() for a in AXES}
+        parameters |= {f"misalignment_{pair}": Parameter(0.0, None, "rad") for pair in ("yx", "zx", "zy")}
+        model = {"order": 1, "output_unit": unit, "temperature": {"value": -60.0, "unit": "degC"}}
+        Calibration("tumble", parameters, Covariance((), ()), model, {}).save(tmp_path / "rec.json")
+        done = imulab("apply", "rec.json", cut, "-o", "out.csv")
+        assert done.stderr.count("\n") == lines, done.stderr
+        assert (tmp_path / "out.csv").exists() == (unit == "m/s^2")
+        assert ("outputs in count" in done.stderr) == (done.returncode == 2) == (unit == "count")
+    assert "truncated" in done.stderr
+    assert "K away" in done.stderr

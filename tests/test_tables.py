@@ -8,6 +8,7 @@ import sys
 import h5py
 import numpy as np
 import polars
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
@@ -195,22 +196,27 @@ def test_matlab_5_vectors_matrices_and_structs(tmp_path, truth, layout, compress
         "m": np.column_stack([truth["x"], truth["y"]]),
         "imu": {"y": truth["y"], "deep": {"y": truth["y"]}},
         "name": "text",
+        "z": truth["x"] * 1j,
     }
     scipy.io.savemat(path, content, do_compression=compressed)
     for x, y in (("x", "imu/y"), ("m[0]", "m[1]"), ("x", "imu/deep/y")):
         check(il.read(path, layout(LAYOUT.format(t="t", x=x, y=y))), truth)
     for x, message in (
-        ("q", "takes accel_x from 'q', found t x m imu name"),
+        ("q", "takes accel_x from 'q', found t x m imu name z"),
         ("imu/q", "takes accel_x from 'imu/q', found y deep"),
         ("m", "say which column"),
-        ("imu", "expected numbers, found a struct"),
+        ("imu", "expected real numbers, found a struct"),
+        ("z", "expected real numbers, found complex ones"),
         ("t/x", "found no struct"),
         ("name", "expected"),
     ):
         with pytest.raises(ReadError, match=message):
             il.read(path, layout(LAYOUT.format(t="t", x=x, y="x")))
-    with pytest.raises(ReadError, match=r"variables found: t \(1 x 1000\), x \(1000 x 1\)"):
+    with pytest.raises(
+        ReadError, match=r"variables found: t \(1 x 1000\), x \(1000 x 1\), m \(1000 x 2\), imu/y "
+    ) as met:
         il.read(path)
+    assert "imu/deep/y (1 x 1000), name (1 x 4)" in str(met.value)
 
 
 def test_a_layout_can_give_the_sample_rate(tmp_path, truth, layout):
@@ -380,3 +386,31 @@ def test_a_wrong_convert_gets_one_line(tmp_path, imulab, arguments, fragments):
     for fragment in fragments:
         assert fragment in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_head_comments_pass_through_parquet_whatever_their_names(tmp_path, imulab):
+    comments = {"geodetic_height": "520 m", "geo": "site B", "pandas_version": "3", "huggingface": "x", "a": "b: c"}
+    (tmp_path / "a.csv").write_text(
+        "".join(f"# {key}: {value}\n" for key, value in comments.items()) + "time [s],accel_x [g]\n0,1\n1,2\n"
+    )
+    assert imulab("convert", "a.csv", "-o", "a.parquet").returncode == 0
+    assert il.read(tmp_path / "a.parquet").metadata == comments
+
+
+def test_what_other_writers_keep_in_parquet_metadata_is_left_out(tmp_path):
+    table = pa.table({"time [s]": [0.0, 1.0], "accel_x [g]": [1.0, 2.0]})
+    theirs = {"pandas": '{"index_columns": []}', "geo": '{"version": "1.0"}', "org.apache.spark.version": "3.5"}
+    pq.write_table(table.replace_schema_metadata({**theirs, "serial": "S1"}), tmp_path / "a.parquet")
+    assert il.read(tmp_path / "a.parquet").metadata == {"serial": "S1"}
+
+
+def test_show_states_the_duration_of_a_single_sample(tmp_path, imulab):
+    (tmp_path / "a.csv").write_text("time [s],accel_x [g]\n5,1\n")
+    assert "duration 0 s" in imulab("show", "a.csv").stdout
+
+
+def test_show_says_where_time_runs_backwards(tmp_path, imulab):
+    (tmp_path / "a.csv").write_text("time [s],accel_x [g]\n0,1\n1,1\n2,1\n1.5,1\n2.5,1\n")
+    (tmp_path / "b.csv").write_text("time [s],accel_x [g]\n0,1\n1,1\n2,1\n")
+    assert "time runs backwards once" in imulab("show", "a.csv").stdout
+    assert "backwards" not in imulab("show", "b.csv").stdout

@@ -28,8 +28,13 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     if target.is_dir():
         raise OptionError(f"{path}: expected the name of a file to write, found a folder")
     if target.exists() and not target.is_file():  # a device or a pipe is written to, not replaced
-        with target.open("wb") as stream:
-            yield stream
+        try:
+            with target.open("wb") as stream:
+                yield stream
+        except BrokenPipeError:  # its reader has had enough, which is no failure
+            raise
+        except OSError as error:
+            raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
         return
     try:
         descriptor, name = tempfile.mkstemp(prefix=".imulab.", suffix=".part", dir=target.parent)

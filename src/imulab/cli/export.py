@@ -35,9 +35,11 @@ def export(
     number = whole_number(device_id, "--device-id")
     if not 0 <= number < _DEVICE_IDS:
         raise OptionError(f"--device-id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
-    if not output or (Path(output).exists() and not Path(output).is_dir()):
-        raise OptionError(f"{output!r}: expected a folder to write to, found a file")
-    options = ExportOptions(lossy=lossy, device_id=number, noise=_noise(noise) if noise else {})
+    if not output:
+        raise OptionError("-o '': expected a folder to write to")
+    if Path(output).exists() and not Path(output).is_dir():
+        raise OptionError(f"{output}: expected a folder to write to, found a file")
+    options = ExportOptions(lossy=lossy, device_id=number, noise=_noise(noise) if noise else {}, noise_file=noise or "")
     loaded = [load(name) for name in records]
     if to in ("c", "blob"):
         for name, record in zip(records, loaded, strict=True):
@@ -54,6 +56,6 @@ def _noise(file: str) -> dict[str, Any]:
         raise OptionError(f"{file}: no such file") from None
     except (OSError, ValueError) as error:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found no JSON ({error})") from None
-    if not isinstance(content, dict):
-        raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found {type(content).__name__}")
+    if not isinstance(content, dict) or "columns" not in content:
+        raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found JSON without 'columns'")
     return content

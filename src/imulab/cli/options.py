@@ -40,6 +40,7 @@ def heard(blocks: Iterable[Recording], *, notes: bool = True) -> Iterator[Record
     """Pass blocks on, and say on standard error what the reader did to the data, each thing once."""
     said: set[str] = set()
     for block in blocks:
+        yield block  # first: where the data are refused, the refusal is the one line there is
         for note in block.notes:
             kind = note.partition(":")[0]
             if kind not in said and note.startswith("truncated"):
@@ -47,7 +48,6 @@ def heard(blocks: Iterable[Recording], *, notes: bool = True) -> Iterator[Record
             elif note not in said and notes and not note.startswith("truncated"):
                 print(f"imulab: note: {block.name}: {note}", file=sys.stderr)
             said |= {kind, note}
-        yield block
 
 
 def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recording:

@@ -65,17 +65,11 @@ def apply(
 
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Pass blocks on; say at the first what a user should know, and at the end what lay beyond the test."""
+    """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
     from imulab.applying import beyond_message, beyond_test_of, identity, warnings_of
 
     counts, largest, name = [0] * len(records), [0.0] * len(records), ""
     for number, block in enumerate(blocks):
-        if number == 0:
-            messages = [message for record in records for message in warnings_of(record, block)]
-            if len({identity(record) for record in records}) < len(records):
-                messages.append("the same record is applied twice")
-            for message in dict.fromkeys(messages):
-                warn(message)
         for index, record in enumerate(records):
             try:
                 here, most = beyond_test_of(record, block)
@@ -83,6 +77,12 @@ def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> I
                 continue
             counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
         yield block
+        if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
+            messages = [message for record in records for message in warnings_of(record, block)]
+            if len({identity(record) for record in records}) < len(records):
+                messages.append("the same record is applied twice")
+            for message in dict.fromkeys(messages):
+                warn(message)
     for record, count, most in zip(records, counts, largest, strict=True):
         if count:
             warn(f"{name}: {beyond_message(record, count, most)}")

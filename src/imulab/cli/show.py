@@ -97,6 +97,7 @@ class _Clock:
     usual: float = np.nan
     gaps: int = 0
     widest: float = 0.0
+    backwards: int = 0
     broken: bool = False
 
     def add(self, time: Array) -> None:
@@ -107,16 +108,21 @@ class _Clock:
         if step.size:
             self.gaps += int(np.count_nonzero(step > _GAP * self.usual))
             self.widest = max(self.widest, float(step.max()))
+            self.backwards += int(np.count_nonzero(step < 0))
         self.first = float(time[0]) if self.first is None else self.first
         self.last = float(time[-1])
 
     def text(self) -> list[str]:
-        if self.broken or self.first is None or np.isnan(self.usual):
+        if self.broken or self.first is None:
             return []
+        if np.isnan(self.usual):
+            return ["duration 0 s, rate unknown: a single sample"]
         rising = self.usual > 0
         rate = f"{1 / self.usual:.6g} Hz" if rising else "unknown, time does not rise"
         widest = f" (the widest {self.widest:.6g} s)" if self.gaps and rising else ""
-        return [f"duration {self.last - self.first:.6g} s, rate {rate}, gaps {self.gaps if rising else 0}{widest}"]
+        lines = [f"duration {self.last - self.first:.6g} s, rate {rate}, gaps {self.gaps if rising else 0}{widest}"]
+        times = "once" if self.backwards == 1 else f"{self.backwards} times"
+        return [*lines, f"time runs backwards {times}: procedures refuse it"] if self.backwards else lines
 
 
 def describe_recording(blocks: Iterable[Recording]) -> str:

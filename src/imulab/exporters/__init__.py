@@ -35,11 +35,14 @@ class ExportOptions:
         PX4's number of the sensor; 0 where it is not known.
     noise
         What ``allan --json`` found, for targets with noise keys.
+    noise_file
+        What messages call the file that it came from.
     """
 
     lossy: bool = False
     device_id: int = 0
     noise: Mapping[str, Any] = field(default_factory=dict)
+    noise_file: str = "the noise file"
 
 
 def export(

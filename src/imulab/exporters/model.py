@@ -24,7 +24,7 @@ AXES = "xyz"
 _NEGLIGIBLE = 1e-6
 _GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
 _ELSEWHERE = {
-    "warmup": "{target} has no parameter that follows the time since power-on, only ones that follow temperature",
+    "warmup": "{target} has no parameter that follows the time since power-on",
     "gyro_array": "{target} fuses no array of gyroscopes",
     "centrifuge": "{target} has no parameter for drift that depends on acceleration",
 }
@@ -101,6 +101,8 @@ def one_unit(records: Sequence[Calibration], target: str) -> Unit:
     for record in records:
         if record.procedure != "tumble":
             reason = _ELSEWHERE.get(record.procedure, "{target} cannot hold it").format(target=target)
+            if record.procedure == "warmup" and target in ("px4", "ardupilot"):
+                reason += ", only ones that follow temperature"
             raise OptionError(
                 f"{target}: a {record.procedure} record cannot be exported: {reason}; use --to c or --to blob"
             )

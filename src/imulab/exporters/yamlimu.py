@@ -34,10 +34,10 @@ def noise_lines(options: ExportOptions, indent: str) -> list[str]:
         return [f"{indent}# not known, to be filled in (imulab export --noise FILE): {keys} update_rate"]
     columns = options.noise.get("columns")
     if not isinstance(columns, Mapping):
-        raise OptionError("the noise file lacks 'columns'; expected what 'imulab allan --json' printed")
+        raise OptionError(f"{options.noise_file}: lacks 'columns'; expected what 'imulab allan --json' printed")
     lines = []
     for key, (sensor, coefficient, unit) in _KEYS.items():
-        found = [_value(columns[name], coefficient, name) for name in _names(columns, sensor)]
+        found = [_value(columns[name], coefficient, name, options.noise_file) for name in _names(columns, sensor)]
         value = max(found, default=0.0)
         if value > 0:
             lines.append(f"{indent}{key}: {yaml_number(value)}  # {unit}, the largest of {len(found)} axes")
@@ -56,19 +56,19 @@ def _names(columns: Mapping[str, Any], sensor: str) -> list[str]:
     return [f"{sensor}_{axis}" for axis in AXES if f"{sensor}_{axis}" in columns]
 
 
-def _value(column: Any, coefficient: str, name: str) -> float:
+def _value(column: Any, coefficient: str, name: str, file: str) -> float:
     try:
         value = column[coefficient]["value"]
         unit = column["unit"]
     except (KeyError, TypeError):
         raise OptionError(
-            f"the noise file lacks {coefficient} of {name}; expected what 'imulab allan --json' printed"
+            f"{file}: lacks {coefficient} of {name}; expected what 'imulab allan --json' printed"
         ) from None
     needed = _UNITS[name.partition("_")[0]]
     if unit != needed:
-        raise OptionError(f"the noise file has {name} in {unit!r}; expected {needed!r}")
+        raise OptionError(f"{file}: has {name} in {unit!r}; expected {needed!r}")
     if not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
-        raise OptionError(f"the noise file has {coefficient} of {name} = {value!r}; expected a number of at least 0")
+        raise OptionError(f"{file}: has {coefficient} of {name} = {value!r}; expected a number of at least 0")
     return float(value)
 
 

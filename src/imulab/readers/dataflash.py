@@ -245,7 +245,8 @@ def _choose(
         sources[kind] = [(0, number, _FIELDS["GYR"])]
         return [Stream("gyroscope", _GYRO)], sources
     if topic == "IMU":
-        warm = ("T",) if "T" in form.fields and form.fields["T"].kind[0] != "S" else ()
+        # "Temp" in old logs
+        warm = tuple(key for key in ("T", "Temp") if key in form.fields and form.fields[key].kind[0] != "S")[:1]
         sources[kind] = [(0, number, (*_FIELDS["IMU"], *warm))]
         units = {**_ACCEL, **_GYRO, **({"temperature": "degC"} if warm else {})}
         return [Stream("accelerometer", units)], sources

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import prod
 from pathlib import Path
@@ -29,6 +29,7 @@ _STRUCT, _FIRST_NUMBER, _LAST_NUMBER = 2, 6, 15
 _CLASSES = {1: "a cell", 2: "a struct", 3: "an object", 4: "text", 5: "a sparse matrix"}
 _COMPLEX = 0x0800
 _DEEPEST = 20
+_LISTED = 20
 
 
 class _DamagedError(Exception):
@@ -45,8 +46,12 @@ class _Variable:
     numbers: np.ndarray | None = None
     fields: dict[str, _Variable] | None = None
 
-    def describe(self) -> str:
-        return f"{self.name} ({' x '.join(map(str, self.shape))})"
+    def describe(self, prefix: str = "") -> Iterator[str]:
+        """Yield what a layout can name: the variable, or each field of a struct."""
+        if not self.fields:
+            yield f"{prefix}{self.name} ({' x '.join(map(str, self.shape))})"
+        for name, field in (self.fields or {}).items():
+            yield from replace(field, name=name).describe(f"{prefix}{self.name}/")
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
@@ -61,11 +66,12 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     roots = {variable.partition("/")[0] for variable, _ in wanted.values()}
     try:
         with path.open("rb") as stream:
-            variables = {found.name: found for found in _variables(stream.read(), roots)}
+            variables = {found.name: found for found in _variables(stream.read(), roots if layout else None)}
     except (_DamagedError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: truncated or damaged, not a whole MATLAB file: {error}") from None
     if layout is None:
-        found = ", ".join(variable.describe() for variable in variables.values()) or "none"
+        names = [name for variable in variables.values() for name in variable.describe()]
+        found = ", ".join(names[:_LISTED]) + (" ..." if len(names) > _LISTED else "") or "none"
         raise ReadError(f"{name}: say with --layout FILE.toml which variable is which column; variables found: {found}")
     take: dict[str, Callable[[int, int], Array]] = {}
     lengths: dict[str, int] = {}
@@ -94,15 +100,15 @@ def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarr
         variable = inside[part]
         inside = variable.fields
     if variable.numbers is None:
-        raise ReadError(f"{where}: expected numbers, found {_CLASSES.get(variable.kind, 'something else')}")
+        raise ReadError(f"{where}: expected real numbers, found {_CLASSES.get(variable.kind, 'complex ones')}")
     return variable.numbers
 
 
 # --- the format ----------------------------------------------------------------------------------------------------
 
 
-def _variables(data: bytes, wanted: set[str]) -> Iterator[_Variable]:
-    """Yield the variables of a file, the numbers only of those that are wanted."""
+def _variables(data: bytes, wanted: set[str] | None) -> Iterator[_Variable]:
+    """Yield the variables of a file, the numbers only of those that are wanted; all where that is None."""
     if len(data) < _HEAD:
         raise _DamagedError(f"the head has {len(data)} bytes, expected {_HEAD}")
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])

@@ -14,7 +14,8 @@ from imulab.readers.formats import library
 from imulab.readers.layout import Layout
 from imulab.recording import Array, Recording, parse_column_title
 
-_NOT_OURS = ("ARROW:", "pandas", "org.apache", "huggingface", "geo")
+_NOT_OURS = ("ARROW:", "org.apache.")
+_OTHERS_JSON = ("pandas", "huggingface", "geo")  # what other writers leave under these names begins with a brace
 
 
 def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
@@ -76,7 +77,11 @@ def _columns(there: list[str], name: str, layout: Layout | None) -> tuple[dict[s
 
 def _metadata(pairs: dict[bytes, bytes] | None) -> dict[str, str]:
     texts = {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in (pairs or {}).items()}
-    return {key: " ".join(value.splitlines()) for key, value in texts.items() if not key.startswith(_NOT_OURS)}
+    return {
+        key: " ".join(value.splitlines())
+        for key, value in texts.items()
+        if not key.startswith(_NOT_OURS) and not (key in _OTHERS_JSON and value.startswith("{"))
+    }
 
 
 def _floats(arrow: Any, column: Any, title: str, name: str) -> Array:

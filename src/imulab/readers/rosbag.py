@@ -26,6 +26,7 @@ _DOUBLES = {_IMU: 37, _TEMPERATURE: 2}
 _GYRO_AT, _ACCEL_AT = 13, 25  # behind quaternion and its covariance, behind the rate and its covariance
 _ACCEL = {f"accel_{axis}": "m/s^2" for axis in "xyz"}
 _GYRO = {f"gyro_{axis}": "rad/s" for axis in "xyz"}
+_ENOUGH = 4096  # samples to find out what a topic reports; a chunk may hold only one
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
@@ -48,8 +49,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     warm = _temperature(topics, chosen, notes)
     if warm is not None:
         slots[warm] = len(slots)
-    first, pieces = _with_first(_pieces(files, slots, name), name, chosen[0])
-    there = [bool(np.isfinite(first.values[:, i : i + 3]).any()) for i in (0, 3)]
+    there, pieces = _reported(_pieces(files, slots, name), name, chosen[0])
     if len(chosen) == 2:
         taken = [slice(0, 3), slice(3, 6)]
         streams = [Stream("accelerometer", _ACCEL), Stream("gyroscope", _GYRO)]
@@ -133,14 +133,20 @@ def _pieces(files: list[Container], slots: dict[str, int], name: str) -> Iterato
                 yield Piece(slots[topic.name], ticks, _readings(values) if topic.type == _IMU else values[:, :1])
 
 
-def _with_first(pieces: Iterator[Piece], name: str, topic: str) -> tuple[Piece, Iterator[Piece]]:
-    """Return the first piece of the clock's stream, and all pieces."""
+def _reported(pieces: Iterator[Piece], name: str, topic: str) -> tuple[list[bool], Iterator[Piece]]:
+    """Return whether the clock's stream reports specific force and rate, by its first samples; and all pieces."""
     before: list[Piece] = []
+    there, count = [False, False], 0
     for piece in pieces:
         before.append(piece)
         if piece.stream == 0:
-            return piece, chain(before, pieces)
-    raise ReadError(f"{name}: no messages on {topic}")
+            there = [there[i] or bool(np.isfinite(piece.values[:, 3 * i : 3 * i + 3]).any()) for i in (0, 1)]
+            count += len(piece.ticks)
+            if all(there) or count >= _ENOUGH:
+                break
+    if not count:
+        raise ReadError(f"{name}: no messages on {topic}")
+    return there, chain(before, pieces)
 
 
 def _readings(values: Array) -> Array:

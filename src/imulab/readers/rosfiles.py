@@ -198,7 +198,7 @@ class Mcap:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, Topic] = {}
         self._define(records)
-        if not self._channels:
+        if not self._channels or not self._schemas:  # a summary need not repeat them
             for found in self._blocks():
                 self._define(found)
         self.topics = list(self._channels.values())
@@ -269,6 +269,12 @@ class Sqlite:
         expected = count * (65536 if page == 1 else page)
         if path.stat().st_size < expected:
             raise ReadError(f"{name}: truncated: expected {expected} bytes, found {path.stat().st_size}")
+        for beside in (Path(f"{path}-wal"), Path(f"{path}-journal")):
+            if beside.is_file() and beside.stat().st_size:
+                raise ReadError(
+                    f"{name}: the bag was not closed: {beside.name} holds changes that are not in it yet; put them in "
+                    f"with: sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+                )
         rows = [row for rows in self._query("SELECT id, name, type, serialization_format FROM topics") for row in rows]
         if not all(isinstance(number, int) for number, *_ in rows):
             raise ReadError(f"{name}: damaged: a topic without a number")
@@ -304,7 +310,7 @@ class Sqlite:
 
 
 def files_of(folder: Path, name: str) -> list[Path]:
-    """Return the data files of a ROS 2 bag's folder in order.
+    """Return the data files of a ROS 2 bag's folder in order: those that its metadata lists, or else all.
 
     Raises
     ------
@@ -321,6 +327,8 @@ def files_of(folder: Path, name: str) -> list[Path]:
             raise ReadError(f"{name}: {entry} is compressed as a whole; decompress it first with 'zstd -d'")
         if not (folder / Path(entry).name).is_file():
             raise ReadError(f"{name}: {entry} is listed in metadata.yaml, but it is not there")
+    if listed:
+        return [folder / Path(entry).name for entry in listed]
     if not found:
         raise ReadError(f"{name}: expected a file, found a folder that is no ROS 2 bag (no .mcap or .db3 in it)")
     return found

@@ -97,19 +97,26 @@ def on_one_clock(
     Raises
     ------
     ReadError
-        There is no sample, or a stream to interpolate runs backwards.
+        There is no sample, or a stream to interpolate runs backwards or lies far behind the clock in the file.
     """
     buffers = [_Buffer(stream) for stream in streams]
     clock, others = buffers[0], buffers[1:]
-    row = 1
+    row, done = 1, np.iinfo(np.int64).min
     for piece in _and_end(pieces):
         if piece is not None:
+            if piece.stream and piece.ticks.size and piece.ticks[-1] < done:
+                _refuse_late(buffers[piece.stream], clock, name)
             buffers[piece.stream].add(piece)
             if piece.stream or clock.count < _ROWS:
                 continue
         for buffer in buffers:
             buffer.join()
-        ready = _ready(clock, others, last=piece is None)
+        whole = _ready(clock, others)
+        ready = clock.count if piece is None else whole
+        if clock.count > _PATIENCE and whole < clock.count // 2:
+            # A stream that has ended does not hold up the others; one that is only late has half of them as a margin.
+            ready = clock.count // 2
+            done = max(done, int(clock.ticks[:ready].max()))
         if ready == 0:
             continue
         ticks = clock.ticks[:ready]
@@ -140,9 +147,17 @@ def _and_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
     yield None
 
 
-def _ready(clock: _Buffer, others: list[_Buffer], *, last: bool) -> int:
+def _refuse_late(buffer: _Buffer, clock: _Buffer, name: str) -> None:
+    """Refuse a stream whose samples come when the clock's samples of that time have long gone out without them."""
+    raise ReadError(
+        f"{name}: the samples of the {buffer.stream.what} lie more than {_PATIENCE // 2} samples behind those of the "
+        f"{clock.stream.what} in the file; expected streams written side by side, as they are recorded"
+    )
+
+
+def _ready(clock: _Buffer, others: list[_Buffer]) -> int:
     """How many samples of the clock have their neighbours in all other streams."""
-    if last or not others or clock.count > _PATIENCE:  # a stream that has ended does not hold up the others
+    if not others:
         return clock.count
     if any(other.count == 0 for other in others):
         return 0
