@@ -85,7 +85,7 @@ def test_apply_takes_the_drift_out_of_the_test_s_own_recording(record):
 
 
 def test_apply_refuses_what_it_cannot_correct(record):
-    with pytest.raises(RecordError, match="no x_direction: it was reduced without table_angle"):
+    with pytest.raises(RecordError, match="no x_direction: it was made without table_angle"):
         il.apply(record_of(False), flight())
     with pytest.raises(DataError, match=r"flight.csv: no column dtg_x or dtg_y; found time fog"):
         il.apply(
@@ -111,7 +111,7 @@ def test_a_record_without_direction_is_refused_by_its_name(imulab, tmp_path):
         done = imulab(*command)
         assert done.returncode == 2
         assert done.stderr.startswith(
-            "imulab: r.json: the record has no x_direction: it was reduced without table_angle"
+            "imulab: r.json: the record has no x_direction: it was made without table_angle"
         )
         assert done.stderr.count("\n") == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.csv", "r.json"]
