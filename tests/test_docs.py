@@ -37,8 +37,9 @@ def test_what_a_page_shows_runs(page, tmp_path, monkeypatch):
             assert done.returncode == 0, f"{page.name}: {line}\n{done.stderr}"
 
 
-def test_pages_with_a_worked_example_are_there():
-    assert "tumble" in [page.stem for page in PAGES]
+@pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge"])
+def test_every_procedure_has_a_worked_example(page):
+    assert page in [found.stem for found in PAGES]
 
 
 MODULES = [module.name for module in pkgutil.walk_packages(imulab.__path__, "imulab.")]
