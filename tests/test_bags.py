@@ -12,6 +12,7 @@ from rosbags.rosbag1 import Writer as Writer1
 import bags
 import imulab as il
 from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.readers import logs
 
 IMU, TEMPERATURE, FIELD = "sensor_msgs/msg/Imu", "sensor_msgs/msg/Temperature", "std_msgs/msg/String"
 EPOCH = bags.EPOCH
@@ -300,6 +301,31 @@ def test_files_of_the_official_mcap_library(tmp_path, truth, method, chunks):
         "use_summary_offsets": False,
     }
     check(il.read(official(tmp_path / "b.mcap", truth, **options)), truth)
+
+
+def test_a_large_attachment_is_passed_over_unread(tmp_path, truth, monkeypatch):
+    from mcap.writer import Writer
+
+    monkeypatch.setattr("imulab.readers.logs.BLOCK_BYTES", 10_000)
+    start = Writer.start
+
+    def start_with_attachment(self, *arguments, **options):
+        start(self, *arguments, **options)
+        self.add_attachment(0, 0, "video", "video/mp4", b"\x05" * 1_000_000)
+
+    monkeypatch.setattr(Writer, "start", start_with_attachment)
+    path = official(tmp_path / "a.mcap", truth)
+    read, sizes = logs.walk, []
+    monkeypatch.setattr("imulab.readers.logs.walk", lambda *a, **k: (sizes.append(len(a[1])), read(*a, **k))[1])
+    check(il.read(path), truth)
+    assert max(sizes) < 200_000
+    data = bytearray(path.read_bytes())
+    at = data.index(b"video/mp4") - 4 - 5 - 4 - 16 - 9  # type, name and their lengths, two times, the record's head
+    assert data[at] == 9
+    data[at + 1 : at + 9] = (1 << 40).to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(ReadError, match=r"damaged|truncated"):
+        il.read(path)
 
 
 @pytest.mark.parametrize("missing", ["repeat_schemas", "repeat_channels"])

@@ -462,3 +462,9 @@ def test_a_decimal_comma_is_recognised(file):
 def test_a_record_in_the_place_of_a_recording_is_recognised(file):
     with pytest.raises(ReadError, match=r"expected a recording, found JSON \(a calibration record\?\)"):
         read(file(b'{\n "format": "imulab.calibration"\n}\n'))
+
+
+def test_a_line_without_an_end_is_refused_in_few_words(file):
+    with pytest.raises(ReadError, match="line 1: expected a line of text, found more than 1048576 bytes") as met:
+        read(file(b"a" * 3_000_000))
+    assert len(str(met.value)) < 300

@@ -19,6 +19,7 @@ MORE, FULL, DAMAGED = range(3)
 Integers = NDArray[np.int64]
 _AT_ONCE = 1 << 18
 BLOCK_BYTES = 1 << 23
+_MCAP_READ = (3, 4, 5, 6)  # schema, channel, message, chunk; attachments may be larger than memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +104,21 @@ def walk_stream(stream: BinaryIO, kind: int, start: int, limit: int, ending: lis
                 yield records
         base += position
         rest = block[position:]
+        if status == MORE and (size := _passed_over(kind, rest, limit - base)):
+            base, rest = base + size, b""
+            stream.seek(base)
+            continue
         if status == DAMAGED or not data:
             ending.append(Ending(base, rest, status == DAMAGED))
             return
+
+
+def _passed_over(kind: int, rest: bytes, most: int) -> int:
+    """Return the size of a record that need not be read, where it is whole in the file but not in the block, or 0."""
+    if kind != MCAP or len(rest) < 9 or rest[0] in _MCAP_READ:
+        return 0
+    size = 9 + int.from_bytes(rest[1:9], "little")
+    return size if len(rest) < size <= most else 0
 
 
 def text_of(data: bytes, name: str, what: str) -> str:

@@ -198,6 +198,9 @@ class TextFile:
             return None
         line, _, self._rest = self._rest.partition(b"\n")
         self._lines_before += 1
+        if len(line) > _LONGEST_LINE:
+            place = f"{self._name}: line {self._lines_before}"
+            raise ReadError(f"{place}: expected a line of text, found more than {_LONGEST_LINE} bytes without an end")
         try:
             return line.decode("utf-8").rstrip("\r")
         except UnicodeDecodeError:
