@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.warmup.apply import record_table
+from imulab.warmup.figures import exhibits
 from imulab.warmup.model import evaluate
 from reference import warmup as reference
 
@@ -334,3 +336,19 @@ def test_fit_of_several_units_says_how_they_differ(tmp_path, capsys):
     assert "Spread between 3 units" in shown
     assert "unit left out" in shown
     assert "unit_spread_gyro_x" in il.load(tmp_path / "type.json").parameters
+
+
+def test_what_is_lost_in_the_noise_is_said_and_not_printed_as_zero(chamber):
+    """A floor of 0 is no floor, and a spread of units within twice its uncertainty asks for no table each."""
+    record = il.load(chamber / "auto.json")
+    found = dict(record.fit["repeatability"])
+    found |= {"cycle": [0.0] * 6, "standard_uncertainty": [1 * HOUR] * 6, "unit": [0.0, 1.9 * HOUR, 2.1 * HOUR] * 2}
+    shown = exhibits(replace(record, fit=record.fit | {"repeatability": found}))
+    assert "power cycles repeat to in noise" not in shown.headline
+    assert "of cycles, in noise." in shown.items[0].caption
+    spread = next(item for item in shown.items if item.title.startswith("Spread between"))
+    assert [row[1:4] for row in spread.rows[:3]] == [
+        ["in noise", "in noise", "one per type"],
+        ["1.9", "in noise", "one per type"],
+        ["2.1", "in noise", "each unit"],
+    ]
