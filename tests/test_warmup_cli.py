@@ -13,6 +13,7 @@ from imulab.cli import main
 from imulab.warmup.apply import record_table
 from imulab.warmup.figures import exhibits
 from imulab.warmup.model import evaluate
+from reference import flightlogs
 from reference import warmup as reference
 
 HOUR = np.pi / 180 / 3600
@@ -352,3 +353,39 @@ def test_what_is_lost_in_the_noise_is_said_and_not_printed_as_zero(chamber):
         ["1.9", "in noise", "one per type"],
         ["2.1", "in noise", "each unit"],
     ]
+
+
+def test_flight_logs_are_fitted_by_topic_instance_and_first_temperature(tmp_path, capsys):
+    """Three minutes on the pad, then flight: 3 s after boot, two accelerometers, the second with twice the curve."""
+    rng = np.random.default_rng(12)
+    formats = {
+        "sensor_accel": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;"
+        "float x;float y;float z;float temperature;"
+    }
+    files = []
+    for at in (0, 20):
+        for cycle in (1, 2):
+            time = np.arange(3.0, 900.0, 0.1)
+            flying = np.where(time > 240, rng.standard_normal(len(time)) * 3, 0.0)
+            data = []
+            for i, t in enumerate(time):
+                micro = round(1e6 * t)
+                for instance in (0, 1):
+                    x = (1 + instance) * 0.02 * np.exp(-t / 50) + flying[i] + 1e-4 * rng.standard_normal()
+                    row = (micro, micro, 1, x, 0.001 * rng.standard_normal(), 9.8, at + 0.01 * t)
+                    data.append((3 + instance, row))
+            log = flightlogs.ulog(formats, [(0, 3, "sensor_accel"), (1, 4, "sensor_accel")], data)
+            files.append(tmp_path / f"log_{at}_{cycle}.ulg")
+            files[-1].write_bytes(log)
+    fit = ["warmup", "fit", *files, "--temperatures", "0,20", "--settling-time", "200", "--model", "exponential"]
+    assert "no power_on_temperature" in refused(capsys, *fit)
+    fit += ["--temperature-column"]
+    assert "instance 7" in refused(capsys, *fit, "--instance", "7")
+    for instance in ("0", "1"):
+        out = tmp_path / f"{instance}.json"
+        assert main(list(map(str, [*fit, "--instance", instance, "--axes", "accel_x", "-o", out]))) == 0
+        assert "the unit moved; those seconds are left out" in capsys.readouterr().err
+        settled = np.exp(-np.arange(200.0, 239.0, 0.1) / 50).mean()  # the reference ends with the take-off
+        at = np.array([3.0, 30.0, 100.0])
+        want = (1 + int(instance)) * 0.02 * (np.exp(-at / 50) - settled)
+        np.testing.assert_allclose(evaluate(record_table(il.load(out)), at, 10.0)[0], want, atol=2e-5)
