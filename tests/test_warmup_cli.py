@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.warmup.apply import record_table
+from imulab.warmup.figures import exhibits
 from imulab.warmup.model import evaluate
+from reference import flightlogs
 from reference import warmup as reference
 
 HOUR = np.pi / 180 / 3600
@@ -334,3 +337,55 @@ def test_fit_of_several_units_says_how_they_differ(tmp_path, capsys):
     assert "Spread between 3 units" in shown
     assert "unit left out" in shown
     assert "unit_spread_gyro_x" in il.load(tmp_path / "type.json").parameters
+
+
+def test_what_is_lost_in_the_noise_is_said_and_not_printed_as_zero(chamber):
+    """A floor of 0 is no floor, and a spread of units within twice its uncertainty asks for no table each."""
+    record = il.load(chamber / "auto.json")
+    found = dict(record.fit["repeatability"])
+    found |= {"cycle": [0.0] * 6, "standard_uncertainty": [1 * HOUR] * 6, "unit": [0.0, 1.9 * HOUR, 2.1 * HOUR] * 2}
+    shown = exhibits(replace(record, fit=record.fit | {"repeatability": found}))
+    assert "power cycles repeat to in noise" not in shown.headline
+    assert "of cycles, in noise." in shown.items[0].caption
+    spread = next(item for item in shown.items if item.title.startswith("Spread between"))
+    assert [row[1:4] for row in spread.rows[:3]] == [
+        ["in noise", "in noise", "one per type"],
+        ["1.9", "in noise", "one per type"],
+        ["2.1", "in noise", "each unit"],
+    ]
+
+
+def test_flight_logs_are_fitted_by_topic_instance_and_first_temperature(tmp_path, capsys):
+    """Three minutes on the pad, then flight: 3 s after boot, two accelerometers, the second with twice the curve."""
+    rng = np.random.default_rng(12)
+    formats = {
+        "sensor_accel": "uint64_t timestamp;uint64_t timestamp_sample;uint32_t device_id;"
+        "float x;float y;float z;float temperature;"
+    }
+    files = []
+    for at in (0, 20):
+        for cycle in (1, 2):
+            time = np.arange(3.0, 900.0, 0.1)
+            flying = np.where(time > 240, rng.standard_normal(len(time)) * 3, 0.0)
+            data = []
+            for i, t in enumerate(time):
+                micro = round(1e6 * t)
+                for instance in (0, 1):
+                    x = (1 + instance) * 0.02 * np.exp(-t / 50) + flying[i] + 1e-4 * rng.standard_normal()
+                    row = (micro, micro, 1, x, 0.001 * rng.standard_normal(), 9.8, at + 0.01 * t)
+                    data.append((3 + instance, row))
+            log = flightlogs.ulog(formats, [(0, 3, "sensor_accel"), (1, 4, "sensor_accel")], data)
+            files.append(tmp_path / f"log_{at}_{cycle}.ulg")
+            files[-1].write_bytes(log)
+    fit = ["warmup", "fit", *files, "--temperatures", "0,20", "--settling-time", "200", "--model", "exponential"]
+    assert "no power_on_temperature" in refused(capsys, *fit)
+    fit += ["--temperature-column"]
+    assert "instance 7" in refused(capsys, *fit, "--instance", "7")
+    for instance in ("0", "1"):
+        out = tmp_path / f"{instance}.json"
+        assert main(list(map(str, [*fit, "--instance", instance, "--axes", "accel_x", "-o", out]))) == 0
+        assert "the unit moved; those seconds are left out" in capsys.readouterr().err
+        settled = np.exp(-np.arange(200.0, 239.0, 0.1) / 50).mean()  # the reference ends with the take-off
+        at = np.array([3.0, 30.0, 100.0])
+        want = (1 + int(instance)) * 0.02 * (np.exp(-at / 50) - settled)
+        np.testing.assert_allclose(evaluate(record_table(il.load(out)), at, 10.0)[0], want, atol=2e-5)

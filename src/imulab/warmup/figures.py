@@ -16,6 +16,7 @@ from imulab.warmup.model import Table as WarmupTable
 from imulab.warmup.model import evaluate
 
 _POINTS = 121
+_LOST = "in noise"
 _INSTANTS = (0.0, 30.0, 100.0, 200.0)
 
 
@@ -32,11 +33,12 @@ def exhibits(record: Calibration) -> Exhibits:
     before, after = (_rms(row["training"], head) * factor for row in (none, chosen))
     left = f"{plain_number(after, 2)} {label}" if after > 0 else "nothing above the noise"
     floor = record.fit["repeatability"]["cycle"]
+    jump = ("largest edge jump", "edge_jump") if table.model == "interval-cubic" else ("largest |Z(T_M)|", "exit_jump")
     facts = [
-        ("largest edge jump", f"{_largest(chosen['edge_jump'], head, factor)} {label}"),
+        (jump[0], f"{_largest(chosen[jump[1]], head, factor)} {label}"),
         ("power cycles", str(record.fit["cycles"])),
         ("T_M", f"{table.settling_time:g} s"),
-        ("left at the tests", f"{plain_number(after, 2)} {label}" if after > 0 else "within noise"),
+        ("left at the tests", _text(chosen["training"], head, factor, f" {label}")),
         ("between them", _text(chosen["left_temperature"], head, factor, f" {label}")),
         ("repeatability", _text(floor, head, factor, f" {label}")),
     ]
@@ -55,11 +57,7 @@ def exhibits(record: Calibration) -> Exhibits:
     return Exhibits(
         headline=f"The {chosen['model']} table leaves {left} of "
         f"{plain_number(before, 2)} {label} rms in the {table.settling_time:g} s after power-on"
-        + (
-            f"; power cycles repeat to {_text(floor, head, factor, f' {label}')}."
-            if record.fit["repeatability"]["degrees_of_freedom"]
-            else "."
-        ),
+        + (f"; power cycles repeat to {_text(floor, head, factor, f' {label}')}." if _rms(floor, head) > 0 else "."),
         facts=facts,
         items=items,
     )
@@ -89,8 +87,11 @@ def _rms(values: list[float | None] | None, index: list[int]) -> float:
 
 
 def _text(values: list[float | None] | None, index: list[int], factor: float, unit: str = "") -> str:
+    """Root mean square of some axes as text; what is not above the white noise has no number."""
     value = _rms(values, index) * factor
-    return "–" if np.isnan(value) else f"{plain_number(value, 2)}{unit}"
+    if np.isnan(value):
+        return "–"
+    return f"{plain_number(value, 2)}{unit}" if value > 0 else _LOST
 
 
 def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Table:
@@ -112,14 +113,14 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
                 scales,
             ]
         )
-    floor = _text(record.fit["repeatability"]["cycle"], index, factor)
+    floor = _text(record.fit["repeatability"]["cycle"], index, factor, f" {label}")
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption="Root mean square over t < T_M and all axes, white noise taken off (0: within it): of the cycles "
+        caption="Root mean square over t < T_M and all axes, white noise taken off: of the cycles "
         f"fitted, of each {what} left out, of each temperature left out (its neighbours are then twice as far as in "
         "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
-        f"once. No table can beat the repeatability of cycles, {floor} {label}.",
+        f"once. No table can beat the repeatability of cycles, {floor}.",
         columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],
         rows=rows,
         highlight=highlight,
@@ -134,15 +135,17 @@ def _units(record: Calibration, table: WarmupTable, kinds: dict[str, list[int]])
         for i in index:
             label, factor = engineering_unit(table.units[i])
             unit, cycle = found["unit"][i], found["cycle"][i]
-            cycle_text = "–" if cycle is None else plain_number(cycle * factor, 2)
-            verdict = "–" if cycle is None else ("each unit" if unit > cycle else "one per type")
-            rows.append([table.axes[i], plain_number(unit * factor, 2), cycle_text, verdict, label])
+            verdict = "–"
+            if cycle is not None:
+                clear = unit > cycle + 2 * found["standard_uncertainty"][i]
+                verdict = "each unit" if clear else "one per type"
+            shown = [_text(found[key], [i], factor) for key in ("unit", "cycle")]
+            rows.append([table.axes[i], *shown, verdict, label])
     return Table(
         title=f"Spread between {record.fit['units']} units",
         caption="Root mean square deviation of a unit's curve from that of the type, beside that of a cycle from its "
-        "unit. "
-        "Where units differ by more than their cycles do, a table for each unit would gain; otherwise one per type is "
-        "enough.",
+        "unit. Where units differ clearly more than their cycles do (by two standard uncertainties of the latter), a "
+        "table for each unit would gain; otherwise one per type is enough.",
         columns=["axis", "between units", "between cycles", "table for", "unit"],
         rows=rows,
     )

@@ -85,12 +85,11 @@ def grid(
                 "text": f"<b>{name}</b>",
                 "xref": "paper",
                 "yref": "paper",
-                "x": left + width,
+                "x": left,
                 "y": top,
-                "xanchor": "right",
-                "yanchor": "top",
+                "xanchor": "left",
+                "yanchor": "bottom",
                 "showarrow": False,
-                "bgcolor": "rgba(255,255,255,0.8)",
             }
         )
     return Figure(title=title, caption=caption, traces=traces, layout=layout, height=120 + 280 * down)

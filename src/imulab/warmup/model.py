@@ -66,6 +66,11 @@ class Table:
     time_constants: tuple[float, ...] = ()
     slopes: Array | None = None
 
+    @property
+    def scales(self) -> tuple[float, ...]:
+        """The time constants, tau0 alone, or nothing: what `basis` takes."""
+        return self.time_constants or (() if self.time_scale is None else (self.time_scale,))
+
     def to_section(self) -> dict[str, Any]:
         """Return the section ``table`` of a record, the interface to the C core."""
         section: dict[str, Any] = {
@@ -115,44 +120,20 @@ def evaluate(table: Table, time: Array, temperature: float) -> Array | None:
     """Return Z at times since power-on, shape (n,), for a power-on temperature: shape (axes, n), units of the table.
 
     None outside the table or where the temperature is not a number. NaN in time gives NaN; times before power-on count
-    as power-on itself.
+    as power-on itself. For figures and judging: what corrects recordings is the C core (`imulab.apply`).
     """
     coefficients = table.coefficients_at(temperature)
     if coefficients is None:
         return None
     end = table.settling_time
-    z = np.zeros((len(table.axes), len(time)))
-    early = ~(time >= end)  # NaN counts as early, and comes out as NaN
-    everything = bool(early.all())
-    inside = time if everything else time[early]
-    inside = np.maximum(inside, 0.0)
-    if everything:
-        z = _curve(table, coefficients, inside)
-    elif inside.size:
-        z[:, early] = _curve(table, coefficients, inside)
-    if table.exit == "zero" or everything:
-        return z
-    last = _curve(table, coefficients, np.array([end]))
-    late = ~early
-    share = np.ones(int(late.sum()))
-    if table.exit == "taper":
-        share = np.clip(1 - (time[late] - end) / table.taper_time, 0.0, 1.0)
-    z[:, late] = last * share
-    return z
-
-
-def _curve(table: Table, coefficients: Array, time: Array) -> Array:
-    """Z before T_M for coefficients (axes, p): shape (axes, n)."""
-    if table.time_constants:
-        return np.asarray(coefficients @ basis(table.model, time, table.settling_time, table.time_constants).T)
-    u = reduced_time(time, table.settling_time, table.time_scale)
-    c = coefficients[:, :, None]
-    z = c[:, 3] * u
-    for power in (2, 1):
-        z += c[:, power]
-        z *= u
-    z += c[:, 0]
-    return np.asarray(z)
+    z = coefficients @ basis(table.model, np.clip(time, 0.0, end), end, table.scales).T
+    late = time >= end
+    share = np.ones(len(time))
+    if table.exit == "zero":
+        share[late] = 0.0
+    elif table.exit == "taper":
+        share[late] = np.maximum(1 - (time[late] - end) / table.taper_time, 0.0)
+    return np.asarray(z * share)
 
 
 def reduced_time(time: Array, settling_time: float, time_scale: float | None) -> Array:
@@ -271,7 +252,6 @@ def edge_jumps(table: Table, times: Array) -> Array:
 
 def exit_jump(table: Table) -> Array:
     """Return Z(T_M) at each interval or knot, shape (r, axes): what is dropped at T_M under exit ``zero``."""
-    scales = table.time_constants or (() if table.time_scale is None else (table.time_scale,))
-    last = basis(table.model, np.array(table.settling_time), table.settling_time, scales)
+    last = basis(table.model, np.array(table.settling_time), table.settling_time, table.scales)
     found: Array = table.coefficients @ last
     return found

@@ -65,7 +65,6 @@ def make_record(
                 "degrees_of_freedom": spread.freedom,
                 "unit": None if spread.unit is None else _numbers(spread.unit),
             },
-            "exit_jump": table.exit == "zero",
             "exit_rms": _numbers(np.sqrt(np.mean(exit_jump(table) ** 2, axis=0))),
             "noise": _numbers(np.sqrt(curves.noise)),
             "coefficient_covariance": None if covariance is None else covariance.tolist(),

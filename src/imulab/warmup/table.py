@@ -6,7 +6,8 @@ forms: powers of u, whose rounding adds up to ``(1 + u + u^2 + u^3) / 2 <= 2`` L
     Z = sum_i b_i C(3, i) u^i (1 - u)^(3 - i),
 
 a weighted mean of the b_i, so that rounding adds at most 1/2 LSB, and the LSB is smaller because no b_i exceeds the
-curve by much. Source: Farouki and Rajan, Computer Aided Geometric Design 4 (1987) 191.
+curve by much. Blobs and C sources hold floats; what int16 and float arithmetic would cost is measured by the
+benchmarks with this. Source: Farouki and Rajan, Computer Aided Geometric Design 4 (1987) 191.
 """
 
 from __future__ import annotations
