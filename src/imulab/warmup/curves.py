@@ -261,7 +261,7 @@ def quiet_levels(cycles: Sequence[Cycle]) -> list[Array]:
 def _quietest(variance: Array) -> Array:
     """Least median over any minute, or over any quarter of what is shorter than four."""
     width = max(min(_QUIET, len(variance) // 4), 1)
-    windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)
+    windows = np.lib.stride_tricks.sliding_window_view(variance, width, axis=0)[:: max(width // 6, 1)]
     return np.asarray(np.median(windows, axis=-1).min(axis=0))
 
 

@@ -1,0 +1,205 @@
+"""What makes no warm-up test is refused, what makes a poor one is named; motion, noise and settling are found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import DataError, OptionError
+from imulab.recording import Recording
+from imulab.warmup.curves import make_curves
+from imulab.warmup.cycles import find_power_cycle
+from imulab.warmup.model import evaluate
+from imulab.warmup.solve import coefficients_of, fitted_noise, solve, statistics
+from test_warmup_fit import END, HOUR, cycle_of
+
+
+def flat(t):
+    return 100 * HOUR * np.exp(-t / 60)
+
+
+def test_warnings_name_what_is_wrong_with_the_test():
+    rng = np.random.default_rng(4)
+
+    def noisy(recording, **metadata):
+        extra = {n: v + 1e-6 * rng.standard_normal(len(v)) for n, v in recording.columns.items() if n != "time"}
+        return replace(recording.with_columns(extra, {}), metadata=recording.metadata | metadata)
+
+    good = [noisy(cycle_of(flat, t, name=f"good{t}{c}")) for t in (-20, 0, 20) for c in (1, 2)]
+    assert il.fit_warmup(good, temperatures=[-20, 0, 20], settling_time=END).calibration.warnings == ()
+    moving = noisy(cycle_of(flat, -20, name="moving"))
+    for axis in ("gyro_x", "accel_x"):
+        moving.columns[axis][4000:4200] += 0.05 * np.sin(np.arange(200))
+    short = noisy(cycle_of(flat, 0, name="short", duration=310))
+    warm = noisy(cycle_of(flat, 20.4, name="warm"), set_point="19")
+    far = noisy(cycle_of(flat, 0.8, name="far"))
+    late = noisy(cycle_of(flat, -20, name="late"))
+    late = late.with_columns({"time": late.column("time") + 2.5}, {})
+    fit = il.fit_warmup([*good, moving, short, warm, far, late], temperatures=[-20, 0, 20], settling_time=END)
+    text = "\n".join(fit.calibration.warnings)
+    for words in (
+        "moved; those seconds are left out: moving (12 s, first at 199 s)",
+        "ends before T_M + 30 s = 330 s, so that the second half of the cycle is its reference: short (310 s)",
+        "not cold: at power-on warmer than the chamber",
+        "warm (+1.4 K)",
+        "more than 0.5 K from the set point: far (+0.8 K)",
+        "the first sample comes late after power-on: late (2.5 s)",
+    ):
+        assert words in text
+    alone = il.fit_warmup(good[:3] + good[4:], temperatures=[-20, 0, 20], settling_time=END)
+    assert any("one cycle only at 0 degC" in message for message in alone.calibration.warnings)
+    drifting = [cycle_of(lambda t: flat(t), t, name=f"d{t}{c}") for t in (-20, 0) for c in (1, 2)]
+    drifting = [noisy(r.with_columns({"gyro_x": r.column("gyro_x") + 2e-7 * r.column("time")}, {})) for r in drifting]
+    found = il.fit_warmup(drifting, temperatures=[-20, 0], settling_time=END).calibration.warnings
+    assert any("gyro still drifts in the settled part of 4 of 4" in message for message in found)
+
+
+@pytest.mark.parametrize(
+    ("temperatures", "options", "kind", "words"),
+    [
+        (
+            [-20, 0, 21.5],
+            {},
+            DataError,
+            "c2: power-on temperature 21.5 degC fits no calibration temperature within 1 K",
+        ),
+        ([-20, -20, 0], {}, DataError, "no power cycle at 20 degC among 3 files: every interval needs"),
+        ([], {}, DataError, "no power cycles"),
+        ([-20, 0, 20], {"temperatures": [0.0]}, OptionError, "two or more, ascending"),
+        ([-20, 0, 20], {"temperatures": [20.0, 0]}, OptionError, "two or more, ascending"),
+        ([-20, 0, 20], {"tolerance": 11}, OptionError, "tolerance 11 K"),
+        ([-20, 0, 20], {"model": "quartic"}, OptionError, "expected one of interval-cubic knot-cubic"),
+        ([-20, 0, 20], {"exit_rule": "fade"}, OptionError, "expected one of zero hold taper"),
+        ([-20, 0, 20], {"pool": "all"}, OptionError, "expected one of unit type"),
+        ([-20, 0, 20], {"pool": "type"}, DataError, "no serial in the head"),
+        ([-20, 0, 20], {"settling_time": -5}, OptionError, "settling time"),
+        ([-20, 0, 20], {"settling_time": 5}, DataError, "5 s of samples before T_M"),
+        ([-20, 0, 20], {"axes": ["gyro_q"]}, DataError, "no column gyro_q; found gyro_x accel_x"),
+    ],
+)
+def test_what_makes_no_test_is_refused(temperatures, options, kind, words):
+    cycles = [cycle_of(flat, t, name=f"c{i}", duration=360, rate=5) for i, t in enumerate(temperatures)]
+    with pytest.raises(kind, match=words):
+        il.fit_warmup(cycles, **({"temperatures": [-20, 0, 20]} | options))
+
+
+def test_a_flight_log_is_fitted_where_the_vehicle_stood_still():
+    """400 s at rest, then flight: the same table as from the 400 s alone, and the flight is named."""
+    rng = np.random.default_rng(6)
+    logs, cut = [], []
+    for t in (0, 20):
+        for c in (1, 2):
+            whole = cycle_of(lambda s, t=t: (1 + t / 40) * flat(s), t, name=f"log{t}{c}", duration=700)
+            time = whole.column("time")
+            flying = np.where(time > 400, 0.2 * np.sin(3 * time) * np.sin(1.7 * time + 1), 0.0)
+            noise = 1e-6 * rng.standard_normal((2, len(time)))
+            columns = {axis: whole.column(axis) + flying + noise[i] for i, axis in enumerate(("gyro_x", "accel_x"))}
+            logs.append(whole.with_columns(columns, {}))
+            early = {name: values[time < 399] for name, values in logs[-1].columns.items()}
+            cut.append(replace(logs[-1], columns=early))
+    options = {"temperatures": [0, 20], "settling_time": END, "model": "knot-log-cubic"}
+    fit = il.fit_warmup(logs, **options)
+    assert any("the unit moved" in message and "first at" in message for message in fit.calibration.warnings)
+    time = np.arange(0, 300.0)
+    want = evaluate(il.fit_warmup(cut, **options).table, time, 10.0)
+    np.testing.assert_allclose(evaluate(fit.table, time, 10.0), want, atol=2 * HOUR)
+
+
+def test_a_log_that_is_flight_for_the_most_part_is_fitted_where_it_stood_still():
+    """350 s at rest and 1250 s of flight, whose turns move the bins' means too: the same table as from the rest."""
+    rng = np.random.default_rng(8)
+    logs, cut = [], []
+    for t in (0, 20):
+        for c in (1, 2):
+            whole = cycle_of(lambda s, t=t: (1 + t / 40) * flat(s), t, name=f"log{t}{c}", duration=1600)
+            time = whole.column("time")
+            turns = 0.5 * np.sin(time / 9) + 0.05 * rng.standard_normal(len(time))
+            flying = np.where(time > 350, turns, 0.0)
+            noise = 1e-6 * rng.standard_normal((2, len(time)))
+            columns = {axis: whole.column(axis) + flying + noise[i] for i, axis in enumerate(("gyro_x", "accel_x"))}
+            logs.append(whole.with_columns(columns, {}))
+            early = {name: values[time < 349] for name, values in logs[-1].columns.items()}
+            cut.append(replace(logs[-1], columns=early))
+    options = {"temperatures": [0, 20], "settling_time": END, "model": "knot-log-cubic"}
+    fit = il.fit_warmup(logs, **options)
+    assert any("log01 (1251 s, first at 349 s)" in message for message in fit.calibration.warnings)
+    time = np.arange(0, 300.0)
+    want = evaluate(il.fit_warmup(cut, **options).table, time, 10.0)
+    np.testing.assert_allclose(evaluate(fit.table, time, 10.0), want, atol=2 * HOUR)
+
+
+def test_a_cycle_that_moves_throughout_is_known_by_the_others():
+    rng = np.random.default_rng(9)
+    cycles = [cycle_of(flat, t, name=f"c{t}{c}") for t in (0, 20) for c in (1, 2)]
+    for cycle in cycles:
+        cycle.columns["gyro_x"] += 1e-6 * rng.standard_normal(len(cycle))
+    cycles[2].columns["gyro_x"] += 1e-4 * rng.standard_normal(len(cycles[2]))
+    with pytest.raises(DataError, match="c201: the unit moved from 0 s on: 0 s at rest are too few"):
+        il.fit_warmup(cycles, temperatures=[0, 20], settling_time=END)
+
+
+@pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"])
+def test_noise_alone_leaves_nothing_at_the_tests(model):
+    """A fit follows some of the noise of its own cycles: what is taken off is that much smaller."""
+    scales = {"knot-log-cubic": (20.0,), "exponential": (20.0, 90.0)}.get(model, ())
+    rng = np.random.default_rng(10)
+    at, left, unseen = np.array([-20.0, 0, 20]), [], []
+    for _ in range(60):
+        noise = {(t, c): HOUR * 100 * rng.standard_normal(900) for t in at for c in (1, 2)}
+        cycles = [
+            find_power_cycle(
+                Recording(
+                    {"time": np.arange(900) / 2, "gyro_x": values},
+                    {"time": "s", "gyro_x": "rad/s"},
+                    {"power_on_temperature": str(t + rng.uniform(-0.5, 0.5))},
+                )
+            )
+            for (t, _), values in noise.items()
+        ]
+        curves, _ = make_curves(cycles, at, tolerance=1, settling_time=END, limit={})
+        sums = statistics(curves, model, scales)
+        solution = solve(curves, model, scales, sums, np.ones(6))
+        square = sums.mean_square(coefficients_of(curves, solution.table))
+        left.append((square - fitted_noise(curves, solution, sums)).mean() / HOUR**2)
+        unseen.append((square - curves.expected_noise()).mean() / HOUR**2)
+    error = np.std(left) / np.sqrt(len(left))
+    print(model, np.mean(left), error, np.mean(unseen))
+    assert abs(np.mean(left)) < 3.5 * error
+    assert np.mean(unseen) < -3.5 * error  # so the plain noise would take off too much
+
+
+def test_the_settling_time_is_the_longest_of_the_units():
+    def cycles(tau):
+        return [
+            cycle_of(lambda s, tau=tau[u]: 200 * HOUR * np.exp(-s / tau), t, name=f"{u}{t}", serial=u)
+            for u in tau
+            for t in (0, 20)
+        ]
+
+    quick, mixed = cycles({"A": 20.0, "B": 20.0, "C": 20.0}), cycles({"A": 20.0, "B": 20.0, "C": 60.0})
+    options = {"temperatures": [0, 20], "pool": "type", "model": "knot-cubic"}
+    # 200 exp(-t / tau) is below 5 % from 3 tau on; the mean over units would be there at 118 s
+    assert il.fit_warmup(quick, **options).table.settling_time == pytest.approx(60, abs=15)
+    assert il.fit_warmup(mixed, **options).table.settling_time == pytest.approx(180, abs=20)
+
+
+def test_a_table_that_outlasts_its_data_says_so():
+    cycles = [cycle_of(flat, t, name=f"{t}{c}") for t in (0, 20) for c in (1, 2)]
+    warnings = il.fit_warmup(cycles, temperatures=[0, 20], settling_time=500).calibration.warnings
+    assert any("no cycle at 0 20 degC lasts to T_M = 500 s: the table goes on from 400 s" in text for text in warnings)
+
+
+def test_repeatability_lost_in_the_noise_has_an_uncertainty():
+    rng = np.random.default_rng(11)
+    values = []
+    for _ in range(40):  # no scatter but noise: the square is as often below zero, and 95 % lie within two of it
+        cycles = [cycle_of(flat, t, name=f"{t}{c}", rate=2) for t in (0, 20) for c in (1, 2, 3)]
+        for cycle in cycles:
+            cycle.columns["gyro_x"] += 1e-4 * rng.standard_normal(len(cycle))
+        fit = il.fit_warmup(cycles, temperatures=[0, 20], settling_time=END, model="knot-cubic", axes=["gyro_x"])
+        values.append((fit.repeatability.cycle[0], fit.repeatability.uncertainty[0]))
+    value, uncertainty = np.array(values).T
+    assert (uncertainty > 0).all()
+    assert 0.3 < (value == 0).mean() < 0.8
+    assert (value <= 2 * uncertainty).mean() >= 0.9
