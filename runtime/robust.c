@@ -1,65 +1,16 @@
 /* Gyro array, the robust method: one sample of one axis.
  *
- * Residuals are taken against the mean of the same sample, so that motion, which all gyros share, cancels in them; biases
- * follow the residuals so that their sum, which the array cannot see, never changes. Variances come from the residuals by
- * the N-cornered hat (Grubbs 1948): of e_i = r_i - mean(r), E e_i^2 = (1 - 2/m) v_i + sum_j v_j / m^2, hence
+ * Residuals are taken against the mean of the same sample, so that motion, which all gyros share, cancels in them. Biases
+ * follow them, b_i += g_i e_i with sum e_i = 0: the sum of the biases, which the array cannot see, stays while all have
+ * learnt alike; otherwise sum b_i / g_i does, so that who has seen little moves to the others, and not they to it.
+ * Variances come from the residuals by the N-cornered hat (Grubbs 1948): of e_i = r_i - mean(r),
+ * E e_i^2 = (1 - 2/m) v_i + sum_j v_j / m^2, hence
  *   v_i = m/(m-2) [e_i^2 - sum_j e_j^2 / (m(m-1))],
  * averaged sample by sample, which stays right when the set of gyros changes. A gyro's reading counts in the output while it
- * is inside the gate about the median, and teaches while it is inside the narrower gate of its own noise.
+ * is inside the gate about the median, and teaches while it is inside the narrower gate of its own noise; no more than
+ * MOST sigma of it teach, or a gyro that leaves the others slowly would open its gate ahead of itself (Huber 1964).
  */
-#include "array.h"
-
-#if IL_FLOAT
-#define ROUNDING 1e-5f /* of a reading: closer than this, two readings agree */
-#else
-#define ROUNDING 1e-12
-#endif
-#define OWN IL_C(16.0)        /* residuals that the mean variance of the array counts for in each gyro's own */
-#define CALIBRATED IL_C(200.0) /* the same where a calibration says how the variances compare */
-#define DEVIATION IL_C(1.4826) /* median absolute deviation to standard deviation */
-
-enum { STUCK = 1, OUT = 2, FRESH = 4, JUMPED = 8 }; /* standing of a gyro, from sample to sample */
-enum { ENOUGH = 20 };                               /* repeats that nobody takes for chance */
-
-/* One sample at work. */
-typedef struct {
-    uint8_t usable[IL_ARRAY_ELEMENTS], core[IL_ARRAY_ELEMENTS], inside[IL_ARRAY_ELEMENTS];
-    uint8_t learns[IL_ARRAY_ELEMENTS], used[IL_ARRAY_ELEMENTS];
-    il_real r[IL_ARRAY_ELEMENTS];    /* reading less bias */
-    il_real trust[IL_ARRAY_ELEMENTS]; /* variance as far as it can be trusted */
-    il_real half[IL_ARRAY_ELEMENTS];  /* width of the gate */
-    il_real middle;                  /* median of those trusted */
-    il_real mean_variance;
-    uint32_t learnt; /* residuals of the most experienced gyro */
-    int waived;      /* nobody is trusted: the quiet period does not count */
-} sample;
-
-static il_real larger(il_real a, il_real b) {
-    return a > b ? a : b;
-}
-
-static il_real median(il_real *values, int32_t n) {
-    for (int32_t i = 1; i < n; i++) { /* insertion sort: n is small */
-        il_real v = values[i];
-        int32_t j = i;
-        for (; j > 0 && values[j - 1] > v; j--) values[j] = values[j - 1];
-        values[j] = v;
-    }
-    return n % 2 ? values[n / 2] : IL_C(0.5) * (values[n / 2 - 1] + values[n / 2]);
-}
-
-/* Median of the chosen values, and their typical distance from it as a standard deviation. */
-static il_real median_of(int32_t n, const uint8_t *chosen, const il_real *values, il_real *typical) {
-    il_real sorted[IL_ARRAY_ELEMENTS];
-    int32_t count = 0;
-    for (int32_t i = 0; i < n; i++) {
-        if (chosen[i]) sorted[count++] = values[i];
-    }
-    il_real middle = median(sorted, count);
-    for (int32_t i = 0; i < count; i++) sorted[i] = il_fabs(sorted[i] - middle);
-    *typical = DEVIATION * median(sorted, count);
-    return middle;
-}
+#include "robust.h"
 
 /* Most of what this gyro taught was wrong: the others settle among themselves, and it starts anew. */
 static void forget(const il_array *a, il_array_axis *s, int32_t i) {
@@ -171,26 +122,16 @@ static il_real weight_of_evidence(const il_array *a, const il_array_axis *s, int
     return a->memory > IL_C(0.0) && count * a->memory > IL_C(1.0) ? IL_C(1.0) / a->memory : count;
 }
 
-/* Variance of a gyro, drawn to the mean of all while it rests on few residuals: (prior v_mean + count v) / (both). */
-static il_real drawn(const il_array *a, const il_array_axis *s, const sample *p, int32_t i, il_real count, il_real share) {
-    il_real prior = a->weight != NULL ? CALIBRATED : OWN;
-    il_real mixed = (prior * s->ratio[i] * p->mean_variance + count * s->variance[i]) * share;
-    return larger(larger(mixed, a->weight_floor * p->mean_variance), IL_TINY);
-}
-
-static il_real trusted(const il_array *a, const il_array_axis *s, const sample *p, int32_t i) {
-    il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = weight_of_evidence(a, s, i);
-    return drawn(a, s, p, i, count, IL_C(1.0) / (prior + count));
-}
-
-static void trust_all(const il_array *a, const il_array_axis *s, sample *p) {
+/* Variances, drawn to the mean of all while they rest on few residuals. */
+static void trust(const il_array *a, const il_array_axis *s, sample *p) {
     il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = IL_C(0.0), share = IL_C(0.0);
+    il_real own = prior * p->mean_variance, least = larger(a->weight_floor * p->mean_variance, IL_TINY);
     for (int32_t i = 0; i < a->elements; i++) {
         if (i == 0 || s->seen[i] != s->seen[i - 1]) { /* nearly always all have seen the same: one division serves */
             count = weight_of_evidence(a, s, i);
             share = IL_C(1.0) / (prior + count);
         }
-        p->trust[i] = drawn(a, s, p, i, count, share);
+        p->trust[i] = larger((own * s->ratio[i] + count * s->variance[i]) * share, least);
     }
 }
 
@@ -200,12 +141,15 @@ static void gates(const il_array *a, il_array_axis *s, const il_real *z, sample 
     p->middle = il_nan();
     if (core > 0) p->middle = median_of(a->elements, p->core, p->r, &spread);
     for (int32_t i = 0; i < a->elements; i++) {
-        p->inside[i] = p->learns[i] = (uint8_t)(p->usable[i] && core < 3);
+        /* of two that are trusted none can judge the other, but both can judge who wants to come back */
+        int judged = core > 2 || (core == 2 && !p->core[i]);
+        p->inside[i] = p->learns[i] = (uint8_t)(p->usable[i] && !judged);
         p->half[i] = IL_C(0.0);
-        if (!p->usable[i] || core < 3) continue;
+        if (!p->usable[i] || !judged) continue;
         il_real narrow = (core > 3 ? IL_C(30.0) : IL_C(100.0)) * spread; /* three gyros tell little about their noise */
         if (p->learnt >= 2) {
-            il_real young = IL_C(1.0) + OWN / (il_real)(s->seen[i] > 0 ? s->seen[i] : 1);
+            uint32_t known = s->seen[i] > s->calm[i] ? s->seen[i] : s->calm[i];
+            il_real young = IL_C(1.0) + OWN / (il_real)(known > 0 ? known : 1);
             il_real noise = p->trust[i] + IL_C(2.0) * p->mean_variance / (il_real)core;
             narrow = a->gate * young * il_sqrt(noise);
         }
@@ -215,11 +159,12 @@ static void gates(const il_array *a, il_array_axis *s, const il_real *z, sample 
         p->half[i] = larger(narrow, a->spread_gate * spread);
         il_real distance = il_fabs(p->r[i] - p->middle);
         p->learns[i] = distance <= narrow;
-        p->inside[i] = distance <= p->half[i] || (s->standing[i] & FRESH) != 0;
+        /* a bias that is learnt anew has half of the watch to settle */
+        p->inside[i] = distance <= p->half[i] || ((s->standing[i] & FRESH) && s->calm[i] < a->quiet / 2);
     }
 }
 
-/* A gyro beyond the gate that stays off by the same amount has jumped. */
+/* A gyro that left the gate and stays off by the same amount has jumped, also if its noise takes it in at times. */
 static void follow(const il_array *a, il_array_axis *s, const sample *p, int32_t i) {
     il_real distance = p->r[i] - p->middle;
     if (++s->away[i] == 1) {
@@ -232,7 +177,8 @@ static void follow(const il_array *a, il_array_axis *s, const sample *p, int32_t
     }
     if (s->away[i] < a->jump) return;
     il_real scatter = il_sqrt(s->away_square[i] / (il_real)(s->away[i] - 1));
-    if (scatter <= p->half[i] / IL_C(2.0) && il_fabs(s->away_mean[i]) > a->scale_tolerance * il_fabs(p->middle)) {
+    il_real least = larger(il_sqrt(p->trust[i]), a->scale_tolerance * il_fabs(p->middle));
+    if (scatter <= p->half[i] / IL_C(2.0) && il_fabs(s->away_mean[i]) > least) {
         if (s->away[i] >= s->seen[i]) forget(a, s, i);
         jump(s, i);
     }
@@ -257,7 +203,12 @@ static void judge(const il_array *a, il_array_axis *s, const sample *p) {
             if (s->standing[i] & STUCK) s->standing[i] &= (uint8_t)~JUMPED;
             continue;
         }
-        s->bad[i] = s->away[i] = 0;
+        s->bad[i] = 0;
+        if ((s->standing[i] & (OUT | FRESH)) == OUT && p->half[i] > IL_C(0.0)) {
+            follow(a, s, p, i);
+        } else {
+            s->away[i] = 0;
+        }
         if (!(s->standing[i] & OUT) || ++s->calm[i] <= a->quiet) continue;
         if (s->standing[i] & FRESH) {
             if (s->seen[i] == 0) s->variance[i] = p->mean_variance;
@@ -290,8 +241,9 @@ static void weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t 
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] = i == top ? cap : s->weight[i] / rest * (IL_C(1.0) - cap);
 }
 
-/* A jump too small for the gate shows in the mean of a second, where the others' means agree. */
-static void find_small_jumps(const il_array *a, il_array_axis *s, const sample *p) {
+/* A jump too small for the gate shows in the mean of a second, where the others' means agree. Not while the array as a
+ * whole is finding its biases; but a gyro that came back is watched at once. */
+static void find_small_jumps(const il_array *a, il_array_axis *s, sample *p) {
     il_real share = IL_C(1.0) / (IL_C(2.0) * (il_real)a->quiet), largest = IL_C(0.0), smallest = IL_C(-1.0), scatter;
     il_real least = larger(IL_C(64.0) * share, IL_C(1.0)); /* variances: (8 sqrt(f / 2))^2 */
     for (int32_t i = 0; i < a->elements; i++) {
@@ -302,9 +254,11 @@ static void find_small_jumps(const il_array *a, il_array_axis *s, const sample *
     /* No two means are further apart than twice the largest; half, because one sample moves a variance a little. */
     if (IL_C(4.0) * largest <= IL_C(0.5) * least * smallest) return;
     il_real usual = median_of(a->elements, p->learns, s->fast, &scatter);
+    trust(a, s, p); /* the sample has changed the variances */
+    uint64_t young = (uint64_t)a->quiet * (p->learnt < (uint64_t)FORMING * a->quiet ? FORMING : 1);
     for (int32_t i = 0; i < a->elements; i++) {
-        if (!p->learns[i] || s->seen[i] / 5 < a->quiet) continue; /* fewer than 5 quiet periods, without overflow */
-        il_real limit = larger(il_sqrt(least * trusted(a, s, p, i)), IL_C(8.0) * scatter);
+        if (!p->learns[i] || s->seen[i] < young) continue;
+        il_real limit = larger(il_sqrt(least * p->trust[i]), IL_C(8.0) * scatter);
         limit = larger(limit, a->scale_tolerance * il_fabs(p->middle));
         if (il_fabs(s->fast[i] - usual) > limit) jump(s, i);
     }
@@ -316,22 +270,35 @@ static il_real learning_gain(const il_array *a, uint32_t seen) {
     return a->memory > IL_C(0.0) ? larger(a->memory, IL_C(1.0) / (il_real)seen) : growing;
 }
 
-/* Biases, variances and means of a second take in the sample; learns[] says whose. */
-static void learn(const il_array *a, il_array_axis *s, const sample *p, int32_t pupils) {
-    il_real m = (il_real)pupils, centre = IL_C(0.0), squares = IL_C(0.0), shift = IL_C(0.0), gain = IL_C(0.0);
-    il_real e[IL_ARRAY_ELEMENTS], gains[IL_ARRAY_ELEMENTS], recent = IL_C(1.0) / (il_real)a->quiet;
-    uint32_t known = 0; /* nearly always all gyros have seen the same: one division serves */
-    for (int32_t i = 0; i < a->elements; i++) centre += p->learns[i] ? p->r[i] : IL_C(0.0);
-    centre /= m;
+/* Residuals against the mean of those who learn, of readings held to what may teach about the fused rate. */
+static void residuals(const il_array *a, const il_array_axis *s, const sample *p, il_real m, il_real rate, il_real *e) {
+    il_real mean = IL_C(0.0), most = MOST * MOST * p->mean_variance;
     for (int32_t i = 0; i < a->elements; i++) {
-        e[i] = gains[i] = IL_C(0.0);
+        e[i] = p->learns[i] ? p->r[i] - rate : IL_C(0.0);
+        if (e[i] * e[i] > most && e[i] * e[i] > MOST * MOST * p->trust[i] && s->seen[i] >= SETTLING) {
+            il_real bound = MOST * il_sqrt(larger(p->trust[i], p->mean_variance));
+            e[i] = e[i] > IL_C(0.0) ? bound : -bound;
+        }
+        mean += e[i];
+    }
+    mean /= m;
+    for (int32_t i = 0; i < a->elements; i++) e[i] -= p->learns[i] ? mean : IL_C(0.0);
+}
+
+/* Biases, variances and means of a second take in the sample; learns[] says whose. */
+static void learn(const il_array *a, il_array_axis *s, sample *p, int32_t pupils, il_real rate) {
+    il_real m = (il_real)pupils, squares = IL_C(0.0), gain = IL_C(0.0), recent = IL_C(1.0) / (il_real)a->quiet;
+    il_real e[IL_ARRAY_ELEMENTS], gains[IL_ARRAY_ELEMENTS];
+    residuals(a, s, p, m, rate, e);
+    uint32_t known = 0; /* nearly always all gyros have seen the same: one division serves */
+    for (int32_t i = 0; i < a->elements; i++) {
+        gains[i] = IL_C(0.0);
         if (!p->learns[i]) continue;
         il_count(&s->seen[i]);
         if (s->seen[i] != known) {
             known = s->seen[i];
             gain = learning_gain(a, known);
         }
-        e[i] = p->r[i] - centre;
         gains[i] = gain;
         squares += e[i] * e[i];
         /* a start other than 1 is experience in the bias, from the second residual on */
@@ -340,20 +307,17 @@ static void learn(const il_array *a, il_array_axis *s, const sample *p, int32_t 
             bias_gain = learning_gain(a, il_counted(known, a->start - 1));
         }
         s->bias[i] += bias_gain * e[i];
-        shift += bias_gain * e[i];
     }
-    shift /= m;
-    il_real hat = pupils > 2 ? m / (m - IL_C(2.0)) : IL_C(0.0);
+    if (pupils < 3) return;
     squares /= m * (m - IL_C(1.0));
+    il_real hat = m / (m - IL_C(2.0));
     for (int32_t i = 0; i < a->elements; i++) {
         if (!p->learns[i]) continue;
-        s->bias[i] -= shift;
-        if (pupils < 3) continue;
         il_real grubbs = hat * (e[i] * e[i] - squares);
         s->variance[i] = (IL_C(1.0) - gains[i]) * (s->variance[i] + gains[i] * grubbs);
-        s->fast[i] = (IL_C(1.0) - recent) * s->fast[i] + recent * e[i];
+        s->fast[i] = (IL_C(1.0) - recent) * s->fast[i] + recent * (p->r[i] - rate); /* as it came */
     }
-    if (pupils > 2) find_small_jumps(a, s, p);
+    find_small_jumps(a, s, p);
 }
 
 /* All is well in nearly every sample; then the gates need no median. Of any numbers, the median is no further from the
@@ -386,7 +350,7 @@ static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, sam
     int32_t used = 0, nearest = -1;
     gates(a, s, z, p, roll_call(a, s, p));
     judge(a, s, p);
-    trust_all(a, s, p); /* a gyro that is back has another variance now */
+    trust(a, s, p);
     for (int32_t i = 0; i < a->elements; i++) {
         int here = p->waived ? p->core[i] : p->usable[i] && !(s->standing[i] & OUT);
         p->used[i] = (uint8_t)(here && p->inside[i]);
@@ -431,11 +395,11 @@ il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, co
         if (s->seen[i] > p.learnt) p.learnt = s->seen[i];
     }
     p.mean_variance = mean_variance(a, s);
+    trust(a, s, &p);
     for (int32_t i = 0; i < a->elements; i++) {
         p.r[i] = z[i] - s->bias[i];
         p.used[i] = p.learns[i] = 1;
     }
-    trust_all(a, s, &p);
     int closely = closer || !all_inside(a, s, &p);
     if (closely) used = choose(a, s, z, &p);
     if (used == 0) {
@@ -452,6 +416,6 @@ il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, co
         report(a, s, &p, used);
         if (used < a->elements) teach_fresh(a, s, &p, rate);
     }
-    if (pupils >= 2) learn(a, s, &p, pupils);
+    if (pupils >= 2) learn(a, s, &p, pupils, rate);
     return rate;
 }

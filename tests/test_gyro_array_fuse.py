@@ -83,10 +83,21 @@ def test_feedback_agrees_with_its_transcription_from_every_start(initial, start,
     np.testing.assert_allclose(ours.rate[:, 0], theirs, rtol=0, atol=12.5e-12)
 
 
-def test_robust_agrees_with_its_transcription_under_faults_flags_and_weights_included():
-    readings = faulty()
+def _clipped(limit: float, elements: int) -> np.ndarray:
+    readings = dynamic(7, count=2500, elements=elements)[0]
+    readings[:, 2] = np.clip(readings[:, 2], -limit, limit)
+    readings[1500:1600, 0] = np.nan
+    readings[2000:, 1] += 0.45
+    return readings
+
+
+@pytest.mark.parametrize(
+    "readings", [faulty(), _clipped(1.0, 3), _clipped(4.0, 4), _clipped(8.0, 6), _clipped(11.0, 7)],
+    ids=["mixed", "three", "four", "six", "seven"],
+)  # fmt: skip
+def test_robust_agrees_with_its_transcription_under_faults_flags_and_weights_included(readings):
     ours = fuse(array_recording(readings), FuseOptions(rate=50.0), weights=True)
-    recursion = reference.Robust(6, rate=50.0)
+    recursion = reference.Robust(readings.shape[1], rate=50.0)
     for k, row in enumerate(readings.tolist()):
         rate = recursion.step(row)
         assert ours.rate[k, 0] == pytest.approx(rate, abs=1e-11, nan_ok=True), k

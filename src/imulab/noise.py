@@ -60,17 +60,37 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class NoiseCoefficients:
-    """Coefficients N, B, K of ``sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3``."""
+    """Coefficients N, B, K of ``sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3``.
+
+    `covariance` is that of their squares (N^2, B^2, K^2) as the curve gives them, shape (3, 3).
+    """
 
     angle_random_walk: Coefficient
     bias_instability: Coefficient
     rate_random_walk: Coefficient
+    covariance: Array
 
     def variance(self, tau: Array) -> Array:
         """Return the Allan variance that the coefficients predict, shape of `tau`."""
         values = [getattr(self, name).value ** 2 for name in COEFFICIENTS]
         variance: Array = _terms(tau) @ np.array(values)
         return variance
+
+    def mean_uncertainty(self, duration: float) -> float:
+        """Return the standard uncertainty of the mean over a duration, s, as an estimate of the bias.
+
+        ``u^2 = E[x | x >= N^2 / T]``, x normal about the Allan variance that the coefficients predict at T, with the
+        variance that their covariance gives it: what the curve, which ends at T / 5, leaves open counts as well. A
+        recording that is shorter than the noise is correlated cannot show it.
+        """
+        terms = _terms(np.array([duration]))[0]
+        predicted = float(self.variance(np.array([duration]))[0])
+        spread = math.sqrt(max(float(terms @ self.covariance @ terms), 0.0))
+        if spread == 0.0:
+            return math.sqrt(predicted)
+        cut = (float(terms[0]) * self.angle_random_walk.value**2 - predicted) / spread
+        density, above = math.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi), math.erfc(cut / math.sqrt(2)) / 2
+        return math.sqrt(predicted + spread * density / above)
 
 
 def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -> AllanCurve:
@@ -120,9 +140,8 @@ def read_coefficients(curve: AllanCurve) -> NoiseCoefficients:
     """Read angle random walk, bias instability and rate random walk from an Allan curve, with uncertainties.
 
     Non-negative generalised least squares of ``sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3`` over
-    averaging
-    times up to a fifth of the recording; an estimate's relative variance is 2 / freedom, neighbours are correlated.
-    A coefficient that the curve does not show is 0 with the size that it may have as its uncertainty.
+    averaging times up to about a fifth of the recording; an estimate's relative variance is 2 / freedom, neighbours are
+    correlated. A coefficient that the curve does not show is 0 with the size that it may have as its uncertainty.
 
     Raises
     ------
@@ -134,7 +153,7 @@ def read_coefficients(curve: AllanCurve) -> NoiseCoefficients:
     use = (curve.freedom >= _LONGEST - 1) & (curve.deviation > 0)
     if not (curve.deviation > 0).any():
         zero = Coefficient(0.0, 0.0)
-        return NoiseCoefficients(zero, zero, zero)
+        return NoiseCoefficients(zero, zero, zero, np.zeros((3, 3)))
     if np.count_nonzero(use) < 4:
         raise DataError("noise coefficients: the recording is too short; expected some 50 samples or more")
     tau, variance = curve.tau[use], curve.deviation[use] ** 2
@@ -158,7 +177,8 @@ def read_coefficients(curve: AllanCurve) -> NoiseCoefficients:
     for value, spread in zip(values, np.sqrt(np.diag(covariance)), strict=True):
         size = math.sqrt(value)
         found.append(Coefficient(size, float(min(spread / (2 * size) if size else math.inf, math.sqrt(spread)))))
-    return NoiseCoefficients(*found)
+    white, flicker, walk = found
+    return NoiseCoefficients(white, flicker, walk, covariance)
 
 
 def noise_columns(recording: Recording) -> Iterator[str]:

@@ -216,21 +216,21 @@ class Robust:
         for i in range(n):
             if not usable[i]:
                 continue
-            if len(core) < 3:
+            if len(core) < 2 or (len(core) == 2 and i in core):  # two judge who comes back, not each other
                 inside[i] = learn[i] = True
                 continue
             if learnt < 2:
                 narrow = (30.0 if len(core) > 3 else 100.0) * spread
             else:
                 sigma = math.sqrt(self._variance(i, vbar) + 2 * vbar / len(core))
-                narrow = self.gate * (1 + 16 / max(self.count[i], 1)) * sigma
+                narrow = self.gate * (1 + 16 / max(self.count[i], self.calm[i], 1)) * sigma
             if self.resolution < math.inf:
                 narrow = max(narrow, 1.5 * self.resolution)
             narrow = max(narrow, 1e-12 * max(abs(z[i]), abs(middle)))
             half[i] = max(narrow, self.spread_gate * spread)
             distance = abs(r[i] - middle)
             learn[i] = distance <= narrow
-            inside[i] = distance <= half[i] or self.fresh[i]
+            inside[i] = distance <= half[i] or (self.fresh[i] and self.calm[i] < self.quiet_after // 2)
         # 4. what that does to each gyro
         for i in range(n):
             if not usable[i]:
@@ -247,9 +247,13 @@ class Robust:
                 self.calm[i] = 0
                 if self.bad[i] >= max(self.quiet_after // 5, 1):
                     self.out[i] = True
-                self._follow_away(i, r[i] - middle, middle, half[i])
+                self._follow_away(i, r[i] - middle, middle, half[i], vbar)
             else:
-                self.bad[i] = self.away[i] = 0
+                self.bad[i] = 0
+                if self.out[i] and not self.fresh[i] and half[i] > 0:
+                    self._follow_away(i, r[i] - middle, middle, half[i], vbar)
+                else:
+                    self.away[i] = 0
                 if self.out[i]:
                     self.calm[i] += 1
                     if self.calm[i] > self.quiet_after:
@@ -278,42 +282,45 @@ class Robust:
                 flags[i] |= JUMPED
         pupils = [i for i in used if learn[i]]
         if len(pupils) >= 2:
-            self._learn(pupils, r, middle, vbar)
+            self._learn(pupils, r, rate, middle, vbar, learnt)
         self.weights, self.flags = w, flags
         return rate
 
-    def _learn(self, pupils, r, middle, vbar):
+    def _learn(self, pupils, r, rate, middle, vbar, learnt):
         m = len(pupils)
-        centre = mean_of([r[i] for i in pupils])
-        e = {i: r[i] - centre for i in pupils}
+        # No more than 3 sigma from the fused rate teach, once there is a variance to tell.
+        held = {i: r[i] - rate for i in pupils}
+        for i in pupils:
+            if self.count[i] >= 16:
+                most = 3 * math.sqrt(max(self._variance(i, vbar), vbar))
+                held[i] = min(max(held[i], -most), most)
+        centre = mean_of(list(held.values()))
+        e = {i: held[i] - centre for i in pupils}
         squares = sum(x * x for x in e.values())
-        gain = {}
         for i in pupils:
             self.count[i] += 1
-            gain[i] = 1 / min(self.count[i], self.cap) if self.memory is None else max(self.memory, 1 / self.count[i])
-        shift = mean_of([gain[i] * e[i] for i in pupils])
-        for i in pupils:
-            g = gain[i]
-            self.b[i] += g * e[i] - shift
-            if m < 3:
-                continue
-            grubbs = m / (m - 2) * (e[i] ** 2 - squares / (m * (m - 1)))
-            self.v[i] = (1 - g) * (self.v[i] + g * grubbs)
+            g = 1 / min(self.count[i], self.cap) if self.memory is None else max(self.memory, 1 / self.count[i])
+            self.b[i] += g * e[i]
+            if m > 2:
+                grubbs = m / (m - 2) * (e[i] ** 2 - squares / (m * (m - 1)))
+                self.v[i] = (1 - g) * (self.v[i] + g * grubbs)
         if m < 3:
             return
-        # A jump too small for the gate shows in the mean of a second, where the others' means agree.
+        # A jump too small for the gate shows in the mean of a second, where the others' means agree; not in the array's
+        # first five seconds, in which its biases settle.
         f = 1 / self.quiet_after
         for i in pupils:
-            self.fast[i] = (1 - f) * self.fast[i] + f * e[i]
+            self.fast[i] = (1 - f) * self.fast[i] + f * (r[i] - rate)
         usual = median_of([self.fast[i] for i in pupils])
         scatter = 1.4826 * median_of([abs(self.fast[i] - usual) for i in pupils])
+        young = self.quiet_after * (5 if learnt < 5 * self.quiet_after else 1)
         for i in pupils:
             limit = max(8 * math.sqrt(f / 2), 1.0) * math.sqrt(self._variance(i, vbar))
             limit = max(limit, 8 * scatter, self.motion * abs(middle))
-            if self.count[i] >= 5 * self.quiet_after and abs(self.fast[i] - usual) > limit:
+            if self.count[i] >= young and abs(self.fast[i] - usual) > limit:
                 self._jump(i)
 
-    def _follow_away(self, i, distance, middle, half):
+    def _follow_away(self, i, distance, middle, half, vbar):
         self.away[i] += 1
         if self.away[i] == 1:
             self.away_mean[i] = distance
@@ -324,7 +331,8 @@ class Robust:
             self.away_square[i] += step * (distance - self.away_mean[i])
         if self.away[i] >= self.jump_after:
             scatter = math.sqrt(self.away_square[i] / (self.away[i] - 1))
-            if scatter <= half / 2 and abs(self.away_mean[i]) > self.motion * abs(middle):
+            least = max(math.sqrt(self._variance(i, vbar)), self.motion * abs(middle))
+            if scatter <= half / 2 and abs(self.away_mean[i]) > least:
                 if self.away[i] >= self.count[i]:
                     self._forget(i)
                 self._jump(i)

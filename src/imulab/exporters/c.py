@@ -85,7 +85,7 @@ def _header(tables: Sequence[Table]) -> str:
 def _amalgamation() -> str:
     """The core's sources as one file, so that a project has one to add."""
     parts = ["/* The core of imulab in one file; the same for every unit. */\n", '#include "imulab.h"\n']
-    for name in ("real.h", "array.h", *_CORE):
+    for name in ("real.h", "array.h", "robust.h", *_CORE):
         parts += [f"\n/* ==== {name} ==== */\n", _OWN_INCLUDE.sub("", _source(name))]
     return "".join(parts)
 

@@ -49,10 +49,10 @@ def calibrate_array(
 ) -> ArrayFit:
     """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
 
-    At rest: each element's bias is its plain mean, the common part included, with ``u^2 = N^2/T + (2 ln 2/pi) B^2 +
-    K^2 T/3``;
-    N, B, K come from its Allan curve; the covariance matrix at `averaging_time` from half the products of successive
-    differences of means (the Allan covariance; Vaccaro and Zaki 2017). In motion: `align`.
+    At rest: each element's bias is its plain mean, the common part included; N, B, K come from its Allan curve, and so
+    does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance matrix at `averaging_time` is
+    half the mean of the products of successive differences of means (the Allan covariance; Vaccaro and Zaki 2017). In
+    motion: `align`.
 
     Parameters
     ----------
@@ -210,8 +210,7 @@ def _record(
     warnings: list[str],
 ) -> Calibration:
     axes, n = len(elements.axes), elements.count
-    time = np.array([rest.duration])
-    spread = np.array([[math.sqrt(c.variance(time)[0]) for c in row] for row in rest.noise])
+    spread = np.array([[c.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
     one = axes == 1
 
     def scalar(values: Array) -> Any:
