@@ -110,7 +110,7 @@ def test_a_record_without_direction_is_refused_by_its_name(imulab, tmp_path):
     for command in (["apply", "r.json", "f.csv", "-o", "c.csv"], ["export", "--to", "c", "r.json", "-o", "fw"]):
         done = imulab(*command)
         assert done.returncode == 2
-        assert done.stderr.startswith("imulab: r.json: the record has no x_direction: it was reduced without table_angle")
+        assert done.stderr.startswith("imulab: r.json: the record has no x_direction: it was reduced without table_a")
         assert done.stderr.count("\n") == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.csv", "r.json"]
 

@@ -167,8 +167,8 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
     if undirected:
         warnings.append(
             f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes of "
-            f"the two "
-            "senses were averaged, so that flexure and tilt do not cancel"
+            "the two senses were averaged, so that flexure and tilt do not cancel; the direction of the drift, which "
+            "apply needs, is not known"
         )
     members = [[lines[run.index] for run in groups[key]] for key in keys]
     excess, chi_square, freedom = _repeatability(members)

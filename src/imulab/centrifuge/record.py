@@ -13,7 +13,8 @@ from imulab.centrifuge.levels import Levels, RunLine, axis_lines
 from imulab.centrifuge.manifest import Manifest
 from imulab.centrifuge.model import real_covariance
 from imulab.centrifuge.parameters import Estimates
-from imulab.centrifuge.run import LoadedRun, StaticRun
+from imulab.centrifuge.run import LoadedRun
+from imulab.centrifuge.static import StaticRun
 from imulab.recording import Array, Source
 
 _UNLIKELY = 0.01
@@ -266,5 +267,12 @@ def _warnings(
             )
     senses = {run.run.sense for run in runs}
     if len(senses) == 1 and len(runs) > 1:
-        found.append("one sense of rotation only: differential flexure and scale mismatch are not separated from K(a)")
+        found.append(
+            "one sense of rotation only: differential flexure and scale mismatch are not separated from K(a)"
+            + (
+                ""
+                if all(run.encoder for run in runs)
+                else "; no table_angle: no direction of the drift, which apply needs"
+            )
+        )
     return tuple(dict.fromkeys(found))
