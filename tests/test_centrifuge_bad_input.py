@@ -1,5 +1,6 @@
 """Every way to get a centrifuge test wrong: exit status 2, one line that names run and file, and no record."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -145,6 +146,10 @@ def in_unit(recording, unit, *names):
     return replace(recording, units={**recording.units, **dict.fromkeys(names, unit)})
 
 
+def rows(recording, kept):
+    return replace(recording, columns={k: v[kept] for k, v in recording.columns.items()})
+
+
 def stepped(recording, name, size, start):
     values = recording.columns[name].copy()
     values[int(start * len(values)) :] += size
@@ -172,7 +177,13 @@ RECORDING_CASES = {
     "no fog": (LOADED, lambda r: without(r, "fog"), ["no column fog; found time dtg_x dtg_y table_angle"]),
     "no time": (LOADED, lambda r: without(r, "time"), ["no column time"]),
     "no y in one run": (LOADED, lambda r: without(r, "dtg_y"), ["no column dtg_y, which other runs have"]),
-    "not a number": (LOADED, with_nan, [f"{LOADED}: row 50 (line 51), column fog", "expected a finite number"]),
+    "not a number": (
+        LOADED, with_nan, [f"m.toml: run 3 ({LOADED}): row 50 (line 51), column fog: expected a finite number"],
+    ),
+    "a time that stands still": (
+        LOADED, lambda r: r.with_columns({"time": np.minimum(r.time, 30.0)}, {}),
+        [f"m.toml: run 3 ({LOADED}): row 602 (line 603), column time"],
+    ),
     "counts without scale factor": (
         LOADED, lambda r: in_unit(r, "count", "dtg_x"),
         ["column dtg_x is in count", "[scale_factor]"],
@@ -197,7 +208,36 @@ RECORDING_CASES = {
         "c1_static.csv", lambda r: stepped(r, "dtg_x", 300.0, 0.8),
         ["a static run that moves", "column dtg_x"],
     ),
-    "a static run on a turning table": ("c1_static.csv", turning, ["a static run that moves", "column fog", "sine"]),
+    "a static run on a turning table": (
+        "c1_static.csv", turning, ["a static run that moves", "column fog shows a line of"],
+    ),
+    "a static run that shakes once a second": (
+        "c1_static.csv",
+        lambda r: r.with_columns({"dtg_x": r.columns["dtg_x"] + 40 * np.sin(2 * np.pi * r.time)}, {}),
+        ["a static run that moves", "column dtg_x shows a line of 3", "deg/s, as if"],
+    ),
+    "a static run that creeps": (
+        "c1_static.csv",
+        lambda r: r.with_columns({"fog": r.columns["fog"] + r.time}, {}),
+        ["a static run that moves", "column fog drifts by 28.8 deg/h"],
+    ),
+    "a loaded run in the place of the static one": (
+        "c1_static.csv",
+        lambda r: without(il.read(f"{r.name.rpartition('/')[0]}/{LOADED}"), "table_angle"),
+        ["a static run that moves", "column dtg_x shows a line of", "as if the gyroscope turned"],
+    ),
+    "the FOG the other way round": (
+        LOADED, lambda r: scaled(r, -1.0, ("fog",)),
+        [f"run 3 ({LOADED})", "column dtg_x shows Earth rate 1", "is an axis or a sign reversed"],
+    ),
+    "X and Y exchanged": (
+        LOADED, lambda r: r.with_columns({"dtg_x": r.columns["dtg_y"], "dtg_y": r.columns["dtg_x"]}, {}),
+        [f"run 3 ({LOADED})", "column dtg_x shows Earth rate -", "columns exchanged"],
+    ),
+    "most of a run missing": (
+        LOADED, lambda r: rows(r, (r.time < 8) | (r.time > 38)),
+        [f"run 3 ({LOADED}): gaps: 9.9", "in a run of 39.65 s"],
+    ),
     "a static run whose table turns": (
         "c1_static.csv",
         lambda r: r.with_columns({"table_angle": 0.1 * r.time}, {}),
@@ -265,6 +305,52 @@ def test_without_lines_on_the_fog_there_are_warnings_and_the_manifest_s_rates():
     assert sum("no significant Earth-rate line" in m for m in fit.calibration.warnings) == 2
     assert fit.runs[0].rates.table_rate == test.runs[1].table_rate
     assert fit.runs[0].rates.origin == "manifest"
+
+
+def test_y_the_other_way_round_is_a_warning(folder, imulab):
+    recorded(folder, LOADED, lambda r: scaled(r, -1.0, ("dtg_y",)))
+    done = imulab("centrifuge", "reduce", "m.toml", "-o", "r.json")
+    assert done.returncode == 0
+    assert f"run 3 ({LOADED}): column dtg_y shows Earth rate" in done.stderr
+
+
+def test_a_channel_that_never_changes_is_a_warning(folder, imulab):
+    recorded(folder, LOADED, lambda r: scaled(r, 0.0, ("fog",)))
+    done = imulab("centrifuge", "reduce", "m.toml", "-o", "r.json")
+    assert f"run 3 ({LOADED}): column fog never changes" in done.stderr
+
+
+def test_files_exchanged_without_encoder_are_told_by_the_line_that_is_there(folder, imulab):
+    for file in ("c1_static.csv", "c1_1g.csv", LOADED):
+        recorded(folder, file, lambda r: without(r, "table_angle"))
+    shutil.copy(folder / LOADED, folder / "c1_1g.csv")
+    done = imulab("centrifuge", "reduce", "m.toml", "-o", "r.json")
+    assert "no significant FOG line at the table rate 86.8726 deg/s (its strongest line is at 243." in done.stderr
+    assert "no table_angle: no direction of the drift, which apply needs" in done.stderr
+
+
+@pytest.mark.parametrize("encoder", [True, False])
+def test_a_gap_costs_samples_and_nothing_else(encoder):
+    test = make_manifest(levels=[G, 5 * G], radius=2.0, net_rate=NET)
+    truth = typical_truth()
+    quiet = replace(truth, x=replace(truth.x, angle_random_walk=0.0), fog=replace(truth.fog, angle_random_walk=0.0),
+                    y=None, rig=replace(truth.rig, table_rate_error=1e-4))  # fmt: skip
+    simulation = Simulation(test, quiet, 20.0, 80.0, 20.0, encoder)
+
+    def with_gap(run):
+        for block in simulation(run):
+            yield rows(block, (block.time < 20.0) | (block.time > 33.7)) if run.role == "loaded" else block
+
+    whole, holed = (il.fit_centrifuge(test, source).calibration for source in (simulation, with_gap))
+    for n in (1, 2):
+        assert holed.value(f"x_K_{n}") == pytest.approx(whole.value(f"x_K_{n}"), rel=1e-4)
+
+
+def test_the_rates_found_are_named_to_the_hundredth_even_in_short_runs(folder, imulab):
+    """The far line is interpolated: a bin of 40 s is 9 deg/s wide."""
+    edit(folder, "arm_rate = 283.6958", "arm_rate = 263.6958")
+    found = re.search(r"Earth-rate line is at ([\d.]+) deg/s", refused(imulab, folder))
+    assert float(found[1]) == pytest.approx(40.0, abs=0.5)
 
 
 # --- the manifest itself -----------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ _PRODUCT = 800
 FIRST_LOOK = 1024
 """Samples from which the sampling period is found."""
 FEWEST_PER_PERIOD = 8
+_GAP = 2.5
 
 
 @dataclass(frozen=True)
@@ -56,9 +57,9 @@ class Cells:
     table_rate, net_rate
         Signed rates that the cells were summed at, rad/s.
     series_time, series
-        Centre, s, and mean of short bins, shapes (b,) and (k, b); `series_step` s apart.
-    series_angle
-        chi at the first sample of each bin, rad, or None without encoder.
+        Centre, s, and mean of short bins, shapes (b,) and (k, b); `series_step` s apart unless samples are missing.
+    series_begin, series_angle
+        Time, s, and chi, rad, at the first sample of each bin; chi is None without encoder.
     """
 
     centre: Array
@@ -72,6 +73,7 @@ class Cells:
     net_rate: float
     series_time: Array
     series: Array
+    series_begin: Array
     series_angle: Array | None
 
     @property
@@ -96,7 +98,7 @@ class Cells:
         return Cells(
             self.centre[first:last], moments, self.offset, self.start, self.step,
             round(float(moments[:, CONSTANT, CONSTANT].sum())), self.cell, self.table_rate, self.net_rate,
-            self.series_time[bins], self.series[:, bins],
+            self.series_time[bins], self.series[:, bins], self.series_begin[bins],
                 None if self.series_angle is None else self.series_angle[bins],
         )  # fmt: skip
 
@@ -106,8 +108,10 @@ class TooSlowError(Exception):
 
 
 def sampling_period(time: Array) -> float:
-    """Return the sampling period, s: a whole number of samples per second where it is one within 1e-9."""
-    step = float(time[-1] - time[0]) / (len(time) - 1)
+    """Return the sampling period without gaps, s: a whole number of samples a second where it is one within 1e-9."""
+    steps = np.diff(time)
+    gaps = steps > _GAP * np.median(steps)
+    step = float(time[-1] - time[0] - steps[gaps].sum()) / (len(steps) - np.count_nonzero(gaps))
     nearest = round(1 / step)
     return 1 / nearest if nearest and abs(step * nearest - 1) < 1e-9 else step
 
@@ -158,7 +162,7 @@ def compress(blocks: Iterable[Samples], table_rate: float, net_rate: float) -> C
         rest = _part(rest, whole * cell, len(rest.time))
     if not results:
         return None
-    centre, moments, series_time, series, angle = (
+    centre, moments, series_time, series, begin, angle = (
         None if parts[0] is None else np.concatenate(parts, axis=-1 if parts[0].ndim == 2 else 0)
         for parts in zip(*results, strict=True)
     )
@@ -166,6 +170,7 @@ def compress(blocks: Iterable[Samples], table_rate: float, net_rate: float) -> C
     assert moments is not None
     assert series_time is not None
     assert series is not None
+    assert begin is not None
     left = len(rest.time)
     if left:
         # What remains is less than a cell: it joins the last one, whose columns are about its own centre.
@@ -173,7 +178,7 @@ def compress(blocks: Iterable[Samples], table_rate: float, net_rate: float) -> C
         moments[-1] += tail
         total += left
     return Cells(
-        centre, moments, offset, start, step, total, cell, table_rate, net_rate, series_time, series, angle
+        centre, moments, offset, start, step, total, cell, table_rate, net_rate, series_time, series, begin, angle
     )  # fmt: skip
 
 
@@ -185,7 +190,7 @@ class _Work:
         self.table_rate, self.net_rate = table_rate, net_rate
         self.design = np.empty((COLUMNS + len(offset), 0))
 
-    def sum(self, part: Samples, number: int) -> tuple[Array, Array, Array, Array, Array | None]:
+    def sum(self, part: Samples, number: int) -> tuple[Array, Array, Array, Array, Array, Array | None]:
         """Return centres, moments and series of `number` whole cells."""
         shaped = part.time.reshape(number, self.cell)
         centre = shaped.mean(axis=1)
@@ -198,7 +203,8 @@ class _Work:
         inside = self.cell // self.bins
         time = part.time.reshape(-1, inside).mean(axis=1)
         series = part.channels.reshape(len(part.channels), -1, inside).mean(axis=2)
-        return centre, moments, time, series, None if part.angle is None else part.angle[::inside].copy()
+        angle = None if part.angle is None else part.angle[::inside].copy()
+        return centre, moments, time, series, part.time[::inside].copy(), angle
 
     def sum_about(self, part: Samples, centre: float) -> Array:
         """Return the moments of a part with time counted from `centre`."""

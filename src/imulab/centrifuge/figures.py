@@ -315,14 +315,18 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
         layout[f"xaxis{mark}"] |= {"tickvals": ticks, "ticktext": texts}
         layout[f"yaxis{mark}"] |= {"zeroline": True, "zerolinecolor": QUIET}
     found = record.fit["repeatability"]
-    words = (
-        f"they scatter by {100 * found['relative_standard_deviation']:.2g} % beyond their noise, added to the "
-        f"uncertainties"
-        if found["relative_standard_deviation"]
-        else "their scatter is explained by their noise"
-    )
+    words = [
+        f"{what} by {size:.2g} {unit} beyond their noise"
+        for what, size, unit in (
+            ("K differs from cycle to cycle", 100 * found["relative_standard_deviation"], "%"),
+            ("its direction", np.degrees(found["direction"]["value"]), "deg"),
+            ("K differs from run to run", 100 * found["within_power_cycle"], "%"),
+        )
+        if size
+    ]
+    text = "; ".join(words) + ": in the uncertainties" if words else "The scatter is explained by the noise"
     caption = (
-        f"Bars are one standard uncertainty of a run. Over the power cycles {words}."
+        f"Bars are one standard uncertainty of a run. {text}."
         if len(cycles) > 1
         else ("Bars are one standard uncertainty of a run. One power cycle only: nothing is known of repeatability.")
     )

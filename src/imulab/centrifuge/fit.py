@@ -13,7 +13,8 @@ from imulab.centrifuge.levels import Levels, level_numbers, pool_levels
 from imulab.centrifuge.manifest import Manifest, Run
 from imulab.centrifuge.parameters import Estimates, estimate
 from imulab.centrifuge.record import make_record
-from imulab.centrifuge.run import LoadedRun, StaticRun, reduce_run, reduce_static
+from imulab.centrifuge.run import LoadedRun, reduce_run
+from imulab.centrifuge.static import StaticRun, reduce_static
 from imulab.errors import DataError, OptionError
 from imulab.recording import Array, Recording, Source
 

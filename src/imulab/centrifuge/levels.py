@@ -15,9 +15,9 @@ import numpy as np
 from imulab.centrifuge.manifest import SAME_LEVEL, Manifest
 from imulab.centrifuge.model import fog_share, real_covariance
 from imulab.centrifuge.regress import Complex
+from imulab.centrifuge.repeat import Deviations, Repeatability, find_repeatability
 from imulab.centrifuge.run import LoadedRun
 from imulab.errors import DataError
-from imulab.estimate import chi_square_limit, excess_variance
 from imulab.recording import Array
 
 
@@ -60,7 +60,9 @@ class Level:
     force
         Mean over its runs, m/s^2.
     line, covariance
-        Pooled, shapes (p,) and (2p, 2p), without the radius's uncertainty.
+        Pooled, shapes (p,) and (2p, 2p), without what is common to all levels: radius and power cycles.
+    cycles
+        Share of each power cycle in the line of each axis, shape (p,).
     component_variance
         Of the noise of one component, shape (p,), for the Rice correction.
     freedom
@@ -76,6 +78,7 @@ class Level:
     force: float
     line: Complex
     covariance: Array
+    cycles: dict[int, Array]
     component_variance: Array
     freedom: Array
     runs: tuple[int, ...]
@@ -91,16 +94,12 @@ class Levels:
     items, lines
         The levels, and the lines of each run by its number.
     repeatability
-        Relative standard deviation between power cycles that was added to each run; 0 where noise explains the scatter.
-    chi_square, freedom
-        Of that scatter over the noise.
+        What power cycles and runs do beyond the noise.
     """
 
     items: tuple[Level, ...]
     lines: dict[int, RunLine]
-    repeatability: float
-    chi_square: float
-    freedom: int
+    repeatability: Repeatability
     warnings: tuple[str, ...]
 
 
@@ -167,22 +166,36 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
     if undirected:
         warnings.append(
             f"{manifest.name}: no table_angle at level {', '.join(map(str, sorted(set(undirected))))}: magnitudes of "
-            f"the two "
-            "senses were averaged, so that flexure and tilt do not cancel"
+            "the two senses were averaged, so that flexure and tilt do not cancel; the direction of the drift, which "
+            "apply needs, is not known"
         )
     members = [[lines[run.index] for run in groups[key]] for key in keys]
-    excess, chi_square, freedom = _repeatability(members)
+    repeatability = find_repeatability(_deviations(members))
     items = [
-        _pooled(key[1], key[0], group, excess, freedom, all(line.source.encoder for line in group))
+        _pooled(key[1], key[0], group, repeatability, all(line.source.encoder for line in group))
         for key, group in zip(keys, members, strict=True)
     ]
-    if excess:
+    return Levels(tuple(items), lines, repeatability, (*warnings, *_scatter_warnings(repeatability)))
+
+
+def _scatter_warnings(found: Repeatability) -> list[str]:
+    warnings = []
+    if found.cycle:
         warnings.append(
-            f"K differs between power cycles by {100 * np.sqrt(excess):.2g} % (one standard deviation) beyond the "
-            f"noise; "
-            "this was added to each run's uncertainty"
+            f"K differs between power cycles by {100 * np.sqrt(found.cycle):.2g} % (one standard deviation) beyond the "
+            "noise, at all levels alike: added to every K and the curve; zeta hardly knows of it"
         )
-    return Levels(tuple(items), lines, float(np.sqrt(excess)), chi_square, freedom, tuple(warnings))
+    if found.turn:
+        warnings.append(
+            f"the direction of the drift differs between power cycles by {np.degrees(np.sqrt(found.turn)):.2g} deg "
+            "(one standard deviation) beyond the noise: added to its uncertainty"
+        )
+    if found.run:
+        warnings.append(
+            f"K differs between runs of a power cycle by {100 * np.sqrt(found.run):.2g} % (one standard deviation) "
+            "beyond the noise: added to each run's uncertainty"
+        )
+    return warnings
 
 
 def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -> RunLine:
@@ -214,21 +227,24 @@ def _weights(group: list[RunLine], axis: int, excess: float) -> Array:
     return weights
 
 
-def _radial(line: RunLine, axis: int, excess: float) -> float:
-    """Variance along the line of one axis."""
+def _radial(line: RunLine, axis: int, excess: float, *, rates: bool = True) -> float:
+    """Variance along the line of one axis; without that of the rates, across it."""
     pair = slice(2 * axis, 2 * axis + 2)
     noise = float(np.trace(line.noise[pair, pair])) / 2
+    if not rates:
+        return noise
     return noise + float(np.trace(line.rate[pair, pair])) + excess * float(abs(line.line[axis])) ** 2
 
 
-def _pooled(number: int, spin_axis: str, group: list[RunLine], excess: float, freedom: int, directed: bool) -> Level:
+def _pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatability, directed: bool) -> Level:
     axes = len(group[0].line)
-    weights = np.array([_weights(group, axis, excess) for axis in range(axes)])
+    weights = np.array([_weights(group, axis, found.run + found.cycle) for axis in range(axes)])
     line = np.einsum("ar,ra->a", weights, np.array([member.line for member in group]))
     spread = np.repeat(weights, 2, axis=0)
+    own = np.kron(np.eye(axes), np.ones((2, 2)))  # what a run does to one axis it need not do to the other
     covariance = np.zeros((2 * axes, 2 * axes))
     for r, member in enumerate(group):
-        total = member.noise + member.rate + excess * np.outer(member.vector, member.vector)
+        total = member.noise + member.rate + found.run * own * np.outer(member.vector, member.vector)
         covariance += spread[:, r, None] * total * spread[None, :, r]
     component = np.zeros(axes)
     dof = np.zeros(axes)
@@ -236,38 +252,41 @@ def _pooled(number: int, spin_axis: str, group: list[RunLine], excess: float, fr
         pair = slice(2 * axis, 2 * axis + 2)
         noise = weights[axis] ** 2 * [float(np.trace(member.noise[pair, pair])) / 2 for member in group]
         component[axis] = noise.sum()
-        between = float((weights[axis] ** 2 * excess * np.abs([m.line[axis] for m in group]) ** 2).sum())
+        between = float((weights[axis] ** 2 * found.run * np.abs([m.line[axis] for m in group]) ** 2).sum())
         known = float((weights[axis] ** 2 * [float(np.trace(m.rate[pair, pair])) for m in group]).sum())
-        spent = (noise**2 / [member.freedom for member in group]).sum() + between**2 / max(freedom, 1)
+        spent = (noise**2 / [member.freedom for member in group]).sum() + between**2 / max(found.run_freedom, 1)
         dof[axis] = (noise.sum() + between + known) ** 2 / max(spent, 1e-300)
+    cycles = np.array([member.source.run.power_cycle for member in group])
     return Level(
-        number, spin_axis, float(np.mean([m.source.force for m in group])), line, covariance, component,
+        number, spin_axis, float(np.mean([m.source.force for m in group])), line, covariance,
+        {int(cycle): weights[:, cycles == cycle].sum(axis=1) for cycle in np.unique(cycles)}, component,
         np.minimum(dof, 1e9), tuple(m.source.index for m in group), directed,
     )  # fmt: skip
 
 
-def _repeatability(members: list[list[RunLine]]) -> tuple[float, float, int]:
-    """Relative variance between power cycles beyond the noise; chi-square of the scatter, degrees of freedom."""
-    residuals, variances, freedom = [], [], 0
-    for group in members:
-        for sense in (1, -1):
-            same = [member for member in group if member.source.run.sense == sense]
-            if len(same) < 2:
-                continue
-            for axis in range(len(same[0].line)):
-                size = np.array([abs(member.line[axis]) for member in same])
+def _deviations(members: list[list[RunLine]]) -> list[Deviations]:
+    """What each axis's runs found relative to the mean of their level and sense."""
+    found = []
+    for axis in range(len(members[0][0].line)):
+        rows: list[tuple[int, int, float, float, float, float]] = []
+        label = 0
+        for group in members:
+            for sense in (1, -1):
+                same = [member for member in group if member.source.run.sense == sense]
                 variance = np.array([_radial(member, axis, 0.0) for member in same])
-                weights = 1 / np.maximum(variance, 1e-300)
-                mean = float((weights * size).sum() / weights.sum())
-                if mean**2 < 25 * variance.max():  # a line hardly above the noise says nothing of a relative scatter
+                if len(same) < 2:
                     continue
-                residuals += list(size / mean - 1)
-                variances += list(variance / mean**2)
-                freedom += len(same) - 1
-    if not freedom:
-        return 0.0, 0.0, 0
-    left, expected = np.array(residuals)[None], np.maximum(np.array(variances)[None], 1e-24)
-    chi_square = float((left**2 / expected).sum())
-    if chi_square <= chi_square_limit(freedom):
-        return 0.0, chi_square, freedom
-    return float(excess_variance(left, expected, freedom)[0]), chi_square, freedom
+                line = np.array([member.line[axis] for member in same])
+                mean = complex(np.average(line, weights=1 / np.maximum(variance, 1e-300)))
+                if (
+                    abs(mean) ** 2 < 25 * variance.max()
+                ):  # hardly above the noise, it says nothing of a relative scatter
+                    continue
+                label += 1
+                off = line / mean - 1
+                for member, value, along in zip(same, off, variance / abs(mean) ** 2, strict=True):
+                    across = _radial(member, axis, 0.0, rates=False) / abs(mean) ** 2
+                    rows.append((label, member.source.run.power_cycle, value.real, value.imag, along, across))
+        columns = np.array(rows).reshape(-1, 6).T
+        found.append(Deviations(columns[0].astype(np.int64), columns[1].astype(np.int64), *columns[2:]))
+    return found

@@ -42,6 +42,8 @@ class Estimates:
         In the order of the record.
     values, covariance
         SI, shapes (p,), (p, p).
+    levels
+        Covariance of the levels' (Re, Im) of each axis, in the order of the levels, rad/s/(m/s^2) squared.
     freedom, coverage
         Effective degrees of freedom (Welch-Satterthwaite) and the factor of the 95 % interval, shapes (p,).
     curves
@@ -56,6 +58,7 @@ class Estimates:
     units: tuple[str, ...]
     values: Array
     covariance: Array
+    levels: Array
     freedom: Array
     coverage: Array
     curves: dict[str, CurveFit]
@@ -90,6 +93,8 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     V = np.zeros((size, size))
     for index, level in enumerate(items):
         V[index * width : (index + 1) * width, index * width : (index + 1) * width] = level.covariance
+    common = _cycles(levels, size, width)
+    V += common
     rows: list[_Row] = []
     curves: dict[str, CurveFit] = {}
     turning: dict[str, float] = {}
@@ -126,12 +131,13 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     values = np.array([row.value for row in rows])
     radius = np.array([row.radius for row in rows]) * manifest.radius_uncertainty / manifest.radius
     covariance = J @ V @ J.T + np.outer(radius, radius)
-    freedom = _freedom(J, V, radius, items, width)
+    freedom = _freedom(J, V, common, radius, levels, width)
     return Estimates(
         names=tuple(row.name for row in rows),
         units=tuple(row.unit for row in rows),
         values=values,
         covariance=(covariance + covariance.T) / 2,
+        levels=V,
         freedom=freedom,
         coverage=np.array([coverage_factor(float(nu) if nu < 1e6 else None) for nu in freedom]),
         curves=curves,
@@ -233,13 +239,45 @@ def _cross(
     return found
 
 
-def _freedom(J: Array, V: Array, radius: Array, items: tuple[Level, ...], width: int) -> Array:
+def _cycles(levels: Levels, size: int, width: int) -> Array:
+    """Covariance of the levels' lines by what each power cycle does to all of them alike, axis by axis.
+
+    In units of the mean K of a set, not of each level's own: a noisy level would take a share of its own noise.
+    """
+    found = levels.repeatability
+    total = np.zeros((size, size))
+    if not found.cycle and not found.turn:
+        return total
+    for axis in range(width // 2):
+        for cycle in {cycle for level in levels.items for cycle in level.cycles}:
+            along, across = np.zeros(size), np.zeros(size)
+            for index, level in enumerate(levels.items):
+                if cycle not in level.cycles:
+                    continue
+                unit = level.line[axis] / max(abs(level.line[axis]), 1e-300)
+                share = level.cycles[cycle][axis] * _mean_size(levels, level.spin_axis, axis)
+                place = index * width + 2 * axis
+                along[place : place + 2] = share * unit.real, share * unit.imag
+                across[place : place + 2] = -share * unit.imag, share * unit.real
+            total += found.cycle * np.outer(along, along) + found.turn * np.outer(across, across)
+    return total
+
+
+def _mean_size(levels: Levels, spin_axis: str, axis: int) -> float:
+    mine = [level for level in levels.items if level.spin_axis == spin_axis]
+    weights = [1 / max(float(level.component_variance[axis]), 1e-60) for level in mine]
+    return float(np.average([abs(level.line[axis]) for level in mine], weights=weights))
+
+
+def _freedom(J: Array, V: Array, common: Array, radius: Array, levels: Levels, width: int) -> Array:
     """Effective degrees of freedom of each parameter's variance."""
-    variance = np.zeros(len(J))
-    spent = np.zeros(len(J))
-    for index, level in enumerate(items):
+    cycles = np.einsum("pi,ij,pj->p", J, common, J)
+    variance = cycles.copy()
+    spent = cycles**2 / max(levels.repeatability.freedom, 1)
+    for index, level in enumerate(levels.items):
         part = slice(index * width, (index + 1) * width)
-        mine = np.einsum("pi,ij,pj->p", J[:, part], V[part, part], J[:, part])
+        own = V[part, part] - common[part, part]
+        mine = np.einsum("pi,ij,pj->p", J[:, part], own, J[:, part])
         # An axis's own share decides which of the degrees of freedom counts.
         shares = np.abs(J[:, part]).reshape(len(J), -1, 2).sum(axis=2)
         nu = level.freedom[np.argmax(shares, axis=1)]

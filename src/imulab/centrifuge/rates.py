@@ -9,7 +9,16 @@ import numpy as np
 from imulab.centrifuge.cells import Cells
 from imulab.centrifuge.model import EARTH_RATE
 from imulab.centrifuge.regress import LINE, ROOM, Complex, Solution, basis, refine, scatter, solve
-from imulab.centrifuge.spectra import FAINT, PEAK, SEARCH, in_degrees, interpolated, search_line
+from imulab.centrifuge.spectra import (
+    FAINT,
+    PEAK,
+    SEARCH,
+    even_series,
+    in_degrees,
+    interpolated,
+    search_line,
+    strongest_line,
+)
 from imulab.errors import DataError
 from imulab.recording import Array
 from imulab.units import from_si, to_si
@@ -82,7 +91,10 @@ def find_rates(cells: Cells, place: str) -> Rates:
     origin, table_uncertainty = ("encoder", None) if encoder else ("fog", None)
     if not encoder and (table_shift is None or not _significant(solution, LINE, fog, table_noise)):
         origin, shifts[0] = "manifest", 0.0
-        warnings.append(f"{place}: no significant FOG line at the table rate; the manifest's rate was used as it is")
+        warnings.append(
+            f"{place}: no significant FOG line at the table rate{_elsewhere(cells, fog)}; the manifest's rate was used "
+            "as it is"
+        )
     elif not encoder and refined is not None:
         table_uncertainty = float(np.sqrt(refined.table_gain * table_noise[fog, fog].real))
         if abs(shifts[0]) > max(MISMATCH, 3 * table_uncertainty):
@@ -101,7 +113,7 @@ def find_rates(cells: Cells, place: str) -> Rates:
         net_rate = cells.net_rate + shifts[1]
         net_uncertainty = float(np.sqrt(refined.net_gain * net_noise[fog, fog].real))
         warnings += _check_net(cells.net_rate, net_rate, net_uncertainty, place)
-        _check_units(solution, net_noise, place)
+        warnings += _check_units(solution, net_noise, place)
     solution = solve(cells, *shifts)
     rate = _encoder_rate(cells) if encoder else cells.table_rate + shifts[0]
     return Rates(
@@ -129,22 +141,34 @@ def _mismatch(expected: float, found: float, place: str) -> DataError:
     )
 
 
-def _check_units(solution: Solution, noise: Complex, place: str) -> None:
-    """Check Earth rate for a size that it cannot have, and the gyroscope's against the FOG's."""
-    size = np.abs(solution.line(ROOM))
-    if not _POLAR < size[-1] < 1.2 * EARTH_RATE:
+def _check_units(solution: Solution, noise: Complex, place: str) -> list[str]:
+    """Check Earth rate for a size that it cannot have, and the gyroscope's size and direction against the FOG's."""
+    line = solution.line(ROOM)
+    fog, earth = line[-1], float(abs(line[-1]))
+    if not _POLAR < earth < 1.2 * EARTH_RATE:
         raise DataError(
-            f"{place}: column fog shows Earth rate as {from_si(float(size[-1]), 'deg/h'):.4g} deg/h, expected up to "
-            f"15.04 deg/h: "
+            f"{place}: column fog shows Earth rate as {from_si(earth, 'deg/h'):.4g} deg/h, expected up to 15.04 deg/h: "
             "is its unit or scale factor wrong?"
         )
+    warnings = []
     sigma = np.sqrt(solution.gain(ROOM) * np.diagonal(noise).real)
-    for name, value, u in zip(("dtg_x", "dtg_y"), size[:-1], sigma[:-1], strict=False):
-        if not size[-1] / 2 - 5 * u < value < 2 * size[-1] + 5 * u:
+    # What is fixed in the room passes Y a quarter turn before X.
+    for name, value, expected, u in zip(("dtg_x", "dtg_y"), line[:-1], (fog, -1j * fog), sigma[:-1], strict=False):
+        if not earth / 2 - 5 * u < abs(value) < 2 * earth + 5 * u:
             raise DataError(
-                f"{place}: column {name} shows Earth rate as {from_si(float(value), 'deg/h'):.4g} deg/h, column fog as "
-                f"{from_si(float(size[-1]), 'deg/h'):.4g} deg/h: wrong or mixed units or scale factors?"
+                f"{place}: column {name} shows Earth rate as {from_si(float(abs(value)), 'deg/h'):.4g} deg/h, column "
+                f"fog as {from_si(earth, 'deg/h'):.4g} deg/h: wrong or mixed units or scale factors?"
             )
+        turned = value * expected.conjugate() / earth
+        if abs(turned.imag) - turned.real > 5 * np.sqrt(2) * u:
+            message = (
+                f"{place}: column {name} shows Earth rate {np.degrees(np.angle(turned)):.0f} deg from where column fog "
+                "says: is an axis or a sign reversed, or are columns exchanged?"
+            )
+            if name == "dtg_x":
+                raise DataError(message)
+            warnings.append(message)
+    return warnings
 
 
 def _noise(cells: Cells, solution: Solution, row: int) -> Complex:
@@ -175,8 +199,9 @@ def _significant(solution: Solution, row: int, channel: int, noise: Complex) -> 
 def _encoder_rate(cells: Cells) -> float:
     """Slope of the encoder's angle, rad/s."""
     assert cells.series_angle is not None
-    deviation = np.unwrap(cells.series_angle - cells.table_rate * (cells.series_time - cells.start))
-    return cells.table_rate + float(np.polyfit(cells.series_time - cells.series_time.mean(), deviation, 1)[0])
+    begin = cells.series_begin
+    deviation = np.unwrap(cells.series_angle - cells.table_rate * (begin - cells.start))
+    return cells.table_rate + float(np.polyfit(begin - begin.mean(), deviation, 1)[0])
 
 
 def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float | None:
@@ -189,8 +214,8 @@ def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float 
     net = abs(cells.net_rate)
     if net < 1.5 * bin_width:
         return None
-    time, values = cells.series_time, _without_table_lines(cells, table_shift, fog)
-    count = len(time)
+    values = even_series(cells, _without_table_lines(cells, table_shift, fog))
+    count = len(values)
     window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
     height: Array = np.asarray(2 * np.abs(np.fft.rfft(window * values)) / window.sum(), dtype=np.float64)
     rates: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(count, cells.series_step), dtype=np.float64)
@@ -203,16 +228,32 @@ def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float 
     near = peak & (np.abs(rates - net) <= tolerance)
     if near.any():
         index = int(np.argmax(np.where(near, height, 0.0)))
-        grid = rates[max(index - 2, 0) : index + 3]
         sign = 1.0 if cells.net_rate > 0 else -1.0
-        return sign * (interpolated(grid, height[max(index - 2, 0) : index + 3]) - net)
+        return sign * (_about(index, rates, height) - net)
     far = peak & (height > _PLAUSIBLE) & (height < 1.1 * EARTH_RATE) & (rates > 2 * bin_width)
     for times in (1, 2, 3):
         far &= np.abs(rates - times * abs(cells.table_rate)) > 3 * bin_width
     if far.any():
-        candidates = rates[far]
-        raise _mismatch(net, float(candidates[np.argmin(np.abs(candidates - net))]), place)
+        candidates = np.flatnonzero(far)
+        index = int(candidates[np.argmin(np.abs(rates[candidates] - net))])
+        raise _mismatch(net, _about(index, rates, height), place)
     return None
+
+
+def _about(index: int, rates: Array, height: Array) -> float:
+    """Rate of a peak of a spectrum, by its neighbours."""
+    part = slice(max(index - 2, 0), index + 3)
+    return interpolated(rates[part], height[part])
+
+
+def _elsewhere(cells: Cells, fog: int) -> str:
+    """Where the FOG's strongest line is instead: the rate of another run, perhaps."""
+    found = strongest_line(cells, cells.series[fog], 1.5 * abs(cells.net_rate))
+    return (
+        ""
+        if found is None
+        else f" {in_degrees(abs(cells.table_rate))} (its strongest line is at {in_degrees(found, 5)})"
+    )
 
 
 def _without_table_lines(cells: Cells, table_shift: float, channel: int) -> Array:

@@ -13,7 +13,8 @@ from imulab.centrifuge.levels import Levels, RunLine, axis_lines
 from imulab.centrifuge.manifest import Manifest
 from imulab.centrifuge.model import real_covariance
 from imulab.centrifuge.parameters import Estimates
-from imulab.centrifuge.run import LoadedRun, StaticRun
+from imulab.centrifuge.run import LoadedRun
+from imulab.centrifuge.static import StaticRun
 from imulab.recording import Array, Source
 
 _UNLIKELY = 0.01
@@ -33,6 +34,7 @@ def make_record(
     """Turn the estimates into the record."""
     method = str(options["method"])
     sigma = np.sqrt(np.maximum(np.diagonal(estimates.covariance), 0.0))
+    found = levels.repeatability
     model: dict[str, Any] = {
         "equation": "drift = K(a) (a_x cos direction + a_y sin direction), K(a) = K0 (1 + c1 a + c2 a^2)",
         "radius": {"value": manifest.radius, "unit": "m", "from": "manifest"},
@@ -71,9 +73,11 @@ def make_record(
             },
             "direction_probability": {prefix.rstrip("_"): p for prefix, p in estimates.turning.items()},
             "repeatability": {
-                "relative_standard_deviation": levels.repeatability,
-                "chi_square": levels.chi_square,
-                "degrees_of_freedom": levels.freedom,
+                "relative_standard_deviation": float(np.sqrt(found.cycle)),
+                "direction": _value(np.sqrt(found.turn), "rad"),
+                "within_power_cycle": float(np.sqrt(found.run)),
+                "chi_square": found.chi_square,
+                "degrees_of_freedom": found.freedom,
             },
             "error_budget": error_budget(runs, levels.lines, manifest),
         },
@@ -101,18 +105,19 @@ def _noise_text(runs: Sequence[LoadedRun]) -> str:
 
 def _levels(levels: Levels, estimates: Estimates) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for level in levels.items:
+    for index, level in enumerate(levels.items):
         row: dict[str, Any] = next((r for r in rows if r["level"] == level.number), {})
         if not row:
             row = {"level": level.number, "specific_force": _value(level.force, "m/s^2"), "runs": []}
             rows.append(row)
         row["runs"] = sorted([*row["runs"], *level.runs])
         for axis, letter in enumerate("xy"[: len(level.line)]):
-            pair = slice(2 * axis, 2 * axis + 2)
+            place = 2 * (index * len(level.line) + axis)
+            pair = slice(place, place + 2)
             row[letter if level.spin_axis == "up" else f"{letter}_down"] = {
                 "A": level.line[axis].real,
                 "B": level.line[axis].imag,
-                "covariance": level.covariance[pair, pair].tolist(),
+                "covariance": estimates.levels[pair, pair].tolist(),
                 "directed": level.directed,
                 "unit": "rad/s/(m/s^2)",
             }
@@ -266,5 +271,12 @@ def _warnings(
             )
     senses = {run.run.sense for run in runs}
     if len(senses) == 1 and len(runs) > 1:
-        found.append("one sense of rotation only: differential flexure and scale mismatch are not separated from K(a)")
+        found.append(
+            "one sense of rotation only: differential flexure and scale mismatch are not separated from K(a)"
+            + (
+                ""
+                if all(run.encoder for run in runs)
+                else "; no table_angle: no direction of the drift, which apply needs"
+            )
+        )
     return tuple(dict.fromkeys(found))

@@ -252,9 +252,14 @@ def scatter(
         local.transpose(0, 2, 1) @ cells.moments[:, :COLUMNS, :COLUMNS] @ local, edges[:-1], axis=0
     )
     score = np.add.reduceat(local.transpose(0, 2, 1) @ left, edges[:-1], axis=0)
-    inverse = np.linalg.inv(normal)
+    try:
+        inverse = np.linalg.inv(normal)
+    except np.linalg.LinAlgError:
+        return None
     fitted = (inverse @ score)[:, -2:]
     deviation = fitted[:, 0] + 1j * fitted[:, 1]
     gain = (inverse[:, -1, -1] + inverse[:, -2, -2]) / 2
+    if not (np.isfinite(gain).all() and gain.min() > 0):  # blocks too short to tell the line from their constant
+        return None
     noise = np.einsum("m,mi,mj->ij", 1 / gain, deviation, deviation.conj()) / (2 * (count - 1))
     return Scatter(noise, 2.0 * (count - 1), deviation, centre, gain, edges)

@@ -2,41 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.centrifuge.cells import COLUMNS, CONSTANT, Cells, Samples, TooSlowError, compress, pieces_of
+from imulab.centrifuge.cells import Cells, TooSlowError, compress, pieces_of
+from imulab.centrifuge.channels import Channels
 from imulab.centrifuge.fourier import PeriodResult, PeriodSums
 from imulab.centrifuge.manifest import Manifest, Run
 from imulab.centrifuge.rates import Rates, find_rates, residual_noise
 from imulab.centrifuge.regress import LINE, ROOM, SECOND, THIRD, Complex, scatter
-from imulab.centrifuge.spectra import hann_spectrum
+from imulab.centrifuge.spectra import detrended, even_series, hann_spectrum
 from imulab.centrifuge.steady import steady_part
-from imulab.errors import DataError, UnitError
-from imulab.recording import Array, Recording, check_finite, check_time
-from imulab.units import from_si, parse_unit, to_si
+from imulab.errors import DataError
+from imulab.recording import Array, Recording
+from imulab.units import from_si
 
-_STILL = to_si(5.0, "deg/h")
-_STILL_SIGMA, _STILL_STEPS = 10.0, 8.0
-_STILL_LINE = to_si(1.0, "deg/h")
-_SINE_SAMPLES, _SINE_SHARE = 20, 0.8
-_STILL_ANGLE = np.radians(0.05)
+_MOST_LOST = 0.5
 _SPECTRUM_HALF_WIDTH = 24
 _SPECTRUM_POINTS = 4
-
-
-@dataclass(frozen=True)
-class StaticRun:
-    """Mean of each channel over a static run, rad/s, shape (k,), and its duration, s."""
-
-    run: Run
-    index: int
-    channels: tuple[str, ...]
-    mean: Array
-    samples: int
-    duration: float
 
 
 @dataclass(frozen=True)
@@ -96,146 +81,6 @@ class LoadedRun:
     warnings: tuple[str, ...]
 
 
-def samples_of(
-    blocks: Iterable[Recording], manifest: Manifest, index: int
-) -> Iterator[tuple[tuple[str, ...], Samples]]:
-    """Yield the blocks of a run in SI, checked, with the names of their channels.
-
-    Raises
-    ------
-    DataError
-        A column is missing, a sample is not finite, time does not rise.
-    UnitError
-        A column in count or V without a scale factor in that unit; an angle that is none.
-    """
-    place = manifest.place(index)
-    end = -np.inf
-    for block in blocks:
-        for name in ("time", "dtg_x", "fog"):
-            if name not in block:
-                raise DataError(f"{place}: no column {name}; found {' '.join(block.columns)}")
-        channels = ("dtg_x", "dtg_y", "fog") if "dtg_y" in block else ("dtg_x", "fog")
-        if not len(block):
-            continue
-        angle = None
-        names = [*channels]
-        if "table_angle" in block:
-            if parse_unit(block.units["table_angle"]).quantity != "angle":
-                raise UnitError(f"{place}: column table_angle is in {block.units['table_angle']}; expected deg or rad")
-            names.append("table_angle")
-            angle = block.si("table_angle")
-        check_finite(block, names)
-        time = check_time(block)
-        if not time[0] > end:
-            raise DataError(
-                f"{place}: {block.place(0)}, column time: time runs backwards or stands still: expected more than "
-                f"{end:.9g} s, found {time[0]:.9g} s"
-            )
-        end = float(time[-1])
-        yield channels, Samples(time, np.stack([_rate(block, name, manifest, place) for name in channels]), angle)
-
-
-def _rate(block: Recording, name: str, manifest: Manifest, place: str) -> Array:
-    """A column as rate, rad/s."""
-    unit = parse_unit(block.units[name])
-    if unit.quantity == "rate":
-        return block.si(name)
-    known = manifest.scale_factors.get(name)
-    if known is None:
-        raise UnitError(
-            f"{place}: column {name} is in {unit.symbol}: expected a unit of rate, or {name} under [scale_factor] in "
-            f"the manifest"
-        )
-    if known[1] != unit.symbol:
-        raise UnitError(f"{place}: column {name} is in {unit.symbol}, but its scale factor is in {known[1]} per rate")
-    rate: Array = block.column(name) / known[0]
-    return rate
-
-
-class _Named:
-    """Samples of a run, with the names of their channels once the first block has come."""
-
-    def __init__(self, blocks: Iterable[Recording], manifest: Manifest, index: int) -> None:
-        self._source = samples_of(blocks, manifest, index)
-        self._place = manifest.place(index)
-        self.channels: tuple[str, ...] = ()
-        self.encoder = False
-
-    def __iter__(self) -> Iterator[Samples]:
-        for channels, samples in self._source:
-            self.channels, self.encoder = channels, samples.angle is not None
-            yield samples
-
-
-def reduce_static(blocks: Iterable[Recording], manifest: Manifest, index: int) -> StaticRun:
-    """Return the means of a static run.
-
-    Raises
-    ------
-    DataError
-        It moves: a mean over one second lies further from a straight line than noise explains, or the table turns.
-    """
-    place = manifest.place(index)
-    named = _Named(blocks, manifest, index)
-    try:
-        cells = compress(named, 2 * np.pi, 1.0)  # cells of one second
-    except TooSlowError:
-        raise DataError(f"{place}: expected 8 samples per second or more in a static run") from None
-    if cells is None:
-        raise DataError(f"{place}: shorter than one second; expected a static run of some minutes")
-    count = cells.moments[:, CONSTANT, CONSTANT]
-    sums = cells.moments[:, CONSTANT, COLUMNS:]
-    means = sums / count[:, None]
-    squares = np.einsum("ckk->ck", cells.moments[:, COLUMNS:, COLUMNS:])
-    within = np.sqrt(np.median(np.maximum(squares / count[:, None] - means**2, 0.0), axis=0) / count[0])
-    time = cells.centre - cells.centre.mean()
-    slope = time @ means / max(float(time @ time), 1e-300)
-    flat = means - time[:, None] * slope
-    left = np.abs(flat - np.median(flat, axis=0))
-    steps = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(flat, axis=0)), axis=0) if len(flat) > 3 else 0.0
-    limit = np.maximum(np.maximum(_STILL_SIGMA * within, _STILL_STEPS * steps), _STILL)
-    for number, height in enumerate(_turning(flat)):
-        if height > _STILL_LINE:
-            raise DataError(
-                f"{place}: a static run that moves: column {named.channels[number]} shows a sine of "
-                f"{from_si(height, 'deg/h'):.3g} deg/h, as if the gyroscope turned; expected a record at rest"
-            )
-    if (left > limit).any():
-        cell, channel = np.unravel_index(int(np.argmax(left / limit)), left.shape)
-        raise DataError(
-            f"{place}: a static run that moves: column {named.channels[channel]} is "
-            f"{from_si(float(left[cell, channel]), 'deg/h'):.3g} deg/h off its mean at {cells.centre[cell]:.1f} s; "
-            "expected a record at rest"
-        )
-    if cells.series_angle is not None:
-        angle = np.unwrap(cells.series_angle)
-        if np.ptp(angle) > _STILL_ANGLE:
-            raise DataError(
-                f"{place}: a static run that moves: column table_angle goes over {np.degrees(np.ptp(angle)):.3g} deg; "
-                "expected a record at rest"
-            )
-    return StaticRun(
-        manifest.runs[index], index, named.channels, sums.sum(axis=0) / count.sum() + cells.offset, cells.samples,
-            cells.duration
-    )  # fmt: skip
-
-
-def _turning(flat: Array) -> list[float]:
-    """Height of the sine that holds most of each channel's means over seconds; 0 where none does."""
-    count = len(flat)
-    if count < _SINE_SAMPLES:
-        return [0.0] * flat.shape[1]
-    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
-    power = np.abs(np.fft.rfft(window[:, None] * (flat - flat.mean(axis=0)), axis=0)) ** 2
-    # A sine under this window keeps all its power within two bins of its own.
-    top = np.argmax(power[2:], axis=0) + 2
-    held = np.array([power[max(k - 2, 0) : k + 3, c].sum() for c, k in enumerate(top)]) / np.maximum(
-        power.sum(axis=0), 1e-300
-    )
-    height = 2 * np.sqrt(power[top, range(len(top))]) / window.sum()
-    return [float(h) if share > _SINE_SHARE else 0.0 for h, share in zip(height, held, strict=True)]
-
-
 def reduce_run(
     blocks: Iterable[Recording],
     manifest: Manifest,
@@ -265,10 +110,10 @@ def reduce_run(
         A unit that does not lead to a rate.
     """
     run, place = manifest.runs[index], manifest.place(index)
-    named = _Named(blocks, manifest, index)
+    channels = Channels(blocks, manifest, index)
     table_rate = run.sense * run.table_rate
     sums = PeriodSums(table_rate) if static is not None else None
-    pieces = pieces_of(named)
+    pieces = pieces_of(channels)
     try:
         cells = compress(pieces if sums is None else sums.watch(pieces), table_rate, run.net_rate)
     except TooSlowError as error:
@@ -280,6 +125,7 @@ def reduce_run(
             f"{place}: less than one period of the table ({2 * np.pi / run.table_rate:.4g} s at "
             f"{from_si(run.table_rate, 'deg/s'):.6g} deg/s)"
         )
+    _check_gaps(cells, place)
     _check_resolution(cells, run, place)
     used, warnings = steady_part(cells, place)
     rates = find_rates(used, place)
@@ -292,6 +138,11 @@ def reduce_run(
         noise, freedom, blocks_used = found.noise, found.freedom, len(found.centre)
     if not solution.kept.all():
         warnings.append(f"{place}: too short to tell all lines apart; some harmonics or the net rate were left out")
+    warnings += [
+        f"{place}: column {name} never changes; is it connected?"
+        for name, values in zip(channels.names, cells.series, strict=True)
+        if np.ptp(values) == 0
+    ]
     encoder = cells.series_angle is not None
     # The regression's phase is that of the cells' rate in the middle of the run; chi starts at 0 without encoder.
     turn = np.exp(1j * solution.table_shift * (solution.middle - cells.start))
@@ -301,7 +152,7 @@ def reduce_run(
     return LoadedRun(
         run=run,
         index=index,
-        channels=named.channels,
+        channels=channels.names,
         force=manifest.force(run),
         line=solution.line(LINE) * turn,
         second=solution.line(SECOND) * turn**2,
@@ -321,6 +172,12 @@ def reduce_run(
         spectrum=_spectrum(used, rates) if spectrum else None,
         warnings=(*warnings, *rates.warnings),
     )
+
+
+def _check_gaps(cells: Cells, place: str) -> None:
+    span = float(cells.series_time[-1] - cells.series_time[0]) + cells.series_step
+    if cells.duration < (1 - _MOST_LOST) * span:
+        raise DataError(f"{place}: gaps: {cells.duration:.4g} s of samples in a run of {span:.4g} s")
 
 
 def _check_resolution(cells: Cells, run: Run, place: str) -> None:
@@ -353,10 +210,9 @@ def _spectrum(cells: Cells, rates: Rates) -> tuple[Array, Array]:
     width = 2 * np.pi / cells.duration
     points = _SPECTRUM_HALF_WIDTH * _SPECTRUM_POINTS
     shifts = np.arange(-points, points + 1) * width / _SPECTRUM_POINTS
-    time = cells.series_time
-    heights = []
     rate = abs(rates.table_rate)
-    spectra = [hann_spectrum(time, values - values.mean(), rate + shifts) for values in cells.series]
+    series = [even_series(cells, detrended(cells.series_time, values)) for values in cells.series]
+    spectra = [hann_spectrum(cells.series_step, values, rate + shifts) for values in series]
     heights = [np.abs(spectrum) for spectrum in spectra]
     # Y sees what is fixed in the arm a quarter turn after X, which in a spectrum at positive rates is a factor -i.
     quarter = -1j if rates.table_rate > 0 else 1j

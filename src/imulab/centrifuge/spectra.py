@@ -19,16 +19,26 @@ FINE = 4
 """Points of a spectrum per inverse of the run."""
 
 
-def hann_spectrum(time: Array, values: Array, frequencies: Array) -> Complex:
-    """Return the Hann-windowed spectrum at angular frequencies, a line showing as its ``A - i B``, shape (f,)."""
-    window = 1 - np.cos(2 * np.pi * (np.arange(len(time)) + 0.5) / len(time))
+def even_series(cells: Cells, values: Array) -> Array:
+    """Return what belongs to the bins of a run at even steps: zero where the recording has a gap, shape (n,)."""
+    place = np.round((cells.series_time - cells.series_time[0]) / cells.series_step).astype(np.int64)
+    if place[-1] == len(place) - 1:
+        return values
+    even = np.zeros(int(place[-1]) + 1)
+    even[place] = values
+    return even
+
+
+def hann_spectrum(step: float, values: Array, frequencies: Array) -> Complex:
+    """Return the Hann-windowed spectrum of values a `step` apart, a line showing as its ``A - i B``, shape (f,)."""
+    count = len(values)
+    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
     weighted = window * values / window.sum() * 2
     # Times as start of a stretch plus a multiple of the step: few exponentials, and the rest is a matrix product.
-    stretch = max(1, int(np.sqrt(len(time))))
-    padded = np.append(weighted, np.zeros(-len(time) % stretch)).reshape(-1, stretch)
-    step = (time[-1] - time[0]) / max(len(time) - 1, 1)
+    stretch = max(1, int(np.sqrt(count)))
+    padded = np.append(weighted, np.zeros(-count % stretch)).reshape(-1, stretch)
     inner = padded @ np.exp(-1j * np.outer(np.arange(stretch) * step, frequencies))
-    outer = np.exp(-1j * np.outer(time[::stretch] - time[0], frequencies))
+    outer = np.exp(-1j * np.outer(np.arange(0, count, stretch) * step, frequencies))
     spectrum: Complex = (inner * outer).sum(axis=0)
     return spectrum
 
@@ -43,10 +53,11 @@ def detrended(time: Array, values: Array) -> Array:
 
 def search_line(cells: Cells, series: Array, rate: float, within: float) -> tuple[float, float]:
     """Return the shift of a line from `rate`, rad/s, and its height over the median of the spectrum around it."""
-    count = len(series)
+    values = even_series(cells, detrended(cells.series_time, series))
+    count = len(values)
     window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
     size = FINE * count
-    height = np.abs(np.fft.rfft(window * detrended(cells.series_time, series), size)).astype(np.float64)
+    height = np.abs(np.fft.rfft(window * values, size)).astype(np.float64)
     step = float(2 * np.pi / (size * cells.series_step))
     centre = min(round(abs(rate) / step), len(height) - 1)
     around = np.concatenate([np.arange(-24, -3), np.arange(4, 25)]) * FINE + centre
@@ -73,6 +84,21 @@ def interpolated(grid: Array, height: Array) -> float:
     return float(grid[index] + part * (grid[1] - grid[0]))
 
 
-def in_degrees(rate: float) -> str:
+def strongest_line(cells: Cells, series: Array, above: float) -> float | None:
+    """Return the rate of the highest line faster than `above`, rad/s; None where none stands out."""
+    values = even_series(cells, detrended(cells.series_time, series))
+    count = len(values)
+    window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
+    height: Array = np.asarray(2 * np.abs(np.fft.rfft(window * values)) / window.sum(), dtype=np.float64)
+    rates: Array = np.asarray(2 * np.pi * np.fft.rfftfreq(count, cells.series_step), dtype=np.float64)
+    fast = rates > above
+    if not fast.any() or height[fast].max() < max(PEAK * float(np.median(height)), FAINT):
+        return None
+    index = int(np.argmax(np.where(fast, height, 0.0)))
+    part = slice(max(index - 1, 0), index + 2)
+    return interpolated(rates[part], height[part])
+
+
+def in_degrees(rate: float, digits: int = 6) -> str:
     """Return a rate as messages give it."""
-    return f"{from_si(rate, 'deg/s'):.6g} deg/s"
+    return f"{from_si(rate, 'deg/s'):.{digits}g} deg/s"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from imulab.centrifuge.cells import Cells
 from imulab.centrifuge.regress import LINE, Complex, refine, scatter, solve
-from imulab.centrifuge.spectra import FAINT, PEAK, SEARCH, in_degrees, search_line
+from imulab.centrifuge.spectra import FAINT, PEAK, SEARCH, even_series, in_degrees, search_line
 from imulab.errors import DataError
 from imulab.recording import Array
 from imulab.units import to_si
@@ -65,10 +65,9 @@ def _steady_encoder(cells: Cells, place: str) -> tuple[int, int]:
     """Cells (half-open) over which the encoder's rate is steady."""
     angle = cells.series_angle
     assert angle is not None
-    inside = cells.series_step - cells.step
-    time = cells.series_time - inside / 2
-    deviation = np.unwrap(angle - cells.table_rate * (time - cells.start))[:: cells.bins]
-    rate = np.diff(deviation) / (cells.cell * cells.step)
+    begin = cells.series_begin
+    deviation = np.unwrap(angle - cells.table_rate * (begin - cells.start))[:: cells.bins]
+    rate = np.diff(deviation) / np.diff(begin[:: cells.bins])
     count = len(deviation)
     if count < 4:
         return 0, count
@@ -140,13 +139,14 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
 
 def _check_wandering(cells: Cells, place: str) -> None:
     """Refuse a run without a line at the table rate in which a clear line moves steadily: a ramp all along."""
-    count = len(cells.series_time) // _SEGMENTS
+    series = [even_series(cells, values - values.mean()) for values in cells.series]
+    count = len(series[0]) // _SEGMENTS
     if count < 4 * _SEGMENTS:
         return
     window = 1 - np.cos(2 * np.pi * (np.arange(count) + 0.5) / count)
     rates = 2 * np.pi * np.fft.rfftfreq(count, cells.series_step)
     above = rates > max(1.5 * abs(cells.net_rate), 2.5 * rates[1])
-    for values in cells.series:
+    for values in series:
         segments = values[: count * _SEGMENTS].reshape(_SEGMENTS, count)
         height = np.abs(np.fft.rfft(window * (segments - segments.mean(axis=1, keepdims=True)), axis=1))[:, above]
         clear = height.max(axis=1) > PEAK * np.median(height, axis=1)

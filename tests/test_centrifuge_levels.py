@@ -1,0 +1,259 @@
+"""Runs to levels, levels to the curve, repeatability, and the error budget."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.centrifuge.curve import fit_curve
+from imulab.centrifuge.manifest import make_manifest
+from imulab.centrifuge.model import fog_share
+from imulab.centrifuge.repeat import Deviations, find_repeatability
+from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
+from imulab.errors import OptionError
+from reference import centrifuge as reference
+
+G, DEG_H = reference.G, reference.DEG_H
+K = 3.3 * DEG_H / G
+NET = np.radians(40.0)
+EARTH = 11.6 * DEG_H
+TILTED = RigTruth(tilt=np.radians(10 / 3600), tilt_phase=0.7, earth_rate=EARTH, earth_phase=1.0)
+
+
+def levels_test(*levels, **options):
+    return make_manifest(levels=[n * G for n in levels], radius=2.0, net_rate=NET, **options)
+
+
+def noise_free(truth: Truth) -> Truth:
+    quiet = {"angle_random_walk": 0.0}
+    y = None if truth.y is None else replace(truth.y, **quiet)
+    return Truth(replace(truth.x, **quiet), y, replace(truth.fog, **quiet), truth.rig)
+
+
+# --- levels ------------------------------------------------------------------------------------------------------
+
+
+def test_directions_and_both_axes_with_the_encoder():
+    truth = noise_free(typical_truth(0.02))
+    test = levels_test(1, 5, 20, cycles=2)
+    record = il.fit_centrifuge(test, Simulation(test, truth, 50.0, 120.0, 5.0)).calibration
+    assert record.value("x_direction") == pytest.approx(np.radians(25), abs=2e-4)
+    assert record.value("y_direction") == pytest.approx(np.radians(115), abs=2e-4)
+    force = np.array([level["specific_force"]["value"] for level in record.sections["levels"]])
+    for axis, c2 in (("x", truth.x.c2), ("y", truth.y.c2)):
+        zeta = (1 + c2 * force**2) / (1 + c2 * force[0] ** 2) - 1
+        for n in (2, 3):
+            assert record.value(f"{axis}_zeta_{n}") == pytest.approx(zeta[n - 1], abs=2e-4)
+    assert [level["runs"] for level in record.sections["levels"]] == [[1, 5], [2, 6], [3, 7]]
+    run = record.sections["runs"][3]
+    assert run["x"]["unit"] == "rad/s"
+    assert np.arctan2(run["x"]["B"], run["x"]["A"]) == pytest.approx(np.radians(25), abs=2e-4)
+    assert np.shape(run["x"]["covariance"]) == (2, 2)
+
+
+def test_without_encoder_magnitudes_and_no_direction():
+    test = levels_test(1, 5, 20, cycles=2, both_senses=True)
+    truth = noise_free(typical_truth(0.02))
+    truth = replace(truth, rig=replace(truth.rig, base_tilt=0.0))
+    record = il.fit_centrifuge(test, Simulation(test, truth, 50.0, 120.0, 5.0, False)).calibration
+    assert not any("direction" in name for name in record.parameters)
+    assert record.value("x_zeta_3") == pytest.approx((1.02) / (1 + 0.02 / 400) - 1, abs=1e-5)
+    assert sum("magnitudes of the two senses were averaged" in message for message in record.warnings) == 1
+
+
+def test_a_second_set_with_the_spin_axis_down_separates_the_cross_terms():
+    cross = 2e-3 * K
+    truth = Truth(AxisTruth(D_x=K, cross_x=cross, cross_y=-2 * cross), None, FogTruth(), TILTED)
+    up = levels_test(1, 10)
+    down = tuple(replace(run, file=f"d_{run.file}", spin_axis="down") for run in up.runs if run.role == "loaded")
+    test = replace(up, runs=(*up.runs, *down), gravity=9.81)
+    truth = replace(truth, rig=replace(truth.rig, gravity=9.81))
+    record = il.fit_centrifuge(test, Simulation(test, truth, 50.0, 120.0, 5.0)).calibration
+    expected = [abs(K + s * 9.81 * (cross - 2j * cross)) for s in (1, -1)]
+    for n in (1, 2):
+        assert record.value(f"x_K_{n}") == pytest.approx(expected[0], rel=1e-8)
+        assert record.value(f"x_down_K_{n}") == pytest.approx(expected[1], rel=1e-8)
+        assert record.value(f"x_cross_{n}") == pytest.approx(abs(cross - 2j * cross), rel=1e-7)
+        level = record.sections["levels"][n - 1]
+        assert complex(level["x_cross"]["A"], level["x_cross"]["B"]) == pytest.approx(cross - 2j * cross, rel=1e-7)
+        assert level["x_half_sum"]["A"] == pytest.approx(K, rel=1e-8)
+    assert {"x_down_K0", "x_down_zeta_2", "x_down_direction"} <= set(record.parameters)
+
+
+def test_levels_below_the_reference_keep_their_rows_but_have_no_number():
+    test = replace(levels_test(0.5, 1, 5), reference=G)
+    record = il.fit_centrifuge(test, Simulation(test, typical_truth(), 50.0, 90.0, 5.0)).calibration
+    assert [level["level"] for level in record.sections["levels"]] == [1, 2]
+    assert record.sections["levels"][0]["specific_force"]["value"] == pytest.approx(G, rel=1e-6)
+    assert len(record.sections["runs"]) == 4
+    assert "A" in record.sections["runs"][1]["x"]
+
+
+def scattered(**gains):
+    """Three power cycles at four levels, K of each cycle times its gain, turned by its angle."""
+    test = levels_test(1, 5, 10, 20, cycles=3)
+    truth = typical_truth(0.0)
+    cycles = {}
+    for cycle in (1, 2, 3):
+        turn = gains.get("gain", (1, 1, 1))[cycle - 1] * np.exp(1j * gains.get("angle", (0, 0, 0))[cycle - 1])
+        x = (truth.x.D_x + 1j * truth.x.D_y) * turn
+        cycles[cycle] = replace(truth, x=replace(truth.x, D_x=x.real, D_y=x.imag))
+    simulations = {cycle: Simulation(test, one, 50.0, 90.0, 5.0) for cycle, one in cycles.items()}
+    return il.fit_centrifuge(test, lambda run: simulations[run.power_cycle](run), curve="constant").calibration
+
+
+def test_a_change_of_k_from_power_on_to_power_on_does_not_average_out_over_levels():
+    steady, changed = scattered(), scattered(gain=(0.98, 1.0, 1.02))
+    found = changed.fit["repeatability"]
+    # X alone changes: 2 % in X and none in Y are 1.4 % on both, whose mean of three is 0.8 %.
+    assert found["relative_standard_deviation"] == pytest.approx(0.02 / np.sqrt(2), rel=0.3)
+    assert found["within_power_cycle"] == 0
+    assert sum("K differs between power cycles" in message for message in changed.warnings) == 1
+    for name in ("x_K_4", "x_K0"):
+        u = changed.parameters[name].standard_uncertainty / changed.value(name)
+        assert u == pytest.approx(found["relative_standard_deviation"] / np.sqrt(3), rel=0.1)
+    before, after = (record.parameters["x_zeta_4"].standard_uncertainty for record in (steady, changed))
+    assert after == pytest.approx(before, rel=0.1)
+    # What happens to one axis need not happen to the other.
+    names = list(changed.covariance.names)
+    matrix = changed.covariance.array()
+    i, j = names.index("x_K_4"), names.index("y_K_4")
+    assert abs(matrix[i, j]) < 0.2 * np.sqrt(matrix[i, i] * matrix[j, j])
+    assert steady.fit["repeatability"]["relative_standard_deviation"] == 0
+    assert changed.fit["degrees_of_freedom"]["x_K0"] < 10
+
+
+def test_a_change_of_direction_from_power_on_to_power_on_is_in_the_direction():
+    record = scattered(angle=np.radians([-1.0, 0.0, 1.0]))
+    found = record.fit["repeatability"]
+    assert found["relative_standard_deviation"] < 1e-3
+    assert found["direction"]["value"] == pytest.approx(np.radians(1.0) / np.sqrt(2), rel=0.3)
+    u = record.parameters["x_direction"].standard_uncertainty
+    assert u == pytest.approx(found["direction"]["value"] / np.sqrt(3), rel=0.1)
+    assert record.fit["direction_probability"]["x"] > 0.01
+
+
+def test_repeatability_is_split_between_power_cycles_and_runs():
+    rng = np.random.default_rng(7)
+    level, cycle = (each.ravel() for each in np.meshgrid(np.arange(30), np.arange(40)))
+    sigma = 1e-3 * np.ones(level.size)
+    for of_cycle, of_run in ((0.0, 0.0), (2e-2, 0.0), (0.0, 5e-3), (2e-2, 5e-3)):
+        size = of_cycle * rng.standard_normal(40)[cycle] + of_run * rng.standard_normal(level.size)
+        size += sigma * rng.standard_normal(level.size)
+        found = find_repeatability([Deviations(level, cycle, size, 0 * size, sigma**2, sigma**2)])
+        assert np.sqrt(found.cycle) == pytest.approx(of_cycle, rel=0.4, abs=1.2e-3 if of_run else 3e-4)
+        assert np.sqrt(found.run) == pytest.approx(of_run, rel=0.1, abs=3e-4)
+        assert (found.freedom, found.run_freedom) == (39, 29 * 39)
+        assert found.turn == 0
+
+
+def test_counts_are_turned_into_rates_by_the_manifest():
+    test = levels_test(1, 5)
+    simulation = Simulation(test, typical_truth(), 50.0, 90.0, 5.0, unit="deg/s")
+    plain = il.fit_centrifuge(test, simulation).calibration
+    counted = replace(
+        test, scale_factors={name: (1250.0 / np.radians(1), "count") for name in ("dtg_x", "dtg_y", "fog")}
+    )
+
+    def in_counts(run):
+        for block in simulation(run):
+            columns = {n: block.columns[n] * 1250.0 for n in ("dtg_x", "dtg_y", "fog")}
+            yield block.with_columns(columns, dict.fromkeys(columns, "count"))
+
+    again = il.fit_centrifuge(counted, in_counts).calibration
+    for name, parameter in plain.parameters.items():
+        assert again.value(name) == pytest.approx(parameter.value, rel=1e-9)
+
+
+# --- curve -------------------------------------------------------------------------------------------------------
+
+
+def test_the_curve_is_weighted_least_squares():
+    rng = np.random.default_rng(4)
+    force = G * np.array([1, 2, 5, 10, 20, 40.0])
+    root = rng.standard_normal((6, 6)) * 1e-3
+    covariance = root @ root.T + 1e-6 * np.eye(6)
+    values = 1 + 1e-4 * force + 1e-3 * rng.standard_normal(6)
+    found = fit_curve(force, values, covariance, "c1+c2")
+    J = np.stack([np.ones(6), force, force**2], axis=1)
+    W = np.linalg.inv(covariance)
+    np.testing.assert_allclose(found.coefficients, np.linalg.solve(J.T @ W @ J, J.T @ W @ values), rtol=1e-8)
+    np.testing.assert_allclose(found.from_levels @ values, found.coefficients, rtol=1e-12)
+    left = values - J @ found.coefficients
+    assert found.chi_square == pytest.approx(left @ W @ left, rel=1e-6)
+
+
+def test_model_choice_takes_no_term_too_many_in_nineteen_of_twenty():
+    rng = np.random.default_rng(5)
+    force = G * np.array([1, 2, 5, 10, 15, 20, 30, 40.0])
+    sigma = 0.02 / (force / G)
+    chosen = [fit_curve(force, 1 + sigma * rng.standard_normal(8), np.diag(sigma**2)).model for _ in range(600)]
+    # Two single terms, strongly correlated, at 5 % each, and their pair.
+    assert 0.88 < chosen.count("constant") / 600 < 0.96
+    bent = [
+        fit_curve(force, 1 + 2.5e-7 * force**2 + sigma * rng.standard_normal(8), np.diag(sigma**2)) for _ in range(50)
+    ]
+    assert sum(fit.model == "c2" for fit in bent) > 40
+
+
+def test_unknown_methods_and_curves_are_refused():
+    test = levels_test(1, 5)
+    with pytest.raises(OptionError, match=r"expected one of least-squares fourier"):
+        il.fit_centrifuge(test, lambda run: [], method="magic")
+    with pytest.raises(OptionError, match="expected one of auto constant c1 c2"):
+        il.fit_centrifuge(test, lambda run: [], curve="c3")
+    with pytest.raises(OptionError, match="2 levels; expected at least 3"):
+        il.fit_centrifuge(test, Simulation(test, typical_truth(), 50.0, 60.0, 5.0), curve="c1+c2")
+
+
+# --- error budget ------------------------------------------------------------------------------------------------
+
+
+def budget(record):
+    return {entry["error"]: entry for entry in record.fit["error_budget"]}
+
+
+def test_the_budget_finds_what_was_planted():
+    truth = typical_truth()
+    planted = Truth(
+        replace(truth.x, scale_error=4e-3, differential_flexure=1e-7 / G, angle_random_walk=1e-8), None,
+        replace(truth.fog, azimuth=2e-3, delay=1e-3, angle_random_walk=1e-8), replace(truth.rig, base_tilt=0.0),
+    )  # fmt: skip
+    test = replace(levels_test(1, 5, 10, 20, 40, both_senses=True), rate_uncertainty=np.radians(5e-4))
+    found = budget(il.fit_centrifuge(test, Simulation(test, planted, 50.0, 200.0, 5.0)).calibration)
+    assert found["tilt"]["value"] == pytest.approx(truth.rig.tilt, rel=5e-3)
+    assert found["common flexure"]["value"] == pytest.approx(truth.rig.flexure, rel=0.02)
+    assert found["scale mismatch"]["value"] == pytest.approx(4e-3, rel=0.05)
+    assert found["delay of the FOG"]["value"] == pytest.approx(1e-3, rel=0.01)
+    assert found["differential flexure"]["bounded"]
+    assert found["differential flexure"]["effect"] == 0
+    assert found["differential flexure"]["removed"] > 0.05
+    assert found["arm rate"]["bounded"]
+
+
+def test_the_budget_says_what_the_data_do_not_bound():
+    test = levels_test(1, 10, 40)
+    found = budget(il.fit_centrifuge(test, Simulation(test, typical_truth(), 50.0, 120.0, 5.0, False)).calibration)
+    assert not found["differential flexure"]["bounded"]
+    # 0.1 µrad/g at 40 g: up to 7.5 % (methods); 1 ms: 0.6 % at 10 g and more above.
+    assert found["differential flexure"]["effect"] == pytest.approx(0.085, rel=0.05)
+    assert not found["delay, FOG to X"]["bounded"]
+    assert found["table rate"]["bounded"]
+    assert found["table rate"]["effect"] < 1e-5
+
+
+@pytest.mark.parametrize("late", [0.0, 1e-3])
+def test_the_budget_tells_the_delay_of_the_fog_from_that_of_x(late):
+    truth = replace(noise_free(typical_truth()), fog=FogTruth(delay=late))
+    test = levels_test(1, 5, 10, 20, 40)
+    found = budget(il.fit_centrifuge(test, Simulation(test, truth, 50.0, 120.0, 5.0)).calibration)
+    assert found["delay of the FOG"]["value"] == pytest.approx(late, abs=2e-6)
+    assert found["delay of X"]["value"] == pytest.approx(0.0, abs=1e-5)
+    # 1 ms of w_s at 40 g turns the FOG's line by 0.76 deg, and that line is as large as the drift.
+    assert found["delay of the FOG"]["effect"] == pytest.approx(late * np.radians(762.4) * 1.06, rel=0.05, abs=1e-4)
+
+
+def test_fog_share_is_the_quarter_turn():
+    x, y, fog = 3 + 4j, 1 - 2j, 0.5 + 0.25j
+    np.testing.assert_allclose(fog_share(2) @ [x, y, fog], [x - fog, y - complex(-0.25, 0.5)])
