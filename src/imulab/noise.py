@@ -177,7 +177,8 @@ def read_coefficients(curve: AllanCurve) -> NoiseCoefficients:
     for value, spread in zip(values, np.sqrt(np.diag(covariance)), strict=True):
         size = math.sqrt(value)
         found.append(Coefficient(size, float(min(spread / (2 * size) if size else math.inf, math.sqrt(spread)))))
-    return NoiseCoefficients(*found, covariance=covariance)
+    white, flicker, walk = found
+    return NoiseCoefficients(white, flicker, walk, covariance)
 
 
 def noise_columns(recording: Recording) -> Iterator[str]:
@@ -249,7 +250,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         "samples": len(recording),
         "sample_rate": {"value": rate, "unit": "Hz"},
         "taus": taus,
-        "warnings": notes,
+        "warnings": [*(f"{recording.name}: {note}" for note in recording.notes), *notes],
         "columns": columns,
     }
 
