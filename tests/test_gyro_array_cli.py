@@ -57,7 +57,7 @@ def test_the_way_from_simulation_to_comparison(imulab, tmp_path):
     assert json.loads(printed.stdout)["procedure"] == "gyro_array"
     refused = imulab("array", "fuse", "run.csv", "--calibration", "c.json")
     assert refused.returncode == 2
-    assert "expected the record of an array calibration, found one of a comparison" in refused.stderr
+    assert "c.json: expected the record of an array calibration, found one of a comparison" in refused.stderr
 
 
 def test_what_happened_to_a_gyro_is_one_line_that_names_its_column(imulab, run_file):
@@ -292,6 +292,7 @@ def _without(*names: str) -> str:
         (_text(gyro_4="rad/s"), [], ["must share one unit", "gyro_4 [rad/s]", "gyro_1 [deg/s]"]),
         (_without("time"), [], ["no column time"]),
         (_without("gyro_2"), [], ["no column gyro_2; expected 6 elements"]),
+        (_text().replace("gyro_6 [", "gyro_0 [", 1), [], ["bad.csv: column gyro_0: expected elements numbered 1 2 3"]),
         (_without(*[f"gyro_{i}" for i in range(1, 7)]), [], ["no columns gyro_1 gyro_2 .. (one axis)", "found time"]),
         (_row(50, lambda r: r + ",1.0"), [], ["row 50 (line 51)", "expected 7 fields, found 8"]),
         (_row(50, lambda r: r.rsplit(",", 1)[0]), [], ["row 50 (line 51)", "expected 7 fields, found 6"]),
@@ -321,6 +322,35 @@ def test_a_bad_input_gets_one_line_and_leaves_nothing(text, options, fragments, 
         assert fragment in done.stderr
     assert done.stdout == ""
     assert [p.name for p in tmp_path.iterdir()] == ["bad.csv"]
+
+
+def test_a_record_that_does_not_fit_is_refused_with_both_names(imulab, run_file, tmp_path):
+    record = run_file / "array.json"
+    il.write_csv(simulate_array(elements=4, duration=2.0), tmp_path / "four.csv")
+    (tmp_path / "raw.csv").write_text(_text(**dict.fromkeys([f"gyro_{i}" for i in range(1, 7)], "count")))
+    compare_methods(simulate_array(duration=5.0)).record.save(tmp_path / "other.json")
+    for name, option, given, expected in (
+        (
+            "four.csv",
+            "--calibration",
+            record,
+            "four.csv: 4 gyros on 1 axis; the record of the calibration holds 6 on 1",
+        ),
+        ("four.csv", "--initial-bias", record, "four.csv: 4 gyros on 1 axis"),
+        ("raw.csv", "--calibration", record, "raw.csv: column gyro_1 is in count; the record of the calibration is in"),
+        ("four.csv", "--calibration", "other.json", "other.json: expected the record of an array calibration"),
+        ("four.csv", "--initial-bias", "other.json", "other.json: expected the record of an array calibration"),
+    ):
+        refused = imulab("array", "fuse", name, option, given)
+        assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (2, "", 1)
+        assert expected in refused.stderr
+
+
+def test_a_truth_for_some_axes_only_is_refused():
+    recording = simulate_array(axes=3, duration=10.0)
+    columns = {name: values for name, values in recording.columns.items() if name != "truth_rate_y"}
+    with pytest.raises(il.errors.DataError, match="column truth_rate_x without truth_rate_y; expected truth_rate_x tr"):
+        compare_methods(type(recording)(columns, {name: recording.units[name] for name in columns}, name="a.csv"))
 
 
 def test_clocks_that_disagree_are_refused(imulab, tmp_path):

@@ -387,4 +387,7 @@ def test_a_blob_fuses_as_the_unit_does(imulab, tmp_path):
     assert refused.returncode == 2
     assert "a blob fuses by robust with growing memory, and by nothing else" in refused.stderr
     il.write_csv(simulate_array(duration=2.0, elements=4), tmp_path / "four.csv")
-    assert "holds 6 elements on 1 axes" in imulab("array", "fuse", "four.csv", "--calibration", blob).stderr
+    assert "four.csv: 4 gyros on 1 axis; the blob" in imulab("array", "fuse", "four.csv", "--calibration", blob).stderr
+    refused = imulab("array", "fuse", "run.csv", "--calibration", blob, "--initial-bias", "zero")
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "a blob holds the biases it starts from: no --initial-bias" in refused.stderr

@@ -250,7 +250,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         "samples": len(recording),
         "sample_rate": {"value": rate, "unit": "Hz"},
         "taus": taus,
-        "warnings": notes,
+        "warnings": [*(f"{recording.name}: {note}" for note in recording.notes), *notes],
         "columns": columns,
     }
 

@@ -16,6 +16,7 @@ from imulab.cli.options import (
     RecordingFile,
     ReportFile,
     check_outputs,
+    heard,
     progress_bar,
     quantity,
     warn,
@@ -26,7 +27,7 @@ from imulab.errors import OptionError
 if TYPE_CHECKING:
     from imulab.blob import Blob
     from imulab.calibration import Calibration
-    from imulab.gyro_array.fuse import FuseOptions, Fuser
+    from imulab.gyro_array.fuse import Fuser
     from imulab.gyro_array.simulate import Fault
     from imulab.recording import Recording
 
@@ -180,30 +181,37 @@ def fuse(
         still=None if interval is None else _interval(interval, "--still"),
     )
     fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
-    blocks = (fused_recording(part) for part in fuser.fuse(read_blocks(file, layout)))
+    blocks = (fused_recording(part) for part in fuser.fuse(heard(read_blocks(file, layout))))
     if output:
         write(blocks, output)
     else:
         first = next(blocks)  # fused before anything is written, so that a refusal leaves no head behind
         write_csv_to(_flushed(first, blocks), sys.stdout.buffer)
         sys.stdout.buffer.flush()
-    _say(fuser, options)
+    _say(fuser)
 
 
 def _load(name: str, option: str) -> Calibration:
     from pathlib import Path
 
     from imulab.calibration import load
+    from imulab.gyro_array.model import check_calibration
 
     if option == "--initial-bias" and not Path(name).exists():
         raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
-    return load(name)
+    record = load(name)
+    check_calibration(record, name)
+    return record
 
 
 def _load_any(name: str) -> Calibration | Blob:
-    from imulab.blob import load_any
+    from imulab.blob import Blob, load_any
+    from imulab.gyro_array.model import check_calibration
 
-    return load_any(name)
+    record = load_any(name)
+    if not isinstance(record, Blob):
+        check_calibration(record, name)
+    return record
 
 
 def _interval(text: str, option: str) -> tuple[float, float]:
@@ -222,7 +230,7 @@ def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]
         sys.stdout.buffer.flush()
 
 
-def _say(fuser: Fuser, options: FuseOptions) -> None:
+def _say(fuser: Fuser) -> None:
     for line in fuser.notes():
         warn(line)
     if fuser.health is not None:
@@ -248,12 +256,12 @@ def compare(
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
     check_outputs([output, report], [name for name in (file, calibration, layout) if name])
+    count = whole_number(seeds, "--seeds")
     if experiment is not None:
         if output or report:
             raise OptionError("array compare: -o and --report need a FILE")
         from imulab.gyro_array.experiments import run_experiment
 
-        count = whole_number(seeds, "--seeds")
         with progress_bar("seeds", count) as progress:
             rows = run_experiment(experiment, seeds=count, progress=progress)
         print(

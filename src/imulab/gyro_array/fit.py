@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import DataError, OptionError, UnitError
+from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.gyro_array.align import Alignment, align
 from imulab.gyro_array.model import Elements, find_elements, fixed_weights
 from imulab.noise import COEFFICIENTS, AllanCurve, NoiseCoefficients, allan_deviation, read_coefficients, sampling_rate
@@ -51,8 +51,8 @@ def calibrate_array(
 
     At rest: each element's bias is its plain mean, the common part included; N, B, K come from its Allan curve, and so
     does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance matrix at `averaging_time` is
-    half the mean of the products of successive differences of means (the Allan covariance; Vaccaro and Zaki 2017). In
-    motion: `align`.
+    half the mean of the products of successive differences of means (the Allan covariance; Vaccaro and Zaki 2017).
+    In motion: `align`.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def calibrate_array(
     if not averaging_time > 0:
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
     rest = _at_rest(still, elements)
-    warnings = list(still.notes)
+    warnings = [f"{still.name}: {note}" for note in still.notes]
     _, notes = sampling_rate(still)
     warnings += notes
     aligned = None
@@ -139,7 +139,7 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
     check_finite(moving, [name for row in its.names for name in row])
     readings = _si(moving, its)
     clipped = _clipped(readings)
-    notes = []
+    notes = [f"{moving.name}: {note}" for note in moving.notes]
     if clipped.any():
         notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
     truth = its.truth(moving)
@@ -148,7 +148,10 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
     kept = readings[~clipped] - rest.bias
     if len(kept) < _FEWEST_SAMPLES:
         raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
-    return align(kept, rest.white, truth), notes
+    try:
+        return align(kept, rest.white, truth), notes
+    except ObservabilityError as error:
+        raise ObservabilityError(f"{moving.name}: {error}") from None
 
 
 def _clipped(readings: Array) -> np.ndarray:

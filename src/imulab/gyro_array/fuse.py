@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.blob import Blob
 from imulab.calibration import Calibration
-from imulab.errors import DataError, OptionError, RecordError
+from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.gyro_array.clocks import Clock, to_one_clock
 from imulab.gyro_array.health import Health
 from imulab.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
@@ -20,6 +20,7 @@ from imulab.gyro_array.model import (
     ArrayCalibration,
     Elements,
     array_calibration,
+    count_of_axes,
     find_elements,
 )
 from imulab.recording import Array, Recording
@@ -81,6 +82,12 @@ class FuseOptions:
         if isinstance(self.calibration, Blob) and (self.method, self.memory, self.start) != ("robust", "growing", 1):
             raise OptionError(
                 f"{self.calibration.name}: a blob fuses by robust with growing memory, and by nothing else"
+            )
+        if isinstance(self.calibration, Blob) and self.initial_bias != "first":
+            raise OptionError(f"{self.calibration.name}: a blob holds the biases it starts from: no --initial-bias")
+        if isinstance(self.initial_bias, Calibration) and self.calibration is not None:
+            raise OptionError(
+                "--initial-bias RECORD together with --calibration: the calibration takes the biases off already"
             )
         if self.rate is not None and not 0 < self.rate < 1e9:
             raise OptionError(f"rate {self.rate:g}: expected a positive number of Hz")
@@ -174,7 +181,6 @@ class Fuser:
     weights: bool = False
     clock: Clock = field(default_factory=Clock)
     health: Health | None = None
-    said: list[str] = field(default_factory=list)
     tell: Callable[[str], None] = lambda _: None
     name: str = "recording"
 
@@ -224,8 +230,8 @@ class Fuser:
             yield self._fused(block, out, seen, elements)
 
     def notes(self) -> list[str]:
-        """Return what there is to say at the end: gaps, and choices that were made."""
-        return [*self.said, *self.clock.lines(self.name)]
+        """Return what there is to say of gaps at the end."""
+        return self.clock.lines(self.name)
 
     def _fused(self, block: Recording, out: Any, seen: int, elements: Elements) -> Fused:
         time, rate = block.si("time"), out.rate[seen:]
@@ -252,11 +258,15 @@ class Fuser:
             )
 
     def _open(self, block: Recording, elements: Elements, first: Array) -> Any:
-        return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE])
+        return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE], block.name)
 
 
-def open_stream(options: FuseOptions, elements: Elements, rate: float, first: Array) -> Any:
-    """Return a `runtime.Stream` for these elements; `first` are readings to take the noise from where no record has it.
+def open_stream(
+    options: FuseOptions, elements: Elements, rate: float, first: Array, recording: str = "recording"
+) -> Any:
+    """Return a `runtime.Stream` for these elements of a recording of this name.
+
+    `first` are readings to take the noise from where no record has it.
 
     Raises
     ------
@@ -266,16 +276,14 @@ def open_stream(options: FuseOptions, elements: Elements, rate: float, first: Ar
     from imulab.runtime import array_stream
 
     if isinstance(options.calibration, Blob):
-        return _blob_stream(options.calibration, elements)
-    calibration = None if options.calibration is None else _of(options.calibration, elements)
+        return _blob_stream(options.calibration, elements, recording)
+    calibration = None
+    if options.calibration is not None:
+        calibration = array_calibration(options.calibration, elements, recording)
     initial: Any = options.initial_bias
     bias = None if calibration is None else calibration.bias
     if isinstance(initial, Calibration):
-        start = _of(initial, elements).bias
-        if bias is not None:
-            raise OptionError(
-                "--initial-bias RECORD together with --calibration: the calibration takes the biases off already"
-            )
+        start = array_calibration(initial, elements, recording).bias
         if options.method == "feedback":
             initial = start
         else:  # what the others start from is taken off for good: their own estimates are relative to it
@@ -313,7 +321,7 @@ class _InUnits:
         return replace(out, rate=out.rate / self.factor)
 
 
-def _blob_stream(blob: Blob, elements: Elements) -> _InUnits:
+def _blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
     """Return the stream of an exported blob."""
     from imulab.runtime import Stream
     from imulab.tables import ArraySettings
@@ -323,16 +331,15 @@ def _blob_stream(blob: Blob, elements: Elements) -> _InUnits:
         raise RecordError(f"{blob.name}: the blob holds no array")
     if (section["elements"], section["axes"]) != (elements.count, len(elements.axes)):
         raise RecordError(
-            f"{blob.name}: the blob holds {section['elements']} elements on {section['axes']} axes, "
-            f"the recording {elements.count} on {len(elements.axes)}"
+            f"{recording}: {elements.count} gyros on {count_of_axes(len(elements.axes))}; the blob {blob.name} holds "
+            f"{section['elements']} on {count_of_axes(section['axes'])}"
         )
+    for row, unit in zip(elements.names, elements.units, strict=True):
+        if parse_unit(unit).quantity != "rate":
+            raise UnitError(f"{recording}: column {row[0]} is in {unit}; the blob {blob.name} is in rad/s")
     factor = np.array([conversion_factor(unit, "rad/s") for unit in elements.units])
     settings = ArraySettings(section["method"], elements.count, len(elements.axes), rate=section["rate"])
     return _InUnits(Stream.of_blob(blob.data, settings), factor)
-
-
-def _of(record: Calibration, elements: Elements) -> ArrayCalibration:
-    return array_calibration(record, elements)
 
 
 def _aligned(matrices: Array | None, spread: Array) -> Array:

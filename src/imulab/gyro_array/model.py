@@ -1,8 +1,7 @@
 """What a gyro array is: which columns of a recording are its elements, and what a record says of them.
 
 One axis: columns ``gyro_1 .. gyro_n``. Three axes: ``gyro_x_1 .. gyro_z_n``. ``z_i = A_i w + b_i``: reading z of
-element i,
-body rate w, bias b; the record holds ``M_i = A_i^-1`` so that ``w = M_i (z_i - b_i)``.
+element i, body rate w, bias b; the record holds ``M_i = A_i^-1`` so that ``w = M_i (z_i - b_i)``.
 """
 
 from __future__ import annotations
@@ -21,7 +20,8 @@ from imulab.units import conversion_factor, from_si, parse_unit
 METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")
 FEWEST_ROBUST = 3
 MOST_ELEMENTS = 64
-_ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9]\d*)")
+_ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9][0-9]*)")
+_MISNUMBERED = re.compile(r"gyro_(?:[xyz]_)?0[0-9]*")
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,18 @@ class Elements:
 
         Raises
         ------
+        DataError
+            There is a truth for some axes only.
         UnitError
             The truth has a unit that cannot be converted to the readings'.
         """
         names = [f"truth_{name}" for name in self.rate_names()]
-        if not all(name in recording for name in names):
+        there = [name for name in names if name in recording]
+        if not there:
             return None
+        if len(there) < len(names):
+            missing = next(name for name in names if name not in there)
+            raise DataError(f"{recording.name}: column {there[0]} without {missing}; expected {' '.join(names)}")
         columns = []
         for name, unit in zip(names, self.units, strict=True):
             try:
@@ -86,7 +92,7 @@ def find_elements(recording: Recording) -> Elements:
     Raises
     ------
     DataError
-        There are none, numbers are missing, or the axes have different numbers of elements.
+        There are none, numbers are missing or do not begin with 1, or the axes have different numbers of elements.
     UnitError
         The elements of an axis have different units.
     """
@@ -95,6 +101,8 @@ def find_elements(recording: Recording) -> Elements:
         match = _ELEMENT.fullmatch(name)
         if match:
             found.setdefault(match[1] or "", {})[int(match[2])] = name
+        elif _MISNUMBERED.fullmatch(name):
+            raise DataError(f"{recording.name}: column {name}: expected elements numbered 1 2 3 ..")
     if not found:
         raise DataError(
             f"{recording.name}: no columns gyro_1 gyro_2 .. (one axis) or gyro_x_1 .. gyro_z_n (three); "
@@ -148,8 +156,21 @@ class ArrayCalibration:
     walk: Array
 
 
-def array_calibration(record: Calibration, elements: Elements) -> ArrayCalibration:
-    """Return what a record says of these elements.
+def check_calibration(record: Calibration, name: str = "the record") -> None:
+    """Check that a record, of this file name, is that of an array calibration.
+
+    Raises
+    ------
+    RecordError
+        It is of another procedure, or of a comparison.
+    """
+    if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
+        what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
+        raise RecordError(f"{name}: expected the record of an array calibration, found one of a {what}")
+
+
+def array_calibration(record: Calibration, elements: Elements, recording: str = "recording") -> ArrayCalibration:
+    """Return what a record says of the elements of a recording of this name.
 
     Raises
     ------
@@ -158,18 +179,16 @@ def array_calibration(record: Calibration, elements: Elements) -> ArrayCalibrati
     UnitError
         The readings are not rates.
     """
-    if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
-        what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
-        raise RecordError(f"expected the record of an array calibration, found one of a {what}")
+    check_calibration(record)
     listed = record.sections.get("elements", [])
     if len(listed) != elements.count or len(record.model["axes"]) != len(elements.axes):
         raise RecordError(
-            f"the record holds {len(listed)} elements on {len(record.model['axes'])} axes, "
-            f"the recording {elements.count} on {len(elements.axes)}"
+            f"{recording}: {elements.count} gyros on {count_of_axes(len(elements.axes))}; "
+            f"the record of the calibration holds {len(listed)} on {count_of_axes(len(record.model['axes']))}"
         )
-    for name, unit in zip(elements.rate_names(), elements.units, strict=True):
+    for row, unit in zip(elements.names, elements.units, strict=True):
         if parse_unit(unit).quantity != "rate":
-            raise UnitError(f"{name}: the record's biases are in rad/s, the readings in {unit}")
+            raise UnitError(f"{recording}: column {row[0]} is in {unit}; the record of the calibration is in rad/s")
 
     def of(key: str) -> Array:
         values = np.array([np.atleast_1d(element[key]["value"]) for element in listed]).T
@@ -187,6 +206,11 @@ def array_calibration(record: Calibration, elements: Elements) -> ArrayCalibrati
         white=of("angle_random_walk"),
         walk=of("rate_random_walk"),
     )
+
+
+def count_of_axes(count: int) -> str:
+    """Return ``1 axis`` or ``3 axes``, for messages."""
+    return "1 axis" if count == 1 else f"{count} axes"
 
 
 def _matrix(element: dict[str, Any]) -> Array:
