@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imulab.calibration import Calibration, Covariance, Parameter, content_sha256, load, loads
+from imulab.calibration import Calibration, Covariance, Parameter, content_sha256, json_text, load, loads
 from imulab.errors import OptionError, RecordError
 from imulab.files import replacing, write_text
 from imulab.recording import Source
@@ -371,3 +371,13 @@ def test_a_file_may_have_the_longest_name_that_the_folder_takes(tmp_path):
     name = "n" * (os.pathconf(tmp_path, "PC_NAME_MAX") - 5) + ".json"
     record().save(tmp_path / name)
     assert load(tmp_path / name) == record()
+
+
+def test_the_text_of_a_record_is_that_of_the_standard_library():
+    content = {
+        "text": "µ \"quoted\" \n\x01 \u2028", "": {}, "none": None, "truth": [True, False], "empty": [], 
+        "deep": [[], [{}]],
+        "numbers": [1, 2.5, -0.0, 1e-300, 1e22, 123456789.123456789, 5e-324], "floats": [0.1, 1e100], "whole": 2**70,
+        "rows": [[1.0, 2.0], [3.0, None]], "nested": {"a": {"b": [1, {"c": "d"}]}},
+    }  # fmt: skip
+    assert json_text(content) == json.dumps(content, indent=1, ensure_ascii=False) + "\n"
