@@ -195,6 +195,21 @@ def test_a_wrong_table_rate_is_found_on_the_fog(error):
     plain = il.fit_centrifuge(test, Simulation(test, wrong, 50.0, 300.0, 5.0, False), method="fourier").calibration
     lost = abs(error) * test.runs[3].table_rate * 300 / 2
     assert plain.value("x_K_3") / K == pytest.approx(np.sin(lost) / lost, abs=3e-3)
+    # fourier says so, and knows it in its uncertainty.
+    u = plain.parameters["x_K_3"].standard_uncertainty / K
+    assert u == pytest.approx(lost**2 / 6, rel=0.1)
+    assert any("costs" in message and "c1_40g.csv" in message for message in plain.warnings)
+
+
+def test_a_rate_taken_from_the_manifest_costs_what_its_uncertainty_may():
+    """No line of the FOG, no encoder: (u_w T)^2 / 24 of the amplitude."""
+    level = replace(TILTED, tilt=0.0)
+    test = replace(levels_test(1, 10), rate_uncertainty=np.radians(0.05))
+    truth = Truth(AxisTruth(D_x=K, angle_random_walk=1e-9), None, FogTruth(angle_random_walk=1e-8), level)
+    record = il.fit_centrifuge(test, Simulation(test, truth, 50.0, 300.0, 5.0, False)).calibration
+    assert record.sections["runs"][2]["table_rate_from"] == "manifest"
+    u = np.hypot((np.radians(0.05) * 300) ** 2 / 24, 2 * np.radians(0.05) / test.runs[2].arm_rate)
+    assert record.parameters["x_K_2"].standard_uncertainty / K == pytest.approx(u, rel=0.05)
 
 
 def test_k_at_20_g_within_five_parts_in_ten_thousand():

@@ -210,11 +210,25 @@ def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -
         line = size.astype(np.complex128)
     vector = as_vector(line)
     relative = 2 * manifest.rate_uncertainty / run.run.arm_rate
-    # Amplitude lost to an uncertain table rate, (u T)^2 / 24: of second order, and small wherever the FOG's line is
-    # clear.
-    lost = 0.0 if run.rates.table_uncertainty is None else (run.rates.table_uncertainty * run.duration) ** 2 / 24
+    lost = amplitude_lost(run, manifest, method)
     rate = (relative**2 + lost**2) * np.outer(vector, vector)
     return RunLine(run, line, real_covariance(covariance), rate, run.freedom)
+
+
+def amplitude_lost(run: LoadedRun, manifest: Manifest, method: str) -> float:
+    """Return the part of the amplitude that an error of the rate used costs, ``(error T)^2 / 24``, at most 1.
+
+    With an encoder, or the rate of a clear line of the FOG, it is next to nothing; where the manifest's rate is taken
+    as it is, what was measured of the rate, or the uncertainty of the manifest's rates, says how much it may be.
+    """
+    measured = run.rates.table_uncertainty
+    if method == "least-squares" and run.rates.origin != "manifest":
+        error = measured or 0.0
+    elif run.rates.origin == "manifest":
+        error = manifest.rate_uncertainty
+    else:
+        error = float(np.hypot(abs(run.rates.table_rate) - run.run.table_rate, measured or 0.0))
+    return min((error * run.duration) ** 2 / 24, 1.0)
 
 
 def _weights(group: list[RunLine], axis: int, excess: float) -> Array:

@@ -9,15 +9,17 @@ import numpy as np
 
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.centrifuge.budget import error_budget
-from imulab.centrifuge.levels import Levels, RunLine, axis_lines
+from imulab.centrifuge.levels import Levels, RunLine, amplitude_lost, axis_lines
 from imulab.centrifuge.manifest import Manifest
 from imulab.centrifuge.model import real_covariance
 from imulab.centrifuge.parameters import Estimates
 from imulab.centrifuge.run import LoadedRun
+from imulab.centrifuge.spectra import in_degrees
 from imulab.centrifuge.static import StaticRun
 from imulab.recording import Array, Source
 
 _UNLIKELY = 0.01
+_LOST = 1e-4
 
 
 def make_record(
@@ -242,12 +244,19 @@ def _warnings(
     if method == "fourier":
         few = [run for run in runs if run.whole_periods is not None and run.whole_periods.periods <= 500]
         if few:
-            worst = min(few, key=lambda run: run.whole_periods.periods if run.whole_periods else 0)
-            periods = worst.whole_periods.periods if worst.whole_periods else 0
+            least = min(few, key=lambda run: run.whole_periods.periods if run.whole_periods else 0)
+            periods = least.whole_periods.periods if least.whole_periods else 0
             found.append(
-                f"{len(few)} runs have 500 table periods or fewer (least: {worst.run.file}, {periods}): drift leaks "
-                f"into "
-                "whole-period sums; method least-squares has no such limit"
+                f"{len(few)} runs have 500 table periods or fewer (least: {least.run.file}, {periods}): drift leaks "
+                "into whole-period sums; method least-squares has no such limit"
+            )
+        off = {run.index: amplitude_lost(run, manifest, method) for run in runs}
+        worst = max(runs, key=lambda run: off[run.index])
+        if off[worst.index] > _LOST:
+            found.append(
+                f"method fourier takes the manifest's table rate: in {worst.run.file} the rate measured is "
+                f"{in_degrees(abs(worst.rates.table_rate))}, not {in_degrees(worst.run.table_rate)}, which costs "
+                f"{100 * off[worst.index]:.2g} % of the amplitude (in the uncertainty); method least-squares follows it"
             )
     for prefix, fitted in estimates.curves.items():
         if fitted.probability is not None and fitted.probability < _UNLIKELY:
