@@ -119,8 +119,10 @@ def test_two_runs_at_once_the_second_is_refused(fleet, tmp_path):
     folder = tmp_path / "out"
     first = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
     wait_for(lambda: list(folder.glob("*.json")))
+    first.send_signal(signal.SIGSTOP)  # it would be done before the second has started
     second = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
     _, error = second.communicate()
+    first.send_signal(signal.SIGCONT)
     assert second.returncode == 2
     assert error.count("\n") == 1
     assert f"another run is at work on it (process {first.pid} on " in error
