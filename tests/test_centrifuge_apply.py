@@ -266,6 +266,8 @@ def test_plan_writes_a_list_of_runs_too(imulab, tmp_path):
         (["--cycles", "0"], "cycles 0"),
         (["-o", "plan.txt"], "plan.txt: expected a name that ends in .toml"),
         (["--levels", "1,1"], "the same level twice"),
+        (["--rate-uncertainty", "-1 deg/s"], "rate uncertainty -0.0174533: expected 0 or more"),
+        (["--radius-uncertainty", "-1 m"], "radius uncertainty -1: expected 0 or more"),
     ],
 )
 def test_a_plan_that_cannot_be_is_refused(arguments, fragment, imulab, tmp_path):
@@ -274,6 +276,36 @@ def test_a_plan_that_cannot_be_is_refused(arguments, fragment, imulab, tmp_path)
     assert done.stderr.count("\n") == 1
     assert fragment in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragment"),
+    [
+        (["--plan", "plan.toml", "-o", "s", "--levels", "1,2"], "--levels: --plan plan.toml says that already"),
+        (["--plan", "plan.toml", "-o", "s", "--both-senses"], "--both-senses: --plan plan.toml says that already"),
+        (["--plan", "plan.toml", "-o", "."], "c1_static.csv: exists and is no simulation (no truth.json beside it)"),
+        (["-o", "s", "--rate", "5 Hz", "--levels", "1,5"], "sample rate 5: expected 5.42 Hz or more"),
+        (["-o", "plan.toml"], "plan.toml: the folder cannot be made"),
+    ],
+)
+def test_a_simulation_that_cannot_be_or_would_destroy_is_refused(arguments, fragment, imulab, tmp_path):
+    assert imulab("centrifuge", "plan", "--levels", "1,5", "-o", "plan.toml").returncode == 0
+    (tmp_path / "c1_static.csv").write_text("a recording of days of work\n")
+    done = imulab("centrifuge", "simulate", *arguments)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert fragment in done.stderr
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["c1_static.csv", "plan.toml"]
+    assert (tmp_path / "c1_static.csv").read_text() == "a recording of days of work\n"
+
+
+def test_a_simulation_takes_the_place_of_an_older_one_but_not_of_its_plan(imulab, tmp_path):
+    options = ["--duration", "10 s", "--static-duration", "5 s", "--rate", "20 Hz", "--levels", "1,5", "--cycles", "1"]
+    for _ in range(2):
+        assert imulab("centrifuge", "simulate", "-o", "s", *options).returncode == 0
+    done = imulab("centrifuge", "simulate", "--plan", "s/manifest.toml", "-o", "s")
+    assert done.returncode == 2
+    assert "s/manifest.toml: would overwrite s/manifest.toml" in done.stderr
 
 
 def test_a_plan_out_of_range_is_refused():

@@ -82,6 +82,14 @@ MANIFEST_CASES = {
         'reference = { value = 1', 'reference = { value = 3',
         ["run 3 (c1_5g.csv)", "no reference run (K_1)", "5 % of 3 g"],
     ),
+    "no reference run of the spin axis down": (
+        "table_rate = 243.6958", 'table_rate = 243.6958\nspin_axis = "down"',
+        [f"run 3 ({LOADED})", "no reference run (K_1) with the spin axis down", "126.873 deg/s of the arm as in c1_1g"],
+    ),
+    "a reference run of the spin axis down at another level": (
+        "arm_rate = 283.6958\ntable_rate = 243.6958", 'arm_rate = 127.5\ntable_rate = 87.5\nspin_axis = "down"',
+        [f"run 3 ({LOADED})", "no reference run (K_1) with the spin axis down", "nearest is this one at 127.5 deg/s"],
+    ),
     "no static run": (
         'role = "static"', 'role = "loaded"\narm_rate = 300\ntable_rate = 260',
         ["no static run", "run 1 (c1_static.csv)"],

@@ -72,3 +72,71 @@ def table_of_lines(p, arm, table, force):
             "3": 0.0,
         },
     }
+
+
+# --- a whole test by hand: recordings, reduction, uncertainties (contract, "Centrifuge: manifest and record") ---------
+
+
+def recording(rng, *, arm, table, sense, radius, start, seconds, rate, noise, drift, tilt, earth):
+    """Columns of one run, SI: X, Y, FOG, chi. drift: two complex numbers (for X and Y) per m/s^2; tilt complex.
+
+    chi goes from X to the specific force, X to Y. What is fixed in the arm Y senses a quarter turn later;
+    a vector fixed in the room turns backwards by the angle that the gyroscope turned.
+    """
+    t = np.arange(round(seconds * rate)) / rate
+    chi = start + sense * table * t
+    force = arm**2 * radius
+    x, y = force * np.cos(chi), force * np.sin(chi)
+    turned = sense * (arm - table) * t
+    bend = -sense * arm * np.abs(tilt)
+    in_x = bend * np.cos(chi + np.angle(tilt)) + np.abs(earth) * np.cos(np.angle(earth) - turned)
+    in_y = bend * np.sin(chi + np.angle(tilt)) + np.abs(earth) * np.sin(np.angle(earth) - turned)
+    white = noise[:, None] * np.sqrt(rate) * rng.standard_normal((3, len(t)))
+    return {
+        "time": t,
+        "dtg_x": in_x + drift[0].real * x + drift[0].imag * y + 6e-5 + 1e-8 * t + 2e-10 * x**2 + white[0],
+        "dtg_y": in_y + drift[1].real * x + drift[1].imag * y - 3e-5 - 1e-8 * t - 1e-10 * y**2 + white[1],
+        "fog": in_x + 1e-6 + white[2],
+        "table_angle": chi,
+    }
+
+
+def run_lines(c, net_rate):
+    """Lines (A_X, B_X, A_Y, B_Y) less the FOG's, and their covariance for white noise."""
+    channels = [c[name] for name in ("dtg_x", "dtg_y", "fog")]
+    fits = [regression(c["time"], c["table_angle"], net_rate, channel) for channel in channels]
+    (x, y, fog), inverse = (fit[0][2:4] for fit in fits), fits[0][1][2:4, 2:4]
+    variance = [_residual_variance(c["time"], c["table_angle"], net_rate, channel) for channel in channels]
+    lines = np.array([x[0] - fog[0], x[1] - fog[1], y[0] + fog[1], y[1] - fog[0]])
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])  # what Y loses is (-B_F, A_F)
+    share = np.zeros((4, 6))
+    share[:2, :2] = share[2:, 2:4] = np.eye(2)
+    share[:2, 4:], share[2:, 4:] = -np.eye(2), turn
+    return lines, share @ np.kron(np.diag(variance), inverse) @ share.T
+
+
+def _residual_variance(time, chi, net_rate, channel):
+    middle = time - time.mean()
+    columns = [np.ones_like(time), middle]
+    for angle in (chi, 2 * chi, 3 * chi, net_rate * (time - time[0])):
+        columns += [np.cos(angle), np.sin(angle)]
+    J = np.stack(columns, axis=1)
+    left = channel - J @ np.linalg.lstsq(J, channel, rcond=None)[0]
+    return left @ left / (len(time) - J.shape[1])
+
+
+def parameters(lines, arm, radius, variances):
+    """K, zeta, and direction of X and Y from the half-sums of both senses.
+
+    lines: (levels, senses, 4), rad/s; arm: (levels, senses); variances of a component of each level's half-sum per
+    axis, (levels, 2), for the Rice correction.
+    """
+    pooled = (lines / (arm**2 * radius)[:, :, None]).mean(axis=1)
+    found = []
+    for axis in (0, 1):
+        A, B = pooled[:, 2 * axis], pooled[:, 2 * axis + 1]
+        size = np.hypot(A, B)
+        K = size - variances[:, axis] / (2 * size)
+        weight = 1 / variances[:, axis]
+        found += [*K, *(K[1:] / K[0] - 1), np.arctan2((weight * B).sum(), (weight * A).sum())]
+    return np.array(found)

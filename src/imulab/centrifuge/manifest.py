@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from imulab.centrifuge.entries import check_keys, example, number_of, quantity_of, unit_of
 from imulab.centrifuge.model import specific_force
-from imulab.errors import ReadError, UnitError
-from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
+from imulab.errors import ReadError
+from imulab.units import STANDARD_GRAVITY, from_si, to_si
 
 COLUMNS = ("dtg_x", "dtg_y", "fog")
 ROLES = ("static", "loaded")
@@ -112,20 +113,20 @@ def load_manifest(path: str | Path, name: str | None = None) -> Manifest:
 
 def parse_manifest(table: Mapping[str, Any], name: str) -> Manifest:
     """Return the manifest that a TOML table states; errors as for `load_manifest`."""
-    _known(table, _KEYS, name)
+    check_keys(table, _KEYS, name)
     for key in ("radius", "rates", "run"):
         if key not in table:
-            raise ReadError(f"{name}: no {key}; expected {_example(key)}")
-    radius, radius_uncertainty = _quantity(table["radius"], "radius", "length", name)
-    gravity, _ = _quantity(table.get("gravity", _REFERENCE), "gravity", "acceleration", name)
-    reference, _ = _quantity(table.get("reference", _REFERENCE), "reference", "acceleration", name)
+            raise ReadError(f"{name}: no {key}; expected {example(key)}")
+    radius, radius_uncertainty = quantity_of(table["radius"], "radius", "length", name)
+    gravity, _ = quantity_of(table.get("gravity", _REFERENCE), "gravity", "acceleration", name)
+    reference, _ = quantity_of(table.get("reference", _REFERENCE), "reference", "acceleration", name)
     rates = table["rates"]
     if not isinstance(rates, dict) or "unit" not in rates:
-        raise ReadError(f"{name}: rates: expected {_example('rates')}, found {rates!r}")
-    _known(rates, ("unit", "standard_uncertainty"), f"{name}: rates")
-    rate_unit = _unit(rates["unit"], "rate", f"{name}: rates")
+        raise ReadError(f"{name}: rates: expected {example('rates')}, found {rates!r}")
+    check_keys(rates, ("unit", "standard_uncertainty"), f"{name}: rates")
+    rate_unit = unit_of(rates["unit"], "rate", f"{name}: rates")
     rate_uncertainty = to_si(
-        _number(rates.get("standard_uncertainty", 0.0), f"{name}: rates: standard_uncertainty"), rate_unit
+        number_of(rates.get("standard_uncertainty", 0.0), f"{name}: rates: standard_uncertainty"), rate_unit
     )
     if rate_uncertainty < 0:
         raise ReadError(f"{name}: rates: standard_uncertainty {rates['standard_uncertainty']!r}: expected 0 or more")
@@ -173,8 +174,7 @@ def check_runs(manifest: Manifest) -> None:
         _check_lines(run, place)
     if not loaded:
         raise ReadError(f'{manifest.name}: no run with role = "loaded"')
-    for spin_axis in SPIN_AXES:
-        _check_reference(manifest, spin_axis)
+    _check_reference(manifest)
 
 
 def _check_lines(run: Run, place: str) -> None:
@@ -183,22 +183,31 @@ def _check_lines(run: Run, place: str) -> None:
         if abs(times * run.table_rate - net) <= _SAME_RATE * net:
             raise ReadError(
                 f"{place}: table_rate {_degrees(run.table_rate)} {words} of {_degrees(net)} (arm_rate less "
-                f"table_rate): "
-                "the lines of Earth rate and of specific force coincide; expected another net rate or level"
+                "table_rate): the lines of Earth rate and of specific force coincide; expected another net rate or level"
             )
 
 
-def _check_reference(manifest: Manifest, spin_axis: str) -> None:
-    mine = [(i, run) for i, run in enumerate(manifest.runs) if run.role == "loaded" and run.spin_axis == spin_axis]
-    if not mine:
-        return
-    index, nearest = min(mine, key=lambda item: abs(manifest.force(item[1]) - manifest.reference))
-    if abs(manifest.force(nearest) / manifest.reference - 1) > 0.05:
-        side = " with the spin axis down" if spin_axis == "down" else ""
-        raise ReadError(
-            f"{manifest.place(index)}: no reference run{side} (K_1): expected a loaded run within 5 % of "
-            f"{_in_g(manifest.reference)} (reference), the nearest is this one at {_in_g(manifest.force(nearest))}"
+def _check_reference(manifest: Manifest) -> None:
+    def nearest(spin_axes: tuple[str, ...]) -> tuple[int, Run]:
+        return min(
+            ((i, run) for i, run in enumerate(manifest.runs) if run.role == "loaded" and run.spin_axis in spin_axes),
+            key=lambda item: abs(manifest.force(item[1]) - manifest.reference),
         )
+
+    index, reference = nearest(SPIN_AXES)
+    if abs(manifest.force(reference) / manifest.reference - 1) > 0.05:
+        raise ReadError(
+            f"{manifest.place(index)}: no reference run (K_1): expected a loaded run within 5 % of "
+            f"{_in_g(manifest.reference)} (reference), the nearest is this one at {_in_g(manifest.force(reference))}"
+        )
+    for spin_axis in sorted({run.spin_axis for run in manifest.runs if run.role == "loaded"}):
+        own, run = nearest((spin_axis,))
+        if abs(run.arm_rate / reference.arm_rate - 1) > SAME_LEVEL:
+            raise ReadError(
+                f"{manifest.place(own)}: no reference run (K_1) with the spin axis {spin_axis}: expected one at "
+                f"{_degrees(reference.arm_rate)} of the arm as in {reference.file}, the nearest is this one at "
+                f"{_degrees(run.arm_rate)}"
+            )
 
 
 def _run(entry: Mapping[str, Any], place: str, rate_unit: str) -> Run:
@@ -206,7 +215,7 @@ def _run(entry: Mapping[str, Any], place: str, rate_unit: str) -> Run:
     if not isinstance(file, str) or not file:
         raise ReadError(f'{place}: expected file = "NAME.csv", found {file!r}')
     place = f"{place} ({file})"
-    _known(entry, _RUN_KEYS, place)
+    check_keys(entry, _RUN_KEYS, place)
     cycle, role = entry.get("power_cycle"), entry.get("role")
     if type(cycle) is not int or cycle < 1:
         raise ReadError(f"{place}: power_cycle: expected a whole number from 1, found {cycle!r}")
@@ -226,11 +235,11 @@ def _run(entry: Mapping[str, Any], place: str, rate_unit: str) -> Run:
             continue
         if key not in entry:
             raise ReadError(f"{place}: no {key}; a loaded run needs arm_rate and table_rate")
-        value = _number(entry[key], f"{place}: {key}")
+        value = number_of(entry[key], f"{place}: {key}")
         if not value > 0:
             raise ReadError(
-                f"{place}: {key} = {entry[key]!r}: expected more than 0 (a reversed run has positive rates and sense "
-                f"= -1)"
+                f"{place}: {key} = {entry[key]!r}: expected more than 0 (a reversed run has positive rates and "
+                "sense = -1)"
             )
         rates.append(to_si(value, rate_unit))
     return Run(file, cycle, str(role), rates[0], rates[1], sense, str(spin_axis))
@@ -244,68 +253,19 @@ def _sensor(table: Any, name: str) -> dict[str, str]:
 
 def _scale_factors(table: Any, name: str) -> dict[str, tuple[float, str]]:
     if not isinstance(table, dict):
-        raise ReadError(f"{name}: scale_factor: expected {_example('scale_factor')}, found {table!r}")
-    _known(table, COLUMNS, f"{name}: scale_factor")
+        raise ReadError(f"{name}: scale_factor: expected {example('scale_factor')}, found {table!r}")
+    check_keys(table, COLUMNS, f"{name}: scale_factor")
     found = {}
     for key, entry in table.items():
         place = f"{name}: scale_factor: {key}"
         if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
-            raise ReadError(f"{place}: expected {_example('scale_factor')}, found {entry!r}")
-        value = _number(entry["value"], place)
+            raise ReadError(f"{place}: expected {example('scale_factor')}, found {entry!r}")
+        value = number_of(entry["value"], place)
         if value == 0:
             raise ReadError(f"{place}: expected a value other than 0")
-        unit = _unit(entry["unit"], "output per rate", place)
+        unit = unit_of(entry["unit"], "output per rate", place)
         found[key] = (to_si(value, unit), unit.partition("/")[0])
     return found
-
-
-def _quantity(entry: Any, key: str, kind: str, name: str) -> tuple[float, float]:
-    """Return value and standard uncertainty of ``{ value, standard_uncertainty, unit }`` in SI."""
-    place = f"{name}: {key}"
-    if not isinstance(entry, dict) or not {"value", "unit"} <= set(entry):
-        raise ReadError(f"{place}: expected {_example(key)}, found {entry!r}")
-    _known(entry, ("value", "unit", "standard_uncertainty") if key == "radius" else ("value", "unit"), place)
-    unit = _unit(entry["unit"], kind, place)
-    value = to_si(_number(entry["value"], place), unit)
-    uncertainty = to_si(_number(entry.get("standard_uncertainty", 0.0), place), unit)
-    if not value > 0:
-        raise ReadError(f"{place} {entry['value']!r}: expected more than 0")
-    if uncertainty < 0:
-        raise ReadError(f"{place}: standard_uncertainty {entry['standard_uncertainty']!r}: expected 0 or more")
-    return value, uncertainty
-
-
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> None:
-    for key in table:
-        if key not in keys:
-            raise ReadError(f"{place}: unknown key {key!r}; known keys: {' '.join(keys)}")
-
-
-def _number(value: Any, place: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ReadError(f"{place}: expected a number, found {value!r}")
-    return float(value)
-
-
-def _unit(text: Any, kind: str, place: str) -> str:
-    try:
-        unit = parse_unit(str(text))
-    except UnitError as error:
-        raise UnitError(f"{place}: {error}") from None
-    if unit.quantity != kind:
-        raise UnitError(f"{place}: expected a unit of {kind}, found {text!r} ({unit.quantity})")
-    return unit.symbol
-
-
-def _example(key: str) -> str:
-    return {
-        "radius": 'radius = { value = 2.0, standard_uncertainty = 2e-5, unit = "m" }',
-        "gravity": 'gravity = { value = 9.8015, unit = "m/s^2" }',
-        "rates": 'rates = { unit = "deg/s", standard_uncertainty = 0.0005 }',
-        "reference": 'reference = { value = 1.0, unit = "g" }',
-        "scale_factor": 'fog = { value = 1250.0, unit = "count/(deg/s)" }',
-        "run": "tables [[run]], one for each file",
-    }[key]
 
 
 def _degrees(rate: float) -> str:

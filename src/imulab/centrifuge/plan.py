@@ -102,6 +102,12 @@ def plan_centrifuge(
         A value is out of range, or a level is at a rate below the net rate.
     """
     _check(levels, radius, net_rate, duration, cycles, K, uncertainty)
+    for name, value in (
+        ("DTG noise", dtg_noise), ("FOG noise", fog_noise),
+        ("radius uncertainty", radius_uncertainty), ("rate uncertainty", rate_uncertainty),
+    ):  # fmt: skip
+        if value < 0:
+            raise OptionError(f"{name} {value:.6g}: expected 0 or more")
     manifest = make_manifest(
         levels=levels, radius=radius, net_rate=net_rate, cycles=cycles, both_senses=both_senses,
         radius_uncertainty=radius_uncertainty, rate_uncertainty=rate_uncertainty, name="plan",
@@ -166,8 +172,7 @@ def _warnings(
             refused = " (reduce refuses it where they coincide)" if times <= 1 else ""
             found.append(
                 f"{name}: table rate {_deg(level.table_rate)} is near {words}: Earth rate and the drift fall on one "
-                f"line or its "
-                f"harmonic{refused}; take a net rate of {_deg(better)} or move the level by some percent"
+                f"line or its harmonic{refused}; take a net rate of {_deg(better)} or move the level by some percent"
             )
         if level.relative > uncertainty:
             found.append(_too_short(name, level, duration, runs, uncertainty))
@@ -176,15 +181,14 @@ def _warnings(
         longest = max(PERIODS_ASKED * 2 * math.pi / level.table_rate for level in few)
         names = ", ".join(f"{from_si(level.force, 'g'):.4g} g ({level.periods:.0f})" for level in few)
         found.append(
-            f"{names}: fewer than the {PERIODS_ASKED} table periods that method fourier asks for ({longest / 60:.0f} "
-            f"min would give "
+            f"{names}: fewer than the {PERIODS_ASKED} table periods that method fourier asks for "
+            f"({_time(longest)} would give "
             "them at every level); method least-squares does not need them"
         )
     if not both_senses:
         found.append(
-            "one sense of rotation only: differential flexure (0.1 µrad/g is up to 7.5 % of K at 40 g), scale "
-            "mismatch and "
-            "azimuth are not separated; run both senses (--both-senses, with table_angle recorded)"
+            "one sense of rotation only: differential flexure (0.1 µrad/g is up to 7.5 % of K at 40 g), scale mismatch "
+            "and azimuth are not separated; run both senses (--both-senses, with table_angle recorded)"
         )
     return found
 
@@ -195,13 +199,16 @@ def _too_short(name: str, level: PlannedLevel, duration: float, runs: int, uncer
     if math.isinf(level.needed):
         return text + "the arm rate's own uncertainty exceeds it; no duration helps"
     if level.needed <= _LONGEST:
-        return text + f"run {level.needed / 60:.0f} min instead of {duration / 60:.0f}"
+        return text + f"run {_time(level.needed)} instead of {_time(duration)}"
     more = math.ceil(runs * level.needed / duration)
     return text + (
-        f"too noisy: it takes {level.needed / 3600:.1f} h a run, or {more} runs of {duration / 60:.0f} min; a "
-        f"quieter gyroscope or FOG, "
-        "a higher reference level, or the fitted curve, which does not rest on this level"
+        f"too noisy: it takes {level.needed / 3600:.1f} h a run, or {more} runs of {_time(duration)}; a quieter "
+        "gyroscope or FOG, a higher reference level, or the fitted curve, which does not rest on this level"
     )
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
 
 
 def _deg(rate: float) -> str:

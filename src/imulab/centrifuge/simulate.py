@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imulab.centrifuge.cells import FEWEST_PER_PERIOD
 from imulab.centrifuge.manifest import Manifest, Run
 from imulab.errors import OptionError
 from imulab.recording import Array, Recording
@@ -211,6 +212,12 @@ class Simulation:
         ):
             if not low <= value <= high:
                 raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
+        fastest = max(run.table_rate for run in self.manifest.runs) / (2 * np.pi)
+        if self.sample_rate < FEWEST_PER_PERIOD * fastest:
+            raise OptionError(
+                f"sample rate {self.sample_rate:g}: expected {FEWEST_PER_PERIOD * fastest:.3g} Hz or more, "
+                f"{FEWEST_PER_PERIOD} samples in a period of the table"
+            )
         if self.seed < 0:
             raise OptionError(f"seed {self.seed}: expected a whole number from 0")
         if parse_unit(self.unit).quantity != "rate":

@@ -94,6 +94,7 @@ def plan(
 
 
 def simulate(
+    context: typer.Context,
     output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write manifest and runs to.")],
     manifest: Annotated[
         str | None, typer.Option("--plan", metavar="PLAN.toml", help="Manifest to simulate, as plan writes it.")
@@ -120,6 +121,11 @@ def simulate(
     from imulab.centrifuge.simulate import simulate_centrifuge, typical_truth
 
     if manifest is not None:
+        for name in ("levels", "radius", "net_rate", "cycles", "both_senses"):
+            source = context.get_parameter_source(name)
+            if source is not None and source.name == "COMMANDLINE":
+                option = f"--{name.replace('_', '-')}"
+                raise OptionError(f"{option}: --plan {manifest} says that already; expected one or the other")
         test = load_manifest(manifest)
     else:
         force, arm, net = (
@@ -148,6 +154,7 @@ def simulate(
         unit=unit,
         seed=whole_number(seed, "--seed"),
     )
+    _check_folder(output, test, manifest)
     _write_simulation(simulation, test, truth, output)
 
 
@@ -228,8 +235,7 @@ def _plan_text(result: Plan) -> str:
     titles = ["level, g", "arm, deg/s", "table, deg/s", "periods", "u(K), %", "u(zeta), %", "needed, min"]
     head = (
         f"{len(result.manifest.runs)} runs, {result.total / 3600:.1f} h of recording ({result.duration / 60:.0f} min "
-        f"each, static "
-        f"{result.static_duration / 60:.0f} min); needed: duration of a run for the wanted uncertainty"
+        f"each, static {result.static_duration / 60:.0f} min); needed: duration of a run for the wanted uncertainty"
     )
     return "\n".join([head, *aligned(titles, rows)])
 
@@ -257,6 +263,22 @@ def _write_plan(result: Plan, output: str) -> None:
     write_text(output, "\n".join(lines) + "\n")
 
 
+def _check_folder(output: str, test: Manifest, manifest: str | None) -> None:
+    """Check that nothing but an older simulation is overwritten: the recordings of a test have the same names."""
+    from pathlib import Path
+
+    for run in test.runs:
+        if Path(run.file).name != run.file:
+            raise OptionError(f"{run.file}: expected file names without folders in a manifest to simulate")
+    folder = Path(output)
+    check_outputs([str(folder / "manifest.toml")] if folder.is_dir() else [], [manifest] if manifest else [])
+    taken = [name for name in ("manifest.toml", *(run.file for run in test.runs)) if (folder / name).exists()]
+    if taken and not (folder / "truth.json").is_file():
+        raise OptionError(
+            f"{folder / taken[0]}: exists and is no simulation (no truth.json beside it); expected another folder"
+        )
+
+
 def _write_simulation(simulation: Any, test: Manifest, truth: Truth, output: str) -> None:
     import json as text
     from dataclasses import asdict
@@ -267,9 +289,6 @@ def _write_simulation(simulation: Any, test: Manifest, truth: Truth, output: str
     from imulab.writers import write_csv
 
     folder = Path(output)
-    for run in test.runs:
-        if Path(run.file).name != run.file:
-            raise OptionError(f"{run.file}: expected file names without folders in a manifest to simulate")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
