@@ -21,7 +21,7 @@ from imulab.tables import KINDS, Field, Table
 
 _CORE = ("tumble.c", "centrifuge.c", "warmup.c", "array.c", "robust.c", "table.c")
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
-_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array)\.h"\n', re.MULTILINE)
+_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust)\.h"\n', re.MULTILINE)
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
