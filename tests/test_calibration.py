@@ -375,7 +375,7 @@ def test_a_file_may_have_the_longest_name_that_the_folder_takes(tmp_path):
 
 def test_the_text_of_a_record_is_that_of_the_standard_library():
     content = {
-        "text": "µ \"quoted\" \n\x01 \u2028", "": {}, "none": None, "truth": [True, False], "empty": [], 
+        "text": "µ \"quoted\" \n\x01 \u2028", "": {}, "none": None, "truth": [True, False], "empty": [],
         "deep": [[], [{}]],
         "numbers": [1, 2.5, -0.0, 1e-300, 1e22, 123456789.123456789, 5e-324], "floats": [0.1, 1e100], "whole": 2**70,
         "rows": [[1.0, 2.0], [3.0, None]], "nested": {"a": {"b": [1, {"c": "d"}]}},
