@@ -69,9 +69,9 @@ class History:
             sa.Column("unit", sa.String(80), nullable=False),
         )
         tables.create_all(engine)
-        with engine.connect() as connection:  # tables of that name that are another program's say so here
+        with engine.connect() as connection:  # a table of this name that is another's is refused before the work
             for table in (self._calibrations, self._parameters):
-                connection.execute(table.select().limit(0))
+                connection.execute(sa.select(table).limit(0))
 
     def add(self, summaries: Sequence[Summary]) -> None:
         """Add calibrations that are not there yet, all or none."""
