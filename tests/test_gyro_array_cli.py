@@ -12,7 +12,7 @@ import imulab as il
 from imulab.gyro_array.compare import compare_methods
 from imulab.gyro_array.experiments import run_experiment
 from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import fuse
+from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse
 from imulab.gyro_array.model import METHODS
 from imulab.gyro_array.simulate import Fault, simulate_array
 from imulab.present import exhibits_of
@@ -214,6 +214,119 @@ def test_compare_measures_bandwidth_and_warns_of_filtering(monkeypatch):
     assert kalman_row.bandwidth == pytest.approx(expected, rel=0.1)
     assert kalman_row.rate_std < 0.7 * filtered.figures["robust"][0].rate_std
     assert any(message.startswith("kalman: its bandwidth is") for message in filtered.warnings)
+
+
+def at_rest(rate: float = 100.0) -> np.ndarray:
+    """Readings of four gyros at rest, deg/s, with biases of 0.1 to 0.4."""
+    return 0.1 * np.arange(1, 5) + 0.05 * np.random.default_rng(1).standard_normal((3000, 4))
+
+
+def test_compare_measures_against_the_gyros_that_work():
+    # The mean of all would be the size of the fault: "53 times quieter" than a dead gyro in motion.
+    faults = (Fault("stuck", 3, 10.0, 20.0), Fault("jump", 5, 40.0))
+    broken = compare_methods(simulate_array(duration=60.0, faults=faults, seed=2))
+    whole = compare_methods(simulate_array(duration=60.0, seed=2))
+    assert broken.record.data["working"] == [["gyro_1", "gyro_2", "gyro_4", "gyro_6"]]
+    assert whole.record.data["working"] == [[f"gyro_{i}" for i in range(1, 7)]]
+    readings = simulate_array(duration=60.0, seed=2)
+    singles = [np.std(readings.columns[n] - readings.columns["truth_rate"]) for n in ("gyro_1", "gyro_2", "gyro_4",
+                                                                                    "gyro_6")]  # fmt: skip
+    assert broken.record.data["single"][0] == pytest.approx(np.mean(singles), rel=1e-9)
+    assert broken.figures["robust"][0].reduction == pytest.approx(whole.figures["robust"][0].reduction, rel=0.25)
+    assert broken.figures["mean"][0].reduction < 0.2
+    assert 0.99 < broken.figures["robust"][0].over_limit < 1.1
+    assert "than the mean single gyro that works (gyro_3, gyro_5 did not)" in exhibits_of(broken.record).headline
+    assert "than the mean single gyro;" in exhibits_of(whole.record).headline
+
+
+def test_compare_says_who_follows_a_dead_gyro(imulab, tmp_path):
+    readings = at_rest()
+    readings[:, 1] = 0.25
+    found = compare_methods(array_recording(readings, 100.0))
+    assert found.record.data["working"] == [["gyro_1", "gyro_3", "gyro_4"]]
+    assert found.record.data["single"][0] == pytest.approx(readings[:, [0, 2, 3]].std(axis=0).mean(), rel=1e-9)
+    assert found.figures["feedback"][0].reduction is None  # all the weight is the dead gyro's
+    assert found.figures["robust"][0].over_limit == pytest.approx(1.0, abs=0.03)
+    assert "mean: it follows only 0.75 of a motion: a gyro that does not move counts in it" in found.warnings
+    assert not any(message.startswith("robust:") for message in found.warnings)
+    il.write_csv(array_recording(readings, 100.0), tmp_path / "dead.csv")
+    printed = imulab("array", "compare", "dead.csv").stdout
+    assert f"mean of the 3 that work (not gyro_2): {found.record.data['single'][0]:.5f} deg/s" in printed
+    assert max(map(len, " ".join(printed.split("single gyro")[0].split("method")[1].split()).split())) < 14
+
+
+def test_compare_runs_with_readings_that_are_no_numbers(imulab, tmp_path):
+    readings = at_rest()
+    readings[:, 1] = np.nan
+    readings[100:140, 0] = np.inf
+    readings[200] = np.nan
+    il.write_csv(array_recording(readings, 100.0), tmp_path / "n.csv")
+    done = imulab("array", "compare", "n.csv")
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.split()[:1]}
+    assert set(METHODS) <= set(rows)
+    assert "(feedback cannot run: its output is no number from 0 s on: a reading that is none spoils it)" in done.stdout
+    assert float(rows["robust"][0]) == pytest.approx(0.05 / np.sqrt(3), rel=0.06)
+    assert "mean of the 3 that work (not gyro_2)" in done.stdout
+    il.write_csv(array_recording(np.full((600, 4), np.nan), 100.0), tmp_path / "none.csv")
+    none = imulab("array", "compare", "none.csv")
+    assert (none.returncode, none.stdout, none.stderr.count("\n")) == (2, "", 1)
+    assert "none.csv: columns gyro_1 to gyro_4: expected finite readings, found none" in none.stderr
+
+
+def test_compare_warns_where_noise_below_the_limit_is_a_filter_whose_bandwidth_does_not_show():
+    # A first-order filter of gain K > 0.83 never falls to -3 dB, and is quieter than any weights all the same.
+    readings = 0.2 * np.random.default_rng(5).standard_normal((4000, 6)) * np.linspace(0.8, 1.2, 6)
+    found = compare_methods(array_recording(readings, 62.5))
+    kalman = found.figures["kalman"][0]
+    assert kalman.over_limit < 0.97
+    (message,) = [m for m in found.warnings if m.startswith("kalman:")]
+    assert "low-pass filtering, which does not lower the angle error" in message
+    assert not any(m.startswith(("mean:", "robust:", "least-squares:")) for m in found.warnings)
+
+
+def test_gyros_mounted_the_other_way_round_are_named(imulab, tmp_path):
+    array = {"seed": 3, "mounting": "alternate"}
+    run, still = simulate_array(duration=10.0, **array), simulate_array(experiment="static", duration=60.0, **array)
+    named = "run.csv: gyro_2 gyro_4 gyro_6 turn against the first gyro of the axis"
+    il.write_csv(run, tmp_path / "run.csv")
+    calibrate_array(still, simulate_array(experiment="moving", **array)).calibration.save(tmp_path / "aligned.json")
+    calibrate_array(still).calibration.save(tmp_path / "biases.json")
+    for extra, expected in (
+        ([], True),
+        (["--calibration", "biases.json"], True),
+        (["--calibration", "aligned.json"], False),
+    ):
+        for command in ("fuse", "compare"):
+            done = imulab("array", command, "run.csv", *extra)
+            assert done.returncode == 0, done.stderr
+            assert (named in done.stderr) == expected
+    assert Fuser(FuseOptions()).notes() == []
+    fuser = Fuser(FuseOptions())
+    list(fuser.fuse([simulate_array(duration=10.0, seed=3)]))
+    assert fuser.notes() == []
+    list((rest := Fuser(FuseOptions())).fuse([still]))
+    assert rest.notes() == []
+
+
+def test_clocks_of_their_own_are_brought_to_one_everywhere():
+    def skewed(recording):
+        clocks = {f"time_{i}": recording.columns["time"] + 0.002 * i for i in range(1, 7)}
+        return recording.with_columns(clocks, dict.fromkeys(clocks, "s"))
+
+    array = {"seed": 5, "scale_spread": 0.01}
+    still = skewed(simulate_array(experiment="static", duration=60.0, **array))
+    moving = simulate_array(experiment="moving", **array)
+    late = {  # each element samples the motion when its own clock says so
+        f"gyro_{i}": np.interp(moving.columns["time"] + 0.002 * i, moving.columns["time"], moving.columns[f"gyro_{i}"])
+        for i in range(1, 7)
+    }
+    moving = skewed(moving.with_columns(late, dict.fromkeys(late, "deg/s")))
+    record = calibrate_array(still, moving).calibration
+    residual = max(np.degrees(e["residual"]["value"]) for e in record.sections["elements"])
+    assert residual < 0.2  # 60 deg/s at 0.8 Hz are 0.6 deg/s in 2 ms
+    assert len(compare_methods(still, calibration=record).figures["robust"]) == 1
 
 
 def test_compare_without_truth_uses_the_longest_stretch_at_rest():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from json import dumps
@@ -10,8 +11,9 @@ from imulab.calibration import Calibration
 from imulab.cli.show import aligned
 from imulab.exhibit import plain_number
 from imulab.files import replacing
-from imulab.gyro_array.compare import Comparison, output_unit
+from imulab.gyro_array.compare import Comparison
 from imulab.gyro_array.experiments import ExperimentRow
+from imulab.gyro_array.model import unit_of_angle
 
 _TITLE = {
     "static": "at rest, 100 Hz, 2000 s",
@@ -47,7 +49,7 @@ def comparison(found: Comparison) -> str:
     ]
     for a, axis in enumerate(found.elements.axes):
         unit = found.elements.units[a]
-        angle, factor = output_unit(unit)
+        angle, factor = unit_of_angle(unit)
         halves = any(not isinstance(rows, str) and rows[a].split_half is not None for rows in found.figures.values())
         titles = [
             "method", f"rate std {unit}", f"rate max {unit}", f"angle std {angle}", f"angle max {angle}", "reduction",
@@ -62,22 +64,28 @@ def comparison(found: Comparison) -> str:
             row = rows[a]
             values = [
                 row.rate_std, row.rate_max, factor * row.angle_std, factor * row.angle_max, row.reduction,
-                row.over_limit,
-                row.bandwidth,
+                row.over_limit, row.bandwidth, *([row.split_half] if halves else []),
             ]  # fmt: skip
-            tail = [] if not halves else ["–" if row.split_half is None else plain_number(row.split_half, 4)]
-            body.append([method, *(plain_number(v, 4) for v in values), *tail])
+            body.append([method, *("–" if v is None else plain_number(v, 4) for v in values)])
         lines += ["", *([f"axis {axis}"] if axis else []), *aligned(titles, body), *reasons]
         lines.append(
-            f"single gyro, mean of all: {plain_number(data['single'][a], 4)} {unit}; limit of one sample "
-            f"{plain_number(data['limit'][a], 4)} {unit}"
+            f"single gyro, mean of {_those(found.elements.names[a], data['working'][a])}: "
+            f"{plain_number(data['single'][a], 4)} {unit}; limit of one sample {plain_number(data['limit'][a], 4)} "
+            f"{unit}"
         )
     lines.append(
-        "rate std with the mean removed; reduction: single gyro over method; bandwidth at -3 dB, half the "
-        "sampling rate where "
-        "nothing is filtered"
+        "rate std with the mean removed; reduction: single gyro over method; bandwidth at -3 dB, half the sampling "
+        "rate where nothing is filtered"
     )
     return "\n".join(lines)
+
+
+def _those(names: Sequence[str], working: Sequence[str]) -> str:
+    """Return which gyros the mean single gyro is the mean of."""
+    if len(working) == len(names):
+        return "all"
+    failed = " ".join(name for name in names if name not in working)
+    return f"the {len(working)} that work (not {failed})" if working else "none"
 
 
 def write(record: Calibration, output: str | None, report: str | None) -> None:

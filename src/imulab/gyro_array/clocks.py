@@ -125,6 +125,19 @@ def to_one_clock(blocks: Iterable[Recording]) -> Iterator[Recording]:
         held = _rows(joined, np.arange(max(keep, 0), len(time)))
 
 
+def on_one_clock(recording: Recording) -> Recording:
+    """Return a whole recording with its elements interpolated to the column ``time``; errors as for `to_one_clock`.
+
+    Raises
+    ------
+    DataError
+        The clocks have no time in common.
+    """
+    for block in to_one_clock([recording]):
+        return block
+    raise DataError(f"{recording.name}: the clocks of the elements have no time in common with column time")
+
+
 def _join(first: Recording, second: Recording) -> Recording:
     columns = {name: np.concatenate([values, second.columns[name]]) for name, values in first.columns.items()}
     return replace(first, columns=columns)

@@ -10,19 +10,22 @@ import numpy as np
 
 from imulab.calibration import Calibration, Covariance
 from imulab.errors import DataError, ImulabError
+from imulab.gyro_array.bandwidth import Response, responses
+from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
-from imulab.gyro_array.model import FEWEST_ROBUST, METHODS, Elements, array_calibration, find_elements, fixed_weights
+from imulab.gyro_array.health import Turned
+from imulab.gyro_array.model import FEWEST_ROBUST, METHODS, Elements, array_calibration, find_elements
+from imulab.gyro_array.single import Singles, single_gyros
 from imulab.noise import allan_deviation, sampling_rate
 from imulab.recording import Array, Recording
-from imulab.units import parse_unit
 
-_PROBE_SAMPLES = 16_384
-_SEGMENT = 256
-_HALF_POWER = math.sqrt(0.5)
 _TRACE = 800
 _QUIET_FACTOR = 3.0
 _SHORTEST_QUIET = 5.0
-_FILTERED = 0.9
+_FILTERED = 0.9  # of half the sampling rate
+_BEYOND_LIMIT = 0.97  # of the least noise that weights alone can reach
+_FOLLOWS = 0.95
+_NOTHING = 1e-9  # of a gyro's noise
 _HALVES = 2 * FEWEST_ROBUST
 
 
@@ -30,18 +33,17 @@ _HALVES = 2 * FEWEST_ROBUST
 class Figures:
     """The figures of one method on one axis; rates in the unit of the readings, angles in that unit times s.
 
-    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean
-    single
-    gyro's rate_std over this one; ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; `bandwidth`
-    in Hz
-    at -3 dB, half the sampling rate where nothing is filtered.
+    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean of
+    rate_std over the single gyros that work, over this one (None where the output does not change at all);
+    ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; ``bandwidth`` in Hz at -3 dB, half the
+    sampling rate where nothing is filtered; ``split_half`` the standard deviation of the difference of the two halves.
     """
 
     rate_std: float
     rate_max: float
     angle_std: float
     angle_max: float
-    reduction: float
+    reduction: float | None
     over_limit: float
     bandwidth: float
     split_half: float | None = None
@@ -73,17 +75,27 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
     The truth is the column ``truth_rate`` (or ``truth_rate_x`` ..); without it the unit must be still, or still for a
     stretch of 5 s or more: the figures are then of the longest such stretch, and the truth there is 0. With six gyros
     or more the two halves of the array (odd and even elements) are also fused apart; half of the standard deviation of
-    their difference estimates the noise of the whole without any truth.
+    their difference estimates the noise of the whole without any truth. A single gyro is the mean of those that work
+    (`single_gyros`).
 
     Raises
     ------
     DataError
-        No elements, no time, or neither truth nor a stretch at rest.
+        No elements, no time, an axis without a finite reading, or neither truth nor a stretch at rest.
     """
+    recording = on_one_clock(recording)
     elements = find_elements(recording)
     rate, notes = sampling_rate(recording)
-    warnings = [*recording.notes, *notes]
-    readings, calibrated = _corrected(recording, elements, calibration)
+    warnings = [*(f"{recording.name}: {note}" for note in recording.notes), *notes]
+    logged = elements.readings(recording)
+    readings, aligned = _corrected(logged, recording, elements, calibration)
+    for a, row in enumerate(elements.names):
+        if not np.isfinite(logged[:, a]).any():
+            raise DataError(f"{recording.name}: columns {row[0]} to {row[-1]}: expected finite readings, found none")
+    if not aligned:
+        turned = Turned(elements.names)
+        turned.watch(logged)
+        warnings += [f"{recording.name}: {line}" for line in turned.lines()]
     truth = elements.truth(recording)
     start, stop = 0, len(recording)
     if truth is None:
@@ -96,43 +108,58 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
             )
     reference = np.zeros((stop - start, len(elements.axes))) if truth is None else truth[start:stop]
     error = readings[start:stop] - reference[:, :, None]
-    limits = _limits(error)
-    singles = [float(np.nanmean(np.nanstd(error[:, a], axis=0))) for a in range(len(elements.axes))]
+    lost = ~np.isfinite(readings).any(axis=2)
     figures: dict[str, tuple[Figures, ...] | str] = {}
-    curves: dict[str, Any] = {}
-    angles: dict[str, Any] = {}
-    health: dict[str, Any] = {}
+    rates: dict[str, Fused] = {}
+    halves: dict[str, list[float | None]] = {}
+    response: dict[str, list[Response]] = {}
     for method in METHODS:
         try:
             options = FuseOptions(method=method, calibration=calibration, rate=rate)
             fused = fuse(recording, options, weights=method == "robust", flags=method == "robust")
-            halves = _halves(recording, elements, options, calibration, start, stop)
-            bandwidth = _bandwidth(recording, elements, options, calibration, rate)
+            spoilt = (np.isnan(fused.rate) & ~lost).any(axis=1)
+            if spoilt.any():
+                figures[method] = (
+                    f"its output is no number from {fused.time[int(np.argmax(spoilt))]:.6g} s on: a reading that is "
+                    "none spoils it"
+                )
+                continue
+            halves[method] = _halves(readings, elements, options, start, stop)
+            response[method] = responses(logged[start:stop], elements, options, calibration, rate)
+            rates[method] = fused
         except ImulabError as problem:
             figures[method] = str(problem)
-            continue
-        off = fused.rate[start:stop] - reference
+    known = rates["robust"].flags if "robust" in rates else None
+    singles = [
+        single_gyros(error[:, a], None if known is None else known[start:stop, a]) for a in range(len(elements.axes))
+    ]
+    off = {method: fused.rate[start:stop] - reference for method, fused in rates.items()}
+    for method, wrong in off.items():
         figures[method] = tuple(
-            _figures(off[:, a], rate, singles[a], limits[a], bandwidth[a], None if halves is None else halves[a])
+            _figures(wrong[:, a], rate, singles[a], response[method][a].bandwidth, halves[method][a])
             for a in range(len(elements.axes))
         )
-        curves[method] = [_curve(off[:, a], rate) for a in range(len(elements.axes))]
-        angles[method] = [_trace(np.cumsum(np.nan_to_num(off[:, a])) / rate) for a in range(len(elements.axes))]
-        if method == "robust":
-            health = _health(fused, recording)
-    warnings += _filtering(figures, rate)
-    curves["single gyro"] = [
-        _curve(error[:, a, int(np.argsort(np.nanstd(error[:, a], axis=0))[elements.count // 2])], rate)
-        for a in range(len(elements.axes))
-    ]
+    figures = {method: figures[method] for method in METHODS}
+    curves: dict[str, Any] = {m: [_curve(wrong[:, a], rate) for a in range(wrong.shape[1])] for m, wrong in off.items()}
+    curves["single gyro"] = [_curve(error[:, a, singles[a].middle], rate) for a in range(len(elements.axes))]
+    angles = {
+        m: [_trace(np.cumsum(np.nan_to_num(wrong[:, a])) / rate) for a in range(wrong.shape[1])]
+        for m, wrong in off.items()
+    }
+    health = _health(rates["robust"], recording) if "robust" in rates else {}
+    warnings += _filtering(figures, response, rate)
     data = {
         "figures": {m: f if isinstance(f, str) else [asdict(x) for x in f] for m, f in figures.items()},
         "allan": curves,
         "angle": angles,
         "trace_time": _trace(recording.si("time")[start:stop]),
         "health": health,
-        "single": singles,
-        "limit": limits,
+        "single": [single.noise for single in singles],
+        "limit": [single.limit for single in singles],
+        "working": [
+            [name for name, works in zip(row, single.working, strict=True) if works]
+            for row, single in zip(elements.names, singles, strict=True)
+        ],
         "readings_names": [list(row) for row in elements.names],
     }
     record = Calibration(
@@ -146,7 +173,7 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
             "unit": elements.units[0],
             "units": list(elements.units),
             "truth": "column truth_rate" if truth is not None else "a still unit",
-            "calibrated": calibrated,
+            "calibrated": calibration is not None,
         },
         fit={
             "samples": stop - start,
@@ -167,62 +194,51 @@ def rate_figures(error: Array, rate: float) -> tuple[float, float, float, float]
     return float(np.nanstd(error)), float(np.nanmax(np.abs(error))), float(angle.std()), float(np.abs(angle).max())
 
 
-def _figures(
-    error: Array, rate: float, single: float, limit: float, bandwidth: float, split_half: float | None
-) -> Figures:
+def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split_half: float | None) -> Figures:
     std, largest, angle_std, angle_max = rate_figures(error, rate)
-    step = np.diff(error[np.isfinite(error)])
+    noise = float(np.diff(error[np.isfinite(error)]).std() / math.sqrt(2))
+    if std <= _NOTHING * single.noise:  # rounding alone: it follows a dead gyro
+        std = noise = 0.0
+    limit = single.limit
     return Figures(
         rate_std=std,
         rate_max=largest,
         angle_std=angle_std,
         angle_max=angle_max,
-        reduction=single / std if std > 0 else 0.0,
-        over_limit=float(step.std() / math.sqrt(2)) / limit if limit > 0 else 0.0,
+        reduction=single.noise / std if std > 0 else None,
+        over_limit=noise / limit if limit > 0 else 0.0,
         bandwidth=bandwidth,
         split_half=split_half,
     )
 
 
-def _corrected(recording: Recording, elements: Elements, calibration: Calibration | None) -> tuple[Array, bool]:
-    """Readings with a record's biases and matrices taken off, shape (m, axes, n)."""
-    readings = elements.readings(recording)
+def _corrected(
+    logged: Array, recording: Recording, elements: Elements, calibration: Calibration | None
+) -> tuple[Array, bool]:
+    """Readings with a record's biases and matrices taken off, shape (m, axes, n); whether there were matrices."""
     if calibration is None:
+        return logged, False
+    known = array_calibration(calibration, elements, recording.name)
+    readings = logged - known.bias
+    if known.matrices is None:
         return readings, False
-    known = array_calibration(calibration, elements)
-    readings -= known.bias
-    if known.matrices is not None:
-        readings = np.einsum("nab,mbn->man", known.matrices, readings)
-    return readings, True
-
-
-def _limits(error: Array) -> list[float]:
-    """Limit (1' C^-1 1)^-1/2 of each axis, C the covariance of the noise from sample to sample."""
-    found = []
-    for a in range(error.shape[1]):
-        step = np.diff(error[np.isfinite(error[:, a]).all(axis=1), a], axis=0)
-        covariance = step.T @ step / (2 * max(len(step), 1))
-        live = np.diag(covariance) > 0
-        try:
-            found.append(fixed_weights(covariance[np.ix_(live, live)])[1] if live.any() and len(step) > 1 else 0.0)
-        except np.linalg.LinAlgError:
-            found.append(0.0)
-    return [value if math.isfinite(value) else 0.0 for value in found]
+    return np.einsum("nab,mbn->man", known.matrices, readings), True
 
 
 def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[int, int]:
     """First sample and last + 1 of the longest stretch in which the array's median hardly moves."""
-    middle = np.nanmedian(readings, axis=2)
+    middle = _medians(readings)
     size = max(2, round(rate))
     count = len(middle) // size
-    windows = np.nan_to_num(middle[: count * size], nan=1e300).reshape(count, size, -1).std(axis=1)
-    if count:
-        usual = np.quantile(windows, 0.1, axis=0)
+    windows = middle[: count * size].reshape(count, size, -1).std(axis=1)  # nan where the array was lost
+    whole = np.isfinite(windows).all(axis=1)
+    if whole.any():
+        usual = np.quantile(windows[whole], 0.1, axis=0)
         quiet = (windows <= _QUIET_FACTOR * usual).all(axis=1)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(int), [0]])))
         runs = edges.reshape(-1, 2)
         best = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))] if len(runs) else np.array([0, 0])
-        drift = np.abs(np.diff(np.nanmean(middle[: count * size].reshape(count, size, -1), axis=1), axis=0))
+        drift = np.abs(np.diff(middle[: count * size].reshape(count, size, -1).mean(axis=1), axis=0))
         if (best[1] - best[0]) * size >= _SHORTEST_QUIET * rate and not _moving(drift, usual, size, best):
             stop = len(middle) if best[1] == count else int(best[1]) * size
             return int(best[0]) * size, stop
@@ -232,19 +248,27 @@ def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[
     )
 
 
+def _medians(readings: Array) -> Array:
+    """Median over the finite readings of each sample, shape (m, axes); nan where there is none."""
+    count = np.isfinite(readings).sum(axis=2)
+    ordered = np.sort(np.where(np.isfinite(readings), readings, np.nan), axis=2)  # nan goes to the end
+    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    last = readings.shape[2] - 1
+    pair = [np.take_along_axis(ordered, np.minimum(k, last)[..., None], axis=2)[..., 0] for k in (low, high)]
+    middle: Array = (pair[0] + pair[1]) / 2
+    return middle
+
+
 def _moving(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
     """Whether the means of successive windows wander more than the noise within them allows."""
     steps = drift[int(best[0]) : int(best[1]) - 1]
     return bool(len(steps)) and bool((np.median(steps, axis=0) > 10 * usual / math.sqrt(size) + 0.5 * usual).any())
 
 
-def _halves(
-    recording: Recording, elements: Elements, options: FuseOptions, record: Calibration | None, start: int, stop: int
-) -> list[float] | None:
+def _halves(readings: Array, elements: Elements, options: FuseOptions, start: int, stop: int) -> list[float | None]:
     """Standard deviation of the difference of the two halves of the array (odd and even elements), each axis."""
     if elements.count < _HALVES or options.method == "covariance":
-        return None
-    readings, _ = _corrected(recording, elements, record)
+        return [None] * len(elements.axes)
     plain = replace(options, calibration=None)
     rates = []
     for first in (0, 1):
@@ -253,60 +277,12 @@ def _halves(
         stream = open_stream(plain, half, options.rate or 1.0, part[:10_000])
         rates.append(stream.process(part, flags=False).rate[start:stop])
     apart: Array = rates[0] - rates[1]
-    return [float(np.nanstd(difference)) for difference in apart.T]
-
-
-def _bandwidth(
-    recording: Recording, elements: Elements, options: FuseOptions, record: Calibration | None, rate: float
-) -> list[float]:
-    """Frequency at -3 dB of each axis: response to a small white probe that all gyros see, by its cross-spectrum."""
-    readings = elements.readings(recording)[:_PROBE_SAMPLES]
-    rng = np.random.default_rng(0)
-    size = np.nanmedian(np.nanstd(np.diff(readings, axis=0), axis=0), axis=1)
-    probe = rng.standard_normal(readings.shape[:2]) * np.where(size > 0, size, 1.0)
-    # The probe is one rate for all: it must look the same through every element's matrix.
-    seen = np.repeat(probe[:, :, None], elements.count, axis=2)
-    if record is not None:
-        matrices = array_calibration(record, elements).matrices
-        if matrices is not None:
-            seen = np.einsum("nab,mb->man", np.linalg.inv(matrices), probe)
-    plain, shaken = (
-        open_stream(options, elements, rate, readings).process(np.ascontiguousarray(part)).rate
-        for part in (readings, readings + seen)
-    )
-    response = shaken - plain
-    skip = len(response) // 4
-    found = []
-    for a in range(len(elements.axes)):
-        gain = _transfer(probe[skip:, a], np.nan_to_num(response[skip:, a]))
-        frequency = np.linspace(0, rate / 2, len(gain))
-        below = np.flatnonzero(gain[1:] < _HALF_POWER)
-        if not below.size:
-            found.append(rate / 2)
-            continue
-        k = int(below[0]) + 1
-        high, low = gain[k - 1], gain[k]
-        share = (high - _HALF_POWER) / (high - low) if high > _HALF_POWER else 0.0
-        found.append(float(frequency[k - 1] + share * (frequency[k] - frequency[k - 1])))
-    return found
-
-
-def _transfer(probe: Array, response: Array) -> Array:
-    """Size of the transfer function, averaged over half-overlapping windowed segments (Welch)."""
-    size = min(_SEGMENT, len(probe))
-    window = np.hanning(size)
-    starts = range(0, len(probe) - size + 1, size // 2)
-    spectra = [
-        (np.fft.rfft(window * probe[s : s + size]), np.fft.rfft(window * response[s : s + size])) for s in starts
-    ]
-    cross = sum(np.conj(p) * r for p, r in spectra)
-    own = sum(np.abs(p) ** 2 for p, _ in spectra)
-    gain: Array = np.abs(cross) / np.maximum(own, 1e-300)
-    return gain
+    return [float(np.nanstd(column)) if np.isfinite(column).any() else None for column in apart.T]
 
 
 def _curve(error: Array, rate: float) -> dict[str, Any]:
-    curve = allan_deviation(np.nan_to_num(error, nan=float(np.nanmean(error))), rate)
+    finite = np.isfinite(error)
+    curve = allan_deviation(np.where(finite, error, error[finite].mean() if finite.any() else 0.0), rate)
     return {"tau": curve.tau.tolist(), "deviation": curve.deviation.tolist(), "u": curve.standard_uncertainty.tolist()}
 
 
@@ -333,24 +309,27 @@ def _health(fused: Fused, recording: Recording) -> dict[str, Any]:
     }
 
 
-def _filtering(figures: dict[str, tuple[Figures, ...] | str], rate: float) -> list[str]:
-    """Warn where less noise comes from a low-pass filter."""
+def _filtering(
+    figures: dict[str, tuple[Figures, ...] | str], response: dict[str, list[Response]], rate: float
+) -> list[str]:
+    """Warn where less noise is bought by not following the motion: its fast part (a low-pass filter), or all of it."""
     found = []
     for method, rows in figures.items():
         if isinstance(rows, str):
             continue
-        for row in rows:
-            if row.bandwidth < _FILTERED * rate / 2:
-                found.append(
-                    f"{method}: its bandwidth is {row.bandwidth:.3g} Hz of {rate / 2:.3g} Hz: where its rate "
-                    f"noise is lower "
-                    "that is low-pass filtering, which does not lower the angle error"
-                )
-                break
+        gain = min(answer.gain for answer in response[method])
+        narrow = min(row.bandwidth for row in rows)
+        beyond = min((row.over_limit for row in rows if row.over_limit > 0), default=1.0)
+        if gain < _FOLLOWS:
+            found.append(f"{method}: it follows only {gain:.2f} of a motion: a gyro that does not move counts in it")
+        elif narrow < _FILTERED * rate / 2:
+            found.append(
+                f"{method}: its bandwidth is {narrow:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower that "
+                "is low-pass filtering, which does not lower the angle error"
+            )
+        elif beyond < _BEYOND_LIMIT:
+            found.append(
+                f"{method}: its noise from sample to sample is {beyond:.2f} of the least that weights can reach: that "
+                "is low-pass filtering, which does not lower the angle error"
+            )
     return found
-
-
-def output_unit(unit: str) -> tuple[str, float]:
-    """Return the unit of angles for a unit of rates, and the factor from that rate times s to it."""
-    known = parse_unit(unit).symbol
-    return {"deg/s": ("deg", 1.0), "rad/s": ("rad", 1.0), "deg/h": ("deg", 1 / 3600)}.get(known, (f"{known} s", 1.0))

@@ -11,6 +11,7 @@ import numpy as np
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.gyro_array.align import Alignment, align
+from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.model import Elements, find_elements, fixed_weights
 from imulab.noise import COEFFICIENTS, AllanCurve, NoiseCoefficients, allan_deviation, read_coefficients, sampling_rate
 from imulab.recording import Array, Recording, check_finite
@@ -70,6 +71,7 @@ def calibrate_array(
     ObservabilityError
         The motion does not excite every axis.
     """
+    still = on_one_clock(still)
     elements = find_elements(still)
     for unit in elements.units:
         if parse_unit(unit).quantity != "rate":
@@ -130,6 +132,7 @@ def _at_rest(still: Recording, elements: Elements) -> _AtRest:
 
 
 def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Alignment, list[str]]:
+    moving = on_one_clock(moving)
     its = find_elements(moving)
     if its.names != elements.names:
         raise DataError(

@@ -12,7 +12,7 @@ from imulab.blob import Blob
 from imulab.calibration import Calibration
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.gyro_array.clocks import Clock, to_one_clock
-from imulab.gyro_array.health import Health
+from imulab.gyro_array.health import Health, Turned
 from imulab.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
 from imulab.gyro_array.model import (
     FEWEST_ROBUST,
@@ -183,6 +183,7 @@ class Fuser:
     health: Health | None = None
     tell: Callable[[str], None] = lambda _: None
     name: str = "recording"
+    turned: Turned | None = None
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
         """Fuse consecutive blocks; the result does not depend on where they are cut.
@@ -207,10 +208,13 @@ class Fuser:
                 elements = find_elements(block)
                 self._check(block, elements)
                 self.health = Health(elements.names)
+                self.turned = None if self._aligns() else Turned(elements.names)
             settled = stream is not None and self.clock.settled
             before = self.clock.rate
             self.clock.watch(block)
             readings, time = elements.readings(block), block.si("time")
+            if self.turned is not None:
+                self.turned.watch(readings)
             seen = 0
             if not settled:
                 early = np.concatenate([early, time])
@@ -230,8 +234,13 @@ class Fuser:
             yield self._fused(block, out, seen, elements)
 
     def notes(self) -> list[str]:
-        """Return what there is to say of gaps at the end."""
-        return self.clock.lines(self.name)
+        """Return what there is to say at the end: gaps in time, gyros that turn against the others."""
+        turned = self.turned.lines() if self.turned is not None else []
+        return [*self.clock.lines(self.name), *(f"{self.name}: {line}" for line in turned)]
+
+    def _aligns(self) -> bool:
+        record = self.options.calibration
+        return isinstance(record, Blob) or (record is not None and bool(record.model.get("aligned")))
 
     def _fused(self, block: Recording, out: Any, seen: int, elements: Elements) -> Fused:
         time, rate = block.si("time"), out.rate[seen:]

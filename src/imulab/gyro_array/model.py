@@ -227,3 +227,9 @@ def fixed_weights(covariance: Array) -> tuple[Array, float]:
     ones = np.ones(len(covariance))
     raw = np.linalg.solve(covariance, ones)
     return raw / raw.sum(), float(raw.sum() ** -0.5)
+
+
+def unit_of_angle(unit: str) -> tuple[str, float]:
+    """Return the unit of angles for a unit of rates, and the factor from that rate times s to it."""
+    known = parse_unit(unit).symbol
+    return {"deg/s": ("deg", 1.0), "rad/s": ("rad", 1.0), "deg/h": ("deg", 1 / 3600)}.get(known, (f"{known} s", 1.0))

@@ -1,0 +1,38 @@
+"""What the figures of an array have in common: axes, legend, a curve of Allan deviation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+LEGEND = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
+MARGIN = {"l": 70, "r": 20, "t": 64, "b": 55}
+"""A legend above the plot has room below the buttons in the corner."""
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """Return the layout of an axis."""
+    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
+
+
+def log_axis(title: str, **more: Any) -> dict[str, Any]:
+    """Return the layout of a logarithmic axis."""
+    return axis(title, type="log", dtick=1, exponentformat="none", **more)
+
+
+def of_axis(letter: str) -> str:
+    """Return what a title adds for one of three axes."""
+    return f", axis {letter}" if letter else ""
+
+
+def allan_trace(curve: dict[str, Any], name: str, colour: str, factor: float, width: float = 1.6) -> dict[str, Any]:
+    """Return a line of deviation times a factor over averaging time, s; values of 0 have no place on a log scale."""
+    known = [(t, d) for t, d in zip(curve["tau"], curve["deviation"], strict=True) if d > 0]
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": [t for t, _ in known],
+        "y": [d * factor for _, d in known],
+        "line": {"color": colour, "width": width},
+        "name": name,
+        "hovertemplate": f"{name}<br>%{{x:.3g}} s: %{{y:.3g}}<extra></extra>",
+    }
