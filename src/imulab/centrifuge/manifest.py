@@ -182,8 +182,8 @@ def _check_lines(run: Run, place: str) -> None:
     for times, words in ((1, "equals the net rate"), (2, "is half the net rate")):
         if abs(times * run.table_rate - net) <= _SAME_RATE * net:
             raise ReadError(
-                f"{place}: table_rate {_degrees(run.table_rate)} {words} of {_degrees(net)} (arm_rate less table_rate): "
-                "the lines of Earth rate and of specific force coincide; expected another net rate or level"
+                f"{place}: table_rate {_degrees(run.table_rate)} {words} of {_degrees(net)} (arm_rate less table_rate)"
+                ": the lines of Earth rate and of specific force coincide; expected another net rate or level"
             )
 
 
