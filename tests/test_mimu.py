@@ -22,7 +22,7 @@ def values(k: int) -> list[int]:
 
 
 def log(count: int, first_stamp: int = (1 << 32) - 3_000_000) -> list[bytes]:
-    return [frame(65530 + k, first_stamp + 1_024_000 * k, values(k)) for k in range(count)]
+    return [frame(65530 + k, first_stamp + 1_024_000 * k, values(k % 300)) for k in range(count)]
 
 
 def test_scale_axes_and_the_wrapped_clock(tmp_path):
@@ -50,6 +50,31 @@ def test_damage_is_skipped_and_said(tmp_path):
     assert recording.notes[0] == "106 bytes between frames were skipped as damaged"
     assert recording.notes[1] == "4 frames are missing from the log, the first after row 7"
     assert np.diff(recording.time).min() > 0
+
+
+def test_what_follows_a_long_damage_is_read(tmp_path):
+    # 30 kB of the log are overwritten, among them two wraps of the clock; the sequence says how long that was.
+    frames = log(9000, first_stamp=5)
+    junk = bytes([0xAA, 1, 2, 0x64]) * 7500
+    (tmp_path / "log.bin").write_bytes(b"".join(frames[:40]) + junk + b"".join(frames[8540:]))
+    recording = il.read(tmp_path / "log.bin")
+    assert len(recording) == 40 + 460
+    assert recording.notes[0] == "30000 bytes between frames were skipped as damaged"
+    assert recording.notes[1] == "8500 frames are missing from the log, the first after row 40"
+    assert recording.time[40] == pytest.approx(0.016 * 8540, abs=1e-9)
+    (tmp_path / "tail.bin").write_bytes(b"".join(frames[:40]) + junk)
+    assert il.read(tmp_path / "tail.bin").notes == ("30000 bytes between frames were skipped as damaged",)
+
+
+def test_fuse_says_what_was_skipped(tmp_path, imulab):
+    frames = log(60)
+    del frames[20:23]
+    (tmp_path / "log.bin").write_bytes(b"".join(frames[:10]) + bytes(200) + b"".join(frames[10:]))
+    done = imulab("array", "fuse", "log.bin", "-o", "out.csv")
+    assert done.returncode == 0, done.stderr
+    assert "log.bin: 200 bytes between frames were skipped as damaged" in done.stderr
+    assert "log.bin: 3 frames are missing from the log, the first after row 20" in done.stderr
+    assert "a gap of 0.064 s before row 21 at 0.368 s" in done.stderr
 
 
 def test_it_is_recognised_by_content_alone(tmp_path):

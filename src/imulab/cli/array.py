@@ -76,6 +76,8 @@ def simulate(
 
     check_outputs([output], [])
     low, _, high = spread.partition(",")
+    if "," in high:
+        raise OptionError(f"--spread {spread!r}: expected LOW,HIGH, such as 0.6,1.6")
     noise = NoiseModel(
         white=quantity(white, "--white", "rate", "deg/s"),
         spread=(quantity(low, "--spread", "number", "1"), quantity(high or low, "--spread", "number", "1")),

@@ -21,6 +21,7 @@ EXPERIMENTS: Mapping[str, tuple[float, float]] = {
     "moving": (100.0, 120.0),
 }
 """Sampling rate, Hz, and duration, s, of each."""
+_MOST_READINGS = 200_000_000
 FAULTS = ("dead", "stuck", "spikes", "jump", "nan", "saturation")
 _DEG = math.pi / 180
 
@@ -98,8 +99,14 @@ def simulate_array(
         raise OptionError(f"experiment {experiment!r}: expected one of {' '.join(EXPERIMENTS)}")
     rate = sample_rate if sample_rate is not None else EXPERIMENTS[experiment][0]
     length = duration if duration is not None else EXPERIMENTS[experiment][1]
-    _check(elements, axes, rate, length, mounting, unit, seed, faults)
+    _check(elements, axes, rate, length, mounting, unit)
+    _check_numbers(noise, scale_spread, misalignment, session, seed)
+    _check_faults(faults, elements)
     count = round(length * rate)
+    if not 2 <= count * elements * axes <= _MOST_READINGS:
+        raise OptionError(
+            f"{length:g} s at {rate:g} Hz of {elements * axes} gyros: expected 2 to {_MOST_READINGS:g} readings in all"
+        )
     time = np.arange(count) / rate
     unit_rng = np.random.default_rng([seed, 1])
     white = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
@@ -128,14 +135,11 @@ def simulate_array(
     return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated {experiment} array")
 
 
-def _check(
-    elements: int, axes: int, rate: float, length: float, mounting: str, unit: str, seed: int, faults: tuple[Fault, ...]
-) -> None:
+def _check(elements: int, axes: int, rate: float, length: float, mounting: str, unit: str) -> None:
     for name, value, low, high in (
         ("elements", elements, 1, 64),
         ("sample rate", rate, 1.0, 1e5),
         ("duration", length, 0.1, 1e6),
-        ("seed", seed, 0, 2**63 - 1),
     ):
         if not low <= value <= high:
             raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
@@ -145,11 +149,39 @@ def _check(
         raise OptionError(f"mounting {mounting!r}: expected same or alternate")
     if parse_unit(unit).quantity != "rate":
         raise OptionError(f"unit {unit}: expected rad/s deg/s deg/h")
+
+
+def _check_numbers(noise: NoiseModel, scale_spread: float, misalignment: float, session: int, seed: int) -> None:
+    for name, value in (
+        ("white", noise.white),
+        ("gauss-markov", noise.gauss_markov),
+        ("walk", noise.walk),
+        ("turn-on", noise.turn_on),
+        ("scale spread", scale_spread),
+        ("misalignment", misalignment),
+    ):
+        if not 0 <= value < math.inf:
+            raise OptionError(f"{name} {value:g}: expected a standard deviation, 0 or more")
+    if not 0 <= noise.spread[0] <= noise.spread[1] < math.inf:
+        raise OptionError(f"spread {noise.spread[0]:g},{noise.spread[1]:g}: expected LOW,HIGH with 0 <= LOW <= HIGH")
+    if not 0 < noise.correlation_time < math.inf:
+        raise OptionError(f"correlation time {noise.correlation_time:g} s: expected more than 0")
+    for name, number in (("session", session), ("seed", seed)):
+        if not 0 <= number < 2**63:
+            raise OptionError(f"{name} {number}: expected 0 to {2**63 - 1}")
+
+
+def _check_faults(faults: tuple[Fault, ...], elements: int) -> None:
     for fault in faults:
         if fault.kind not in FAULTS:
             raise OptionError(f"fault {fault.kind!r}: expected one of {' '.join(FAULTS)}")
         if not 1 <= fault.gyro <= elements:
             raise OptionError(f"fault of gyro {fault.gyro}: expected 1 to {elements}")
+        if not (fault.start >= 0 and fault.duration > 0):
+            raise OptionError(
+                f"fault {fault.kind}: start {fault.start:g} s, duration {fault.duration:g} s: expected 0 or later, and "
+                "more than 0"
+            )
 
 
 def _sensing(

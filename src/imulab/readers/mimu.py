@@ -27,6 +27,8 @@ _FRAME = np.dtype(
 _HEAD, _SIZE = 0xAA, 0x64
 _SEARCH = 4096
 _CLOCK = 64e6  # Hz
+_WRAP = 1 << 32  # ticks, 67 s
+_RESTARTED = 60_000  # frames: a sequence that jumps further was begun anew
 _ACCEL_STEP = STANDARD_GRAVITY / 2048  # m/s^2
 _GYRO_STEP = 1 / 16.4  # deg/s
 
@@ -59,8 +61,8 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
         raise ReadError(f"{name}: no whole MIMU4444 frame of {_FRAME.itemsize} bytes was found")
     stamp: NDArray[np.int64] = frames["stamp"].astype(np.int64)
     sequence: NDArray[np.int64] = frames["sequence"].astype(np.int64)
-    ticks = np.mod(np.diff(stamp, prepend=stamp[0]), 1 << 32)
     lost = np.mod(np.diff(sequence) - 1, 1 << 16)
+    ticks = _ticks(stamp, lost)
     columns: dict[str, Array] = {"time": np.cumsum(ticks) / _CLOCK}
     units = {"time": "s"}
     for sensor, first, step, unit in (("gyro", 3, _GYRO_STEP, "deg/s"), ("accel", 0, _ACCEL_STEP, "m/s^2")):
@@ -85,10 +87,20 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
     )
 
 
-def _first_frame(data: bytes) -> int | None:
+def _ticks(stamp: NDArray[np.int64], lost: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the ticks from frame to frame; where frames are missing, the wraps of the clock that their number says."""
+    step = np.mod(np.diff(stamp), _WRAP)
+    if step.size:
+        usual = float(np.median(step))
+        wraps = np.round(((lost + 1) * usual - step) / _WRAP).astype(np.int64)
+        step = step + _WRAP * np.where(lost < _RESTARTED, np.maximum(wraps, 0), 0)
+    return np.concatenate([np.zeros(1, dtype=np.int64), step])
+
+
+def _first_frame(data: bytes, furthest: int = _SEARCH) -> int | None:
     """Return where the first frame with a right sum begins, or None."""
     place = data.find(_HEAD)
-    while 0 <= place <= min(len(data) - _FRAME.itemsize, _SEARCH):
+    while 0 <= place <= min(len(data) - _FRAME.itemsize, furthest):
         if data[place + 3] == _SIZE and _good(data[place : place + _FRAME.itemsize]).all():
             return place
         place = data.find(_HEAD, place + 1)
@@ -115,9 +127,9 @@ def _frames(data: bytes) -> tuple[np.ndarray, int]:
         length = count if good.all() else int(np.argmin(good))
         found.append(np.frombuffer(run[: length * size], dtype=_FRAME))
         place += length * size
-        step = _first_frame(data[place : place + _SEARCH + size])
-        if step is None:
-            skipped += min(len(data) - place, size) if len(data) - place >= size else 0
+        step = _first_frame(data[place:], len(data))
+        if step is None:  # less than a frame at the end is where the log was stopped
+            skipped += len(data) - place if len(data) - place >= size else 0
             break
         skipped += step
         place += step
