@@ -1,16 +1,21 @@
 """Fusion on the C core against the plain-Python transcription, the closed forms, and itself in pieces."""
 
+import subprocess
+import sys
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 import imulab as il
+from imulab.blob import Blob, make_blob
 from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, parse_memory
-from imulab.gyro_array.model import METHODS
+from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream, parse_memory
+from imulab.gyro_array.model import METHODS, find_elements
 from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording
+from imulab.runtime import Stream
+from imulab.tables import ArraySettings, tables_of
 from reference import gyro_array as reference
 
 
@@ -367,6 +372,45 @@ def test_faults_of_the_simulator_are_where_they_should_be():
     assert np.ptp(stuck) == 0
     np.testing.assert_array_equal(broken.columns["gyro_2"][500:], plain.columns["gyro_2"][500:])
     assert np.allclose(broken.columns["gyro_3"][500:] - plain.columns["gyro_3"][500:], np.degrees(0.1))
+
+
+_RESUME = """
+import sys
+import numpy as np
+from imulab.runtime import Stream
+stream = Stream.from_state(open(sys.argv[1], "rb").read())
+np.save(sys.argv[3], stream.process(np.load(sys.argv[2])).rate)
+"""
+
+
+@pytest.mark.parametrize("kind", ["robust", "feedback", "kalman", "blob"])
+def test_a_saved_stream_goes_on_in_another_process_to_the_last_bit(kind, tmp_path):
+    still = simulate_array(experiment="static", duration=60.0, seed=2)
+    record = calibrate_array(still).calibration
+    recording = simulate_array(duration=20.0, seed=2, faults=(Fault("stuck", 3, 9.0, 4.0),))
+    elements = find_elements(recording)
+    readings = elements.readings(recording)
+    if kind == "blob":
+        blob = Blob("unit.blob", make_blob([record], tables_of(record)), {})
+        settings = ArraySettings("robust", 6, 1, rate=100.0)
+        whole, first = (Stream.of_blob(blob.data, settings) for _ in range(2))
+        readings = np.radians(readings)
+    else:
+        options = FuseOptions(method=kind, calibration=None if kind == "feedback" else record)
+        whole, first = (open_stream(options, elements, 50.0, readings) for _ in range(2))
+    expected = whole.process(readings).rate
+    begun = first.process(readings[:500]).rate
+    (tmp_path / "state").write_bytes(first.state())
+    np.save(tmp_path / "rest.npy", readings[500:])
+    files = [str(tmp_path / name) for name in ("state", "rest.npy", "out.npy")]
+    subprocess.run([sys.executable, "-c", _RESUME, *files], check=True)
+    np.testing.assert_array_equal(np.concatenate([begun, np.load(tmp_path / "out.npy")]), expected)
+    assert np.abs(expected[500:]).max() > 0
+    state = bytearray(first.state())
+    state[len(state) // 2] ^= 1
+    for broken, text in ((bytes(state), "cut or altered"), (first.state()[:-1], "cut or altered"), (b"", "not the st")):
+        with pytest.raises(il.errors.RecordError, match=text):
+            Stream.from_state(broken)
 
 
 def test_a_blob_fuses_as_the_unit_does(imulab, tmp_path):

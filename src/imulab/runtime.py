@@ -110,6 +110,8 @@ class Stream:
         A setting cannot be.
     """
 
+    _blob: bytes | None = None  # where the unit came out of one, and the settings do not make it
+
     def __init__(self, settings: ArraySettings) -> None:
         self._configure(settings)
         try:
@@ -141,6 +143,7 @@ class Stream:
         except ValueError as error:
             raise RecordError(f"the blob cannot fuse an array: {error}") from None
         stream.settings = settings
+        stream._blob = blob
         return stream
 
     @property
@@ -150,6 +153,8 @@ class Stream:
 
     @rate.setter
     def rate(self, value: float) -> None:
+        if self._blob is not None:
+            raise OptionError("the sampling rate of a blob's stream is the blob's")
         self._configure(replace(self.settings, rate=float(value)))
 
     def process(
@@ -186,7 +191,8 @@ class Stream:
 
     def state(self) -> bytes:
         """Return settings and state as bytes, to go on with later by `from_state`, also in another process."""
-        head = json.dumps(asdict(self.settings), default=_listed, sort_keys=True).encode("utf-8")
+        content = asdict(self.settings) | ({} if self._blob is None else {"blob": self._blob.hex()})
+        head = json.dumps(content, default=_listed, sort_keys=True).encode("utf-8")
         body = _STATE + struct.pack("<I", len(head)) + head + bytes(self._state)
         return body + struct.pack("<I", zlib.crc32(body))
 
@@ -205,7 +211,10 @@ class Stream:
         if struct.unpack("<I", state[-4:])[0] != zlib.crc32(state[:-4]):
             raise RecordError("the state of the stream is cut or altered (CRC-32)")
         size = struct.unpack("<I", state[at - 4 : at])[0]
-        stream = cls(ArraySettings(**json.loads(state[at : at + size])))
+        content = json.loads(state[at : at + size])
+        blob = content.pop("blob", None)
+        settings = ArraySettings(**content)
+        stream = cls(settings) if blob is None else cls.of_blob(bytes.fromhex(blob), settings)
         inner = state[at + size : -4]
         if len(inner) != len(stream._state):
             raise RecordError("the state of the stream is of another build of the core")
