@@ -72,6 +72,55 @@ def test_the_truth_is_found_within_its_uncertainty(fit_bias):
     assert np.abs(scores).max() < 5
 
 
+def test_slow_beginnings_of_turns_do_not_bias_what_noisy_accelerometers_go_with():
+    """At 4 mg of noise the accelerometers take a tenth of a second or more of a turn for rest."""
+    scores = []
+    for seed in range(2000, 2012):
+        recording = il.simulate_tumble(order=1, attitudes=24, seed=seed, noise=4e-3 * G)
+        attitudes = il.find_attitudes(recording)
+        record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
+        fit = fit_gyro(record, attitudes, recording, sensitivity="no")
+        scores.append(((values(fit) - truth_of(recording)) / np.sqrt(np.diag(fit.covariance)))[:3])
+    assert np.sqrt(np.mean(np.square(scores))) < 1.35  # 2.3 with turns that begin where the accelerometers say
+
+
+def test_twists_about_the_vertical_that_only_the_gyroscopes_feel_leave_the_bias_alone(case):
+    recording, attitudes, record = case
+    truth, t = truth_of(recording), np.eye(3)
+    for k, (i, j) in enumerate(PAIRS):
+        t["xyz".index(i), "xyz".index(j)] = truth[3 + k]
+    time, rate = recording.columns["time"], np.zeros((len(recording), 3))
+    for k in range(0, len(attitudes), 2):
+        at = attitudes.start[k] + 0.2 + (0 if k % 4 else attitudes.stop[k] - attitudes.start[k] - 1.0)
+        pulse = np.where((time > at) & (time < at + 0.6), np.sin(np.pi * (time - at) / 0.6) ** 2, 0.0)
+        rate += np.radians(30.0) * pulse[:, None] * recording.triad("truth_accel") / G  # 9 deg in 0.6 s
+    twisted = recording.with_columns(
+        {f"gyro_{a}": recording.columns[f"gyro_{a}"] + (rate @ t.T)[:, i] * truth[i] for i, a in enumerate("xyz")}, {}
+    )
+    quiet, fit = (fit_gyro(record, attitudes, r) for r in (recording, twisted))
+    sigma = np.sqrt(np.diag(quiet.covariance))
+    assert np.abs((values(fit) - truth_of(recording)) / sigma).max() < 4
+    assert np.sqrt(np.diag(fit.covariance)).max() < 2 * sigma.max()
+
+
+@pytest.mark.parametrize("name", ["imu0.log", "imu1.log"])
+def test_units_held_by_hand_are_still_where_their_gyroscopes_are(name, real_data, tmp_path):
+    """MPU-9150, no reference for its gyroscopes: biases from rest and from the turns are two independent ways."""
+    columns = [f'{sensor}_{a} = {{ from = {3 * s + i}, unit = "{unit}" }}\n'
+               for s, (sensor, unit) in enumerate((("accel", "m/s^2"), ("gyro", "rad/s")))
+               for i, a in enumerate("xyz")]  # fmt: skip
+    head = 'delimiter = "whitespace"\nsample_rate = { value = 100, unit = "Hz" }\n[columns]\n'
+    (tmp_path / "mpu.toml").write_text(head + "".join(columns))
+    recording = il.read(real_data / "mpu9150" / name, tmp_path / "mpu.toml")
+    attitudes = il.find_attitudes(recording)
+    record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
+    rest, turns = (fit_gyro(record, attitudes, recording, fit_bias=b, sensitivity="no") for b in (False, True))
+    assert rest.cost < 1e-4  # 0.0175 and 0.0088 with turns that begin where the accelerometers end to be still
+    apart = (values(turns) - values(rest)) / np.sqrt(np.diag(turns.covariance))
+    assert np.abs(apart).max() < 3
+    assert np.sqrt(np.diag(rest.covariance))[9:].max() < np.radians(0.01)
+
+
 @pytest.mark.parametrize("scale", [1.0, 4778.0, 16.4 * 180 / np.pi])
 def test_counts_need_no_nominal_scale_factor(case, scale):
     recording, attitudes, record = case

@@ -21,20 +21,18 @@ from numpy.typing import NDArray
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
-from imulab.estimate import Observability, covariance, f_test, levenberg_marquardt, observability
+from imulab.estimate import Observability, covariance, levenberg_marquardt, observability
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rotation import Turns, weighted_turns
 from imulab.tumble.apply import output_factor, specific_force
+from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, find_holds
 from imulab.units import parse_unit, to_si
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
-SENSITIVITIES = ("auto", "yes", "no")
 _ROWS, _COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
-_EDGE = 0.1  # s back into the 0.3 s of each hold that segmentation drops; slow beginnings of a turn lie there
 _FEWEST_TURNS = 8
 _LONGEST_TURN = 60.0  # s
 _WORST_TURN = np.radians(20.0)
-_SIGNIFICANT = 0.01
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
@@ -99,16 +97,6 @@ class _Segments:
     stop: Array
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties."""
-
-    zero: Array
-    slope: Array | None
-    zero_uncertainty: Array
-    slope_uncertainty: Array | None
-
-
 def fit_gyro(
     record: Calibration,
     attitudes: Attitudes,
@@ -156,9 +144,10 @@ def fit_gyro(
     time, output = check_time(recording), recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
     force = specific_force(record, attitudes.mean * factor)
-    rest = _at_rest(attitudes, time, output, force, sensitivity, recording.name)
+    holds = find_holds(attitudes, time, output, recording.name)
+    rest = at_rest(holds, output, force, sensitivity)
     moving = _force_at(record, attitudes.recording, time, factor) if rest.slope is not None else None
-    segments = _segments(attitudes, time, output, force, rest, moving, recording.name)
+    segments = _segments(holds, time, output, force, rest, moving, recording.name)
     scale = _start_scale(segments, unit)
     theta, jacobian, residual = _estimate(segments, scale, fit_bias)
     miss = np.linalg.norm(residual.reshape(-1, 3), axis=1)
@@ -193,7 +182,7 @@ def _result(
     theta: Array,
     matrix: Array,
     scale: Array,
-    rest: _Rest,
+    rest: Rest,
     miss: Array,
     segments: _Segments,
     unit: str,
@@ -230,30 +219,6 @@ def _result(
     )
 
 
-def _at_rest(attitudes: Attitudes, time: Array, output: Array, force: Array, sensitivity: str, name: str) -> _Rest:
-    """Zero and g-sensitivity from the mean outputs of each attitude, least squares over the attitudes."""
-    edges = np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop]))
-    if (edges[:, 1] <= edges[:, 0]).any():
-        index = int(np.argmax(edges[:, 1] <= edges[:, 0]))
-        raise DataError(f"{name}: no samples during {attitudes.label(index)}: do the two recordings share one clock?")
-    sums = np.add.reduceat(np.vstack([output, np.zeros((1, 3))]), edges.ravel(), axis=0)[::2]
-    mean = sums / np.diff(edges, axis=1)
-    n = len(mean)
-    flat = mean - mean.mean(axis=0)
-    design = np.column_stack([np.ones(n), force])
-    solution = np.asarray(np.linalg.lstsq(design, mean, rcond=None)[0], dtype=np.float64)
-    left = mean - design @ solution
-    costs = float((flat**2).sum()), float((left**2).sum())
-    shown = n > 6 and f_test(costs[0], 3, costs[1], 12, 3 * n) < _SIGNIFICANT
-    if sensitivity == "no" or (sensitivity == "auto" and not shown):
-        scatter: Array = np.sqrt((flat**2).sum(axis=0) / (n - 1) / n)
-        return _Rest(mean.mean(axis=0), None, scatter, None)
-    spread: Array = np.sqrt((left**2).sum(axis=0) / max(n - 4, 1))
-    root = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    uncertainty: Array = spread[:, None] * root[1:]
-    return _Rest(solution[0], solution[1:].T, spread * root[0], uncertainty)
-
-
 def _force_at(record: Calibration, recording: Recording, time: Array, factor: float) -> Array:
     """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
     force = specific_force(record, recording.triad("accel") * factor)
@@ -264,17 +229,13 @@ def _force_at(record: Calibration, recording: Recording, time: Array, factor: fl
 
 
 def _segments(
-    attitudes: Attitudes, time: Array, output: Array, force: Array, rest: _Rest, moving: Array | None, name: str
+    holds: Holds, time: Array, output: Array, force: Array, rest: Rest, moving: Array | None, name: str
 ) -> _Segments:
-    begin, end = attitudes.stop[:-1] + _EDGE, attitudes.start[1:] - _EDGE
-    keep = (end > begin) & (end - begin <= _LONGEST_TURN)
-    start, stop = np.searchsorted(time, begin[keep]), np.searchsorted(time, end[keep])
-    inside_file = (start > 0) & (stop < len(time)) & (stop > start)
-    if np.count_nonzero(inside_file) < _FEWEST_TURNS:
-        raise SegmentError(
-            f"{name}: {np.count_nonzero(inside_file)} turns between attitudes; expected at least {_FEWEST_TURNS}"
-        )
-    start, stop = start[inside_file], stop[inside_file]
+    begin, end = holds.leave[:-1], holds.arrive[1:]
+    chosen = np.flatnonzero((end > begin) & (time[end] - time[begin] <= _LONGEST_TURN))
+    if len(chosen) < _FEWEST_TURNS:
+        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes; expected at least {_FEWEST_TURNS}")
+    start, stop = begin[chosen], end[chosen]
     index = start[:, None] + np.arange(int((stop - start).max()))
     inside = index < stop[:, None]
     here, there = np.where(inside, index, 0), np.where(inside, index + 1, 0)
@@ -282,7 +243,6 @@ def _segments(
     if moving is not None and rest.slope is not None:
         mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    chosen = np.flatnonzero(keep)[inside_file]
     step = np.where(inside, time[there] - time[here], 0.0)
     return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop])
 
