@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import imulab as il
 from imulab.errors import DataError, OptionError, SegmentError
+from imulab.present import exhibits_of
 from imulab.rotation import frame_rotations, weighted_turns
 from imulab.tumble.gyro import PAIRS, fit_gyro, gyro_names
 from imulab.tumble.gyrorecord import with_gyro
@@ -103,6 +104,24 @@ def test_twists_about_the_vertical_that_only_the_gyroscopes_feel_leave_the_bias_
     assert np.sqrt(np.diag(fit.covariance)).max() < 2 * sigma.max()
 
 
+def test_the_uncertainty_of_the_accelerometers_record_is_carried_along():
+    """A record from a hasty test, and turns from a careful one: the frame of the gyroscopes is no better known."""
+    scores = []
+    for seed in range(20):
+        truth = {f"bias_{a}": 0.1 for a in "xyz"} | {f"scale_factor_{a}": 1.0 for a in "xyz"}
+        truth |= {"misalignment_yx": 0.01, "misalignment_zx": -0.02, "misalignment_zy": 0.01}
+        hasty, careful = (
+            il.simulate_tumble(attitudes=24, truth=truth, seed=100 * i + seed, noise=noise * G)
+            for i, noise in enumerate((6e-3, 0.3e-3), start=1)
+        )
+        record = il.fit_tumble(il.find_attitudes(hasty), order=1, gravity=G).calibration
+        fit = fit_gyro(record, il.find_attitudes(careful), careful, sensitivity="no")
+        scores.append((values(fit) - truth_of(careful)) / np.sqrt(np.diag(fit.covariance)))
+    rms = np.sqrt(np.mean(np.square(scores), axis=0))
+    assert 0.8 < np.sqrt(np.mean(rms**2)) < 1.2
+    assert rms.max() < 1.7  # of 12; each has a standard deviation of 0.16
+
+
 @pytest.mark.parametrize("name", ["imu0.log", "imu1.log"])
 def test_units_held_by_hand_are_still_where_their_gyroscopes_are(name, real_data, tmp_path):
     """MPU-9150, no reference for its gyroscopes: biases from rest and from the turns are two independent ways."""
@@ -156,6 +175,11 @@ def test_the_record_holds_both_triads_and_corrects_both(case, tmp_path):
     assert set(record.parameters) < set(both.parameters)
     assert both.parameters["gyro_scale_factor_x"].unit == "deg/s/(rad/s)"
     assert len(both.covariance.names) == 9 + 12
+    rows = {row[0]: row for row in next(t for t in exhibits_of(both).items if t.title == "Parameters").rows}
+    half = both.fit["gyro"]["coverage_factor_95"] * both.parameters["gyro_bias_x"].standard_uncertainty
+    low = np.degrees(both.value("gyro_bias_x") - half)
+    assert float(rows["gyro_bias_x"][3].split(" to ")[0]) == pytest.approx(low, abs=1e-5)
+    assert "29 turns of the gyroscopes carry gravity's direction within" in exhibits_of(both).headline
     il.write_report(loaded, tmp_path / "both.html")
     assert "What the gyroscopes miss in each turn" in (tmp_path / "both.html").read_text()
     corrected = il.apply(loaded, recording)

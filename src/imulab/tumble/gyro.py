@@ -25,6 +25,7 @@ from imulab.estimate import Observability, covariance, levenberg_marquardt, obse
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rotation import Turns, weighted_turns
 from imulab.tumble.apply import output_factor, specific_force
+from imulab.tumble.directions import direction_covariance
 from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, find_holds
 from imulab.units import parse_unit, to_si
 
@@ -95,6 +96,8 @@ class _Segments:
     after: Array
     start: Array
     stop: Array
+    attitude: NDArray[np.intp]
+    """Index of the attitude before each turn; the one after it is the next."""
 
 
 def fit_gyro(
@@ -143,7 +146,8 @@ def fit_gyro(
     check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
     time, output = check_time(recording), recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
-    force = specific_force(record, attitudes.mean * factor)
+    means = attitudes.mean * factor
+    force = specific_force(record, means)
     holds = find_holds(attitudes, time, output, recording.name)
     rest = at_rest(holds, output, force, sensitivity)
     moving = _force_at(record, attitudes.recording, time, factor) if rest.slope is not None else None
@@ -157,16 +161,14 @@ def fit_gyro(
             f"{np.degrees(np.median(miss)):.0f} deg (median of {len(miss)}): swapped or reversed axes, or a wrong unit?"
         )
     # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
-    freedom = 2 * len(miss) - theta.size
-    variance = float(residual @ residual) / max(freedom, 1)
-    weights = np.full(len(residual), 1 / max(variance, 1e-30))
-    seen = observability(jacobian, weights)
+    freedom = max(2 * len(miss) - theta.size, 1)
+    seen = observability(jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
     if seen.rank < theta.size:
         confused = " ".join(seen.confused(gyro_names()[: theta.size]))
         raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
-    return _result(
-        theta, covariance(jacobian[None], weights[None])[0], scale, rest, miss, segments, unit, fit_bias, seen
-    )
+    known = direction_covariance(record, attitudes, means, force)
+    matrix = _covariance(segments, scale, theta, jacobian, residual, known, None if fit_bias else rest)
+    return _result(theta, matrix, scale, rest, miss, segments, unit, fit_bias, seen)
 
 
 def gyro_names() -> list[str]:
@@ -244,7 +246,7 @@ def _segments(
         mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     step = np.where(inside, time[there] - time[here], 0.0)
-    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop])
+    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop], chosen)
 
 
 def _start_scale(segments: _Segments, unit: str) -> Array:
@@ -257,7 +259,8 @@ def _start_scale(segments: _Segments, unit: str) -> Array:
     # A turn goes at least as far as the direction of gravity does.
     guess = float(np.median((turned / np.maximum(angle, 1e-3))[angle > 0.3])) if (angle > 0.3).any() else 1.0
     few = replace(
-        segments, **{f: getattr(segments, f)[:40] for f in ("output", "step", "before", "after", "start", "stop")}
+        segments,
+        **{f: getattr(segments, f)[:40] for f in ("output", "step", "before", "after", "start", "stop", "attitude")},
     )
     costs = []
     for factor in _START_FACTORS:
@@ -278,6 +281,50 @@ def _estimate(segments: _Segments, scale: Array, fit_bias: bool) -> tuple[Array,
     count = 12 if fit_bias else 9
     fit = levenberg_marquardt(model, np.zeros((1, count)), np.ones((1, 3 * len(segments.before))), tolerance=1e-8)
     return fit.parameters[0], fit.jacobian[0], fit.residuals[0]
+
+
+def _covariance(
+    segments: _Segments, scale: Array, theta: Array, jacobian: Array, residual: Array, known: Array, rest: Rest | None
+) -> Array:
+    """Covariance of a least-squares estimate whose observations share errors: (J'J)^-1 J' V J (J'J)^-1.
+
+    V is what the directions of gravity (`known`) and the zero at rest bring to the residuals, and a common variance of
+    each for all else, which takes up what the residuals scatter beyond them.
+    """
+    m, size = len(segments.before), theta.size
+    turn = _turns(segments, scale, theta).matrix
+    rows = jacobian.reshape(m, 3, size)
+    count = len(known) // 3
+    seen = np.zeros((count, 3, size))
+    np.add.at(seen, segments.attitude, np.swapaxes(turn, 1, 2) @ rows)
+    np.add.at(seen, segments.attitude + 1, -rows)
+    pulled = seen.reshape(3 * count, size)
+    meat: Array = pulled.T @ known @ pulled
+    blocks = known.reshape(count, 3, count, 3)
+    here, there = segments.attitude, segments.attitude + 1
+    spent = float(
+        np.einsum("mii->", blocks[here, :, here]) + np.einsum("mii->", blocks[there, :, there])
+        - 2 * np.einsum("mij,mji->", turn, blocks[here, :, there])
+    )  # fmt: skip
+    if rest is not None:
+        zero = _model(segments, scale, np.concatenate([theta, np.zeros(3)]), fit_bias=True)[1][:, size:]
+        zero = zero * (rest.zero_uncertainty / scale)
+        meat += (jacobian.T @ zero) @ (zero.T @ jacobian)
+        spent += float((zero**2).sum())
+    bread = covariance(jacobian[None], np.ones((1, 3 * m)))[0]
+    left = float(residual @ residual) - (spent - float(np.trace(bread @ meat)))
+    variance = max(left, 0.0) / max(2 * m - size, 1)
+    found: Array = bread @ meat @ bread + variance * bread
+    return found
+
+
+def _turns(segments: _Segments, scale: Array, theta: Array) -> Turns:
+    """Turns under given parameters, without their derivatives."""
+    t = np.eye(3)
+    t[_ROWS, _COLUMNS] = theta[3:9]
+    moved = scale * theta[9:12] if theta.size > 9 else 0.0
+    rate = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(t).T
+    return weighted_turns(rate, segments.step, np.empty((*rate.shape[:2], 0)))
 
 
 def _model(segments: _Segments, scale: Array, theta: Array, fit_bias: bool) -> tuple[Array, Array]:

@@ -30,8 +30,7 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
     sources |= {r.source.file: r.source for r in (accelerometers, recording) if r.source is not None}
     turns = len(fit.residuals)
     freedom = 2 * turns - (12 if fit.fit_bias else 9)
-    # The triads are fitted one after the other: what the accelerometers' uncertainty adds to the gyroscopes' is not
-    # carried along; it is seen in the residual angles, which scale the covariance.
+    # The gyroscopes' covariance holds what the accelerometers' adds; the covariance between the two is not kept.
     joined = _diagonal_blocks(block, _covariance(fit))
     return replace(
         record,
