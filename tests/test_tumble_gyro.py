@@ -1,5 +1,6 @@
 """The gyroscope triad: truth of simulated turns, derivatives, real recordings, and what can go wrong."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -208,6 +209,48 @@ def test_applying_to_counts_gives_rad_per_second_and_other_units_are_refused(cas
         il.apply(both, counts)
     alone = replace(recording, columns={n: recording.columns[n] for n in ("time", "accel_x", "accel_y", "accel_z")})
     assert "gyro_x" not in il.apply(both, alone)
+
+
+def test_clipped_turns_are_left_out_and_named(case):
+    recording, attitudes, record = case
+    clipped = recording.with_columns({f"gyro_{a}": np.clip(recording.columns[f"gyro_{a}"], -80, 80) for a in "xyz"}, {})
+    fit = fit_gyro(record, attitudes, clipped)
+    assert 8 <= len(fit.residuals) < 25  # of 29
+    assert np.abs((values(fit) - truth_of(recording)) / np.sqrt(np.diag(fit.covariance))).max() < 4
+    warnings = with_gyro(record, fit, clipped, clipped).warnings
+    assert any("turns left out, clipped: gyro_" in w and "at the end of their range (from " in w for w in warnings)
+    narrow = recording.with_columns({"gyro_x": np.clip(recording.columns["gyro_x"], -5, 5)}, {})
+    with pytest.raises(SegmentError, match=r"turns between attitudes \(\d+ more are clipped\); expected at least 8"):
+        fit_gyro(record, attitudes, narrow)
+
+
+def test_the_top_of_a_turn_in_coarse_steps_is_not_clipped(case):
+    recording, attitudes, record = case
+    coarse = recording.with_columns({f"gyro_{a}": np.round(recording.columns[f"gyro_{a}"]) for a in "xyz"}, {})
+    assert len(fit_gyro(record, attitudes, coarse).residuals) == 29
+
+
+@pytest.mark.parametrize(
+    ("late", "words"), [(1.0, r"stop turning 0\.\d s after"), (-1.0, r"start turning 0\.\d s before")]
+)
+def test_a_clock_that_is_off_is_said(case, late, words):
+    recording, _, record = case
+    time = recording.columns["time"]
+    other = recording.with_columns({"time": time + 30.0 + late}, {})
+    own = il.find_attitudes(recording.with_columns({"time": time + 30.0}, {}))
+    late_fit = fit_gyro(record, own, other)
+    assert any(re.search(words, note) for note in late_fit.notes), late_fit.notes
+    assert np.abs((values(late_fit) - truth_of(recording)) / np.sqrt(np.diag(late_fit.covariance))).max() < 5
+    same = recording.with_columns({"time": time + 30.0}, {})
+    assert fit_gyro(record, own, same).notes == ()
+
+
+def test_a_record_of_another_unit_is_said(case):
+    _, _, record = case
+    other = il.simulate_tumble(order=1, attitudes=24, seed=2)
+    notes = fit_gyro(record, il.find_attitudes(other), other).notes
+    assert "gyro: the record is of SIM-0001, the recording of SIM-0002" in notes
+    assert any("|f| scatters by" in note and "is it of this unit?" in note for note in notes)
 
 
 def test_bad_input_is_named(case):

@@ -26,12 +26,13 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rotation import Turns, weighted_turns
 from imulab.tumble.apply import output_factor, specific_force
 from imulab.tumble.directions import direction_covariance
-from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, find_holds
-from imulab.units import parse_unit, to_si
+from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, beyond_range, clock_notes, find_holds
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
 _ROWS, _COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
 _FEWEST_TURNS = 8
+_FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
 _LONGEST_TURN = 60.0  # s
 _WORST_TURN = np.radians(20.0)
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
@@ -65,6 +66,8 @@ class GyroFit:
         Whether the biases were fitted to the turns instead of taken from rest.
     observability
         Of the parameters that were fitted to the turns.
+    notes
+        What a user should know, a sentence each.
     """
 
     scale_factor: Array
@@ -79,6 +82,7 @@ class GyroFit:
     unit: str
     fit_bias: bool
     observability: Observability
+    notes: tuple[str, ...] = ()
 
     @property
     def cost(self) -> float:
@@ -151,7 +155,10 @@ def fit_gyro(
     holds = find_holds(attitudes, time, output, recording.name)
     rest = at_rest(holds, output, force, sensitivity)
     moving = _force_at(record, attitudes.recording, time, factor) if rest.slope is not None else None
-    segments = _segments(holds, time, output, force, rest, moving, recording.name)
+    segments, notes = _segments(holds, time, output, force, rest, moving, recording.name)
+    notes += _record_notes(record, attitudes, force)
+    if attitudes.recording is not recording:
+        notes += clock_notes(holds, attitudes, time)
     scale = _start_scale(segments, unit)
     theta, jacobian, residual = _estimate(segments, scale, fit_bias)
     miss = np.linalg.norm(residual.reshape(-1, 3), axis=1)
@@ -168,7 +175,22 @@ def fit_gyro(
         raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
     known = direction_covariance(record, attitudes, means, force)
     matrix = _covariance(segments, scale, theta, jacobian, residual, known, None if fit_bias else rest)
-    return _result(theta, matrix, scale, rest, miss, segments, unit, fit_bias, seen)
+    result = _result(theta, matrix, scale, rest, miss, segments, unit, fit_bias, seen)
+    return replace(result, notes=tuple(notes))
+
+
+def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
+    """Say if the accelerometers' record is hardly of this unit."""
+    mine, its = record.sensor.get("serial"), attitudes.recording.metadata.get("serial")
+    found = [f"gyro: the record is of {mine}, the recording of {its}"] if mine and its and mine != its else []
+    length = np.linalg.norm(force, axis=1)
+    scatter, usual = float(length.std()), float(record.fit["rms"]["value"])
+    if scatter > _FOREIGN * usual + _TOUCHED:
+        found.append(
+            f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
+            f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?"
+        )
+    return found
 
 
 def gyro_names() -> list[str]:
@@ -232,11 +254,21 @@ def _force_at(record: Calibration, recording: Recording, time: Array, factor: fl
 
 def _segments(
     holds: Holds, time: Array, output: Array, force: Array, rest: Rest, moving: Array | None, name: str
-) -> _Segments:
+) -> tuple[_Segments, list[str]]:
     begin, end = holds.leave[:-1], holds.arrive[1:]
-    chosen = np.flatnonzero((end > begin) & (time[end] - time[begin] <= _LONGEST_TURN))
+    clipped = np.vstack([np.zeros((1, 3), dtype=np.int64), np.cumsum(beyond_range(output), axis=0)])
+    turns = (end > begin) & (time[end] - time[begin] <= _LONGEST_TURN)
+    beyond = (clipped[end + 1] > clipped[begin]) & turns[:, None]
+    chosen = np.flatnonzero(turns & ~beyond.any(axis=1))
+    notes = []
+    if beyond.any():
+        axes = " ".join(f"gyro_{'xyz'[axis]}" for axis in range(3) if beyond[:, axis].any())
+        where = np.flatnonzero(beyond.any(axis=1))
+        at = " ".join(f"{t:.1f}" for t in time[begin[where[:6]]].tolist()) + (" ..." if len(where) > 6 else "")
+        notes.append(f"gyro: {len(where)} turns left out, clipped: {axes} stay at the end of their range (from {at} s)")
     if len(chosen) < _FEWEST_TURNS:
-        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes; expected at least {_FEWEST_TURNS}")
+        aside = f" ({int(beyond.any(axis=1).sum())} more are clipped)" if notes else ""
+        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes{aside}; expected at least {_FEWEST_TURNS}")
     start, stop = begin[chosen], end[chosen]
     index = start[:, None] + np.arange(int((stop - start).max()))
     inside = index < stop[:, None]
@@ -246,7 +278,7 @@ def _segments(
         mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     step = np.where(inside, time[there] - time[here], 0.0)
-    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop], chosen)
+    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop], chosen), notes
 
 
 def _start_scale(segments: _Segments, unit: str) -> Array:

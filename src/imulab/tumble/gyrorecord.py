@@ -15,6 +15,7 @@ from imulab.units import parse_unit
 _AXES = ("x", "y", "z")
 _WORST_SCALE = 0.1
 _STANDS_OUT = 6.0
+_LARGE_MISS = 2.0  # deg
 
 
 def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerometers: Recording) -> Calibration:
@@ -103,7 +104,7 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
 
 
 def _warnings(fit: GyroFit) -> list[str]:
-    found = []
+    found = list(fit.notes)
     if parse_unit(fit.unit).quantity == "rate":
         nominal = 1 / parse_unit(fit.unit).factor
         found += [
@@ -111,6 +112,9 @@ def _warnings(fit: GyroFit) -> list[str]:
             for axis, value in zip(_AXES, fit.scale_factor, strict=True)
             if abs(value / nominal - 1) > _WORST_SCALE
         ]
+    rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
+    if rms > _LARGE_MISS:
+        found.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
     worst = int(np.argmax(fit.residuals))
     others = float(np.sqrt(np.mean(np.delete(fit.residuals, worst) ** 2)))
     if fit.residuals[worst] > _STANDS_OUT * others:

@@ -23,6 +23,9 @@ _MARGIN = 0.1  # s
 _DEEPEST = 2.0  # s
 _MAD = 1.4826
 _SIGNIFICANT = 0.01
+_FLAT_TOP = 4  # samples in a row
+_CUT_OFF = 3.0  # steps of the output
+_LATE = 0.3  # s
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,32 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> H
         if after.size:
             leave[k] = max(after[0] - margin, late[k])
     return Holds(start, stop, arrive, leave, still)
+
+
+def clock_notes(holds: Holds, attitudes: Attitudes, time: Array) -> list[str]:
+    """Say if the gyroscopes, on another clock perhaps, move into one end of the holds and not into the other."""
+    into = np.median(time[holds.arrive] - attitudes.start), np.median(attitudes.stop - time[holds.leave])
+    for late, other, when in ((*into, "stop turning {:.1f} s after"), (*into[::-1], "start turning {:.1f} s before")):
+        if late > _LATE and other < late / 2:
+            return [f"gyro: the gyroscopes {when.format(late)} the accelerometers (median): does one clock drive both?"]
+    return []
+
+
+def beyond_range(output: Array) -> NDArray[np.bool_]:
+    """Return which samples lie in a flat top at the largest or smallest output of an axis, shape (n, 3).
+
+    Four in a row, cut off where the output was still changing: the top of a slow turn in coarse steps is none.
+    """
+    clipped = np.zeros(output.shape, dtype=np.bool_)
+    least = _CUT_OFF * _resolution(output)
+    for axis, values in enumerate(output.T):
+        for extreme in (values.max(), values.min()):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
+            for start, stop in edges.reshape(-1, 2).tolist():
+                before, after = values[max(start - 1, 0)], values[min(stop, len(values) - 1)]
+                if stop - start >= _FLAT_TOP and max(abs(before - extreme), abs(after - extreme)) > least[axis]:
+                    clipped[start:stop, axis] = True
+    return clipped
 
 
 def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest:
