@@ -1,5 +1,7 @@
 """Plans: as good as the published table, allowed by the fixture, and predicting what the bound says."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import imulab as il
 from imulab.calibration import Calibration, Covariance
 from imulab.errors import ObservabilityError, OptionError
-from imulab.tumble.plan import fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
+from imulab.tumble.plan import fixture_candidates, head_candidates, information_rows, plan_tumble, roll_pitch, turning
 from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
 from reference import tumble as reference
 
@@ -145,6 +147,33 @@ def test_a_plan_reads_back_and_feeds_the_simulator_and_the_fit(tmp_path):
     for name, predicted in plan.uncertainties(noise).items():
         if name.startswith("k2"):
             assert record.parameters[name].standard_uncertainty * G == pytest.approx(predicted, rel=0.2), name
+
+
+def test_letters_fit_on_their_faces():
+    """No face is lettered larger than it is wide, and every picture has at least one letter."""
+    for up in reference.random_attitudes(np.random.default_rng(7), 200):
+        parts = re.findall(
+            r'<polygon points="([^"]*)"[^>]*/>(?:<text [^>]*font-size="([\d.]+)")?', attitude_picture(up)
+        )
+        for outline, size in parts:
+            corners = np.array([[float(c) for c in corner.split(",")] for corner in outline.split()])
+            sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)[:2]
+            area = abs(np.cross(np.append(corners[1] - corners[0], 0), np.append(corners[2] - corners[1], 0))[2])
+            assert not size or float(size) < area / sides.max()
+        assert any(size for _, size in parts)
+
+
+def test_three_degrees_off_cost_a_tenth():
+    """As the sheet says."""
+    rng = np.random.default_rng(8)
+    for order, count in ((1, 12), (2, 24), (4, 24)):
+        plan = plan_tumble(order=order, attitudes=count)
+        planned, worst = np.sqrt(np.diag(plan.covariance)), []
+        for _ in range(100):
+            off = plan.directions + np.radians(3) / np.sqrt(2) * rng.standard_normal((count, 3))
+            rows = information_rows(off / np.linalg.norm(off, axis=1, keepdims=True), order)
+            worst.append((np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) / planned).max())
+        assert np.median(worst) < 1.1
 
 
 def test_pictures_show_the_face_that_is_up():

@@ -10,6 +10,7 @@ from imulab.tumble.plan import Plan, roll_pitch
 from imulab.units import parse_unit
 
 _SIZE = 62.0
+_LARGEST_LETTER, _SMALLEST_LETTER = 13.0, 6.5
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float) * [1.0, 0.7, 0.35]
 _FACES = (
     (0, (4, 5, 7, 6), "+x"), (0, (0, 1, 3, 2), "−x"), (1, (2, 3, 7, 6), "+y"),
@@ -80,13 +81,21 @@ def attitude_picture(up: Array) -> str:
             f'<polygon points="{outline}" fill="{_SHADES[axis]}" fill-opacity="{0.45 + 0.5 * toward:.2f}" '
             'stroke="#22303a"/>'
         )
-        if toward > 0.25:
+        size = min(_LARGEST_LETTER, 0.7 * _narrowest(points[list(corners)]))
+        if size >= _SMALLEST_LETTER:
             shapes.append(
-                f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="13" text-anchor="middle" '
+                f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="{size:.1f}" text-anchor="middle" '
                 f'dominant-baseline="central" fill="{_LETTERS[axis]}">{text}</text>'
             )
     side = 2 * _SIZE
     return f'<svg viewBox="0 0 {side:.0f} {side:.0f}" width="150" height="150" role="img">{"".join(shapes)}</svg>'
+
+
+def _narrowest(outline: Array) -> float:
+    """Distance between the nearer pair of sides of a parallelogram, shape (4, 2)."""
+    one, two = outline[1] - outline[0], outline[3] - outline[0]
+    area = abs(float(one[0] * two[1] - one[1] * two[0]))
+    return area / max(float(np.linalg.norm(one)), float(np.linalg.norm(two)))
 
 
 def _to_level(up: Array) -> Array:
