@@ -33,16 +33,35 @@ def frame_rotations(rate: Array, time: Array, start: NDArray[np.int64], stop: ND
     Array
         Shape (m, 3, 3).
     """
-    steps = int(max(1, (stop - start).max()))
-    length = 1 << (steps - 1).bit_length()
-    index = start[:, None] + np.arange(length)
+    index = start[:, None] + np.arange(int(max(1, (stop - start).max())))
     inside = index < stop[:, None]
     here, there = np.where(inside, index, 0), np.where(inside, index + 1, 0)
-    angle = -0.5 * (rate[here] + rate[there]) * (time[there] - time[here])[:, :, None]
-    q = _quaternions(angle)
+    return composed_turns(0.5 * (rate[here] + rate[there]) * (time[there] - time[here])[:, :, None])
+
+
+def composed_turns(angle: Array) -> Array:
+    """Return the matrices that carry fixed directions through the steps of each segment.
+
+    Parameters
+    ----------
+    angle
+        Rotation vector of the body in each step, rad, shape (m, n, 3); zero after a segment's end.
+
+    Returns
+    -------
+    Array
+        Shape (m, 3, 3).
+    """
+    q = _quaternions(_padded(-angle))
     while q.shape[1] > 1:
         q = _compose(q[:, 1::2], q[:, 0::2])
     return _matrices(q[:, 0])
+
+
+def _padded(steps: Array) -> Array:
+    """Steps with zeros behind them, shape (m, a power of two, k)."""
+    missing = (1 << max(steps.shape[1] - 1, 0).bit_length()) - steps.shape[1]
+    return np.pad(steps, ((0, 0), (0, missing), (0, 0)))
 
 
 def _quaternions(vector: Array) -> Array:
@@ -100,11 +119,10 @@ def weighted_turns(rate: Array, step: Array, weights: Array) -> Turns:
     weights
         Shape (m, n, k).
     """
-    missing = (1 << max(rate.shape[1] - 1, 0).bit_length()) - rate.shape[1]
-    angle = np.pad(-rate * step[:, :, None], ((0, 0), (0, missing), (0, 0)))
+    angle = _padded(-rate * step[:, :, None])
     q = _quaternions(angle)
     half = _matrices(_quaternions(0.5 * angle).reshape(-1, 4)).reshape(*angle.shape, 3)
-    scaled = np.pad(weights * step[:, :, None], ((0, 0), (0, missing), (0, 0)))
+    scaled = _padded(weights * step[:, :, None])
     sums = scaled[..., None, None] * np.swapaxes(half, -1, -2)[:, :, None]
     while q.shape[1] > 1:
         first = q[:, 0::2]

@@ -23,7 +23,7 @@ from imulab.calibration import Calibration
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
 from imulab.estimate import Observability, covariance, levenberg_marquardt, observability
 from imulab.recording import Array, Recording, check_finite, check_time
-from imulab.rotation import Turns, weighted_turns
+from imulab.rotation import Turns, composed_turns, weighted_turns
 from imulab.tumble.apply import output_factor, specific_force
 from imulab.tumble.directions import direction_covariance
 from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, beyond_range, clock_notes, find_holds
@@ -35,6 +35,7 @@ _FEWEST_TURNS = 8
 _FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
 _LONGEST_TURN = 60.0  # s
 _WORST_TURN = np.radians(20.0)
+_COARSE = 4  # steps taken as one where a scale factor is only to be found roughly
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
@@ -290,15 +291,16 @@ def _start_scale(segments: _Segments, unit: str) -> Array:
     turned = np.linalg.norm((segments.output * segments.step[:, :, None]).sum(axis=1), axis=1)
     # A turn goes at least as far as the direction of gravity does.
     guess = float(np.median((turned / np.maximum(angle, 1e-3))[angle > 0.3])) if (angle > 0.3).any() else 1.0
-    few = replace(
-        segments,
-        **{f: getattr(segments, f)[:40] for f in ("output", "step", "before", "after", "start", "stop", "attitude")},
-    )
+    few = slice(None, 40)
+    angle_steps = segments.output[few] * segments.step[few, :, None]
+    missing = -angle_steps.shape[1] % _COARSE
+    coarse = np.pad(angle_steps, ((0, 0), (0, missing), (0, 0))).reshape(len(angle_steps), -1, _COARSE, 3).sum(axis=2)
     costs = []
     for factor in _START_FACTORS:
-        rate = few.output / (guess * factor)
-        carried = weighted_turns(rate, few.step, np.empty((*rate.shape[:2], 0))).matrix
-        miss = np.einsum("mij,mj->mi", carried, few.before) - few.after
+        miss = (
+            np.einsum("mij,mj->mi", composed_turns(coarse / (guess * factor)), segments.before[few])
+            - segments.after[few]
+        )
         costs.append(float(np.median(np.linalg.norm(miss, axis=1))))
     return np.full(3, guess * float(_START_FACTORS[int(np.argmin(costs))]))
 
@@ -324,7 +326,7 @@ def _covariance(
     each for all else, which takes up what the residuals scatter beyond them.
     """
     m, size = len(segments.before), theta.size
-    turn = _turns(segments, scale, theta).matrix
+    turn = _turns(segments, scale, theta)
     rows = jacobian.reshape(m, 3, size)
     count = len(known) // 3
     seen = np.zeros((count, 3, size))
@@ -350,13 +352,13 @@ def _covariance(
     return found
 
 
-def _turns(segments: _Segments, scale: Array, theta: Array) -> Turns:
-    """Turns under given parameters, without their derivatives."""
+def _turns(segments: _Segments, scale: Array, theta: Array) -> Array:
+    """Matrices of the turns under given parameters, shape (m, 3, 3)."""
     t = np.eye(3)
     t[_ROWS, _COLUMNS] = theta[3:9]
     moved = scale * theta[9:12] if theta.size > 9 else 0.0
     rate = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(t).T
-    return weighted_turns(rate, segments.step, np.empty((*rate.shape[:2], 0)))
+    return composed_turns(rate * segments.step[:, :, None])
 
 
 def _model(segments: _Segments, scale: Array, theta: Array, fit_bias: bool) -> tuple[Array, Array]:
