@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 import imulab as il
 from conftest import table
-from imulab.errors import DataError
+from imulab.errors import DataError, OptionError
 from imulab.recording import Recording
 from reference import tumble as reference
 
@@ -213,3 +213,22 @@ def test_a_fixed_order_states_its_leave_one_out_error():
     attitudes = il.find_attitudes(table(data + 1e-3 * rng.standard_normal(data.shape)))
     auto, fixed = (il.fit_tumble(attitudes, order=o, gravity=G).calibration for o in ("auto", 1))
     assert fixed.fit["leave_one_out"]["value"] == pytest.approx(auto.fit["leave_one_out"]["value"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gravity": 0.0}, "gravity 0: expected 0.5 to 50"),
+        ({"gravity": -9.8}, "gravity -9.8: expected 0.5 to 50"),
+        (
+            {"hold": 3600.0, "sample_rate": 1e5},
+            r"8\.64e\+09 samples of all attitudes together: expected at most 1e\+07",
+        ),
+        ({"hold": 0.1}, "hold 0.1: expected 0.5 to 3600"),
+        ({"noise": -1.0}, "noise -1: expected 0 to 1000"),
+        ({"attitudes": 1}, "attitudes 1: expected 2 to 10000"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(options, message):
+    with pytest.raises(OptionError, match=message):
+        simulated(**options)

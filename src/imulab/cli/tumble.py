@@ -125,7 +125,8 @@ def fit(
         str | None, typer.Option("--prior", metavar="RECORD", help="Earlier record of this unit, as prior knowledge.")
     ] = None,
     monte_carlo: Annotated[
-        str | None, typer.Option("--monte-carlo", metavar="N", help="Trials of a propagation of distributions, 1000 or more.")
+        str | None,
+        typer.Option("--monte-carlo", metavar="N", help="Trials of a propagation of distributions, 1000 or more."),
     ] = None,
     output: OutputFile = None,
     report: ReportFile = None,

@@ -15,6 +15,7 @@ from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
 _HIGHEST_ORDER = 5
+_MOST_SAMPLES = 1e7
 _RING_FREQUENCY = 12.0  # Hz
 _RING_DECAY = 0.08  # s
 _KNOCK = 30.0  # m/s^2
@@ -92,7 +93,7 @@ def simulate_tumble(
     OptionError
         A value is out of range.
     """
-    _check(order, sample_rate, hold, move, noise)
+    _check(order, sample_rate, hold, move, noise, gravity)
     if seed < 0:
         raise OptionError(f"seed {seed}: expected a whole number from 0")
     rng = np.random.default_rng(seed)
@@ -101,6 +102,9 @@ def simulate_tumble(
         raise OptionError(f"knock {knock}: expected the number of an attitude, 1 to {len(directions)}")
     nominal = _nominal_scale(unit, scale)
     sensor = dict(truth) if truth is not None else _random_sensor(rng, order, nominal)
+    samples = len(directions) * (hold + move) * sample_rate
+    if samples > _MOST_SAMPLES:
+        raise OptionError(f"{samples:.3g} samples of all attitudes together: expected at most {_MOST_SAMPLES:.0e}")
     path = _path(directions, sample_rate, hold, move, rng)
     force = gravity * path.upward
     felt = force + _disturbances(path, hold, knock, rng)
@@ -125,7 +129,7 @@ def simulate_tumble(
     return Recording(columns=columns, units=units, metadata=metadata, name="simulated tumble")
 
 
-def _check(order: int, sample_rate: float, hold: float, move: float, noise: float) -> None:
+def _check(order: int, sample_rate: float, hold: float, move: float, noise: float, gravity: float) -> None:
     if not 1 <= order <= _HIGHEST_ORDER:
         raise OptionError(f"order {order}: expected 1 to {_HIGHEST_ORDER}")
     for name, value, low, high in (
@@ -133,6 +137,7 @@ def _check(order: int, sample_rate: float, hold: float, move: float, noise: floa
         ("hold", hold, 0.5, 3600.0),
         ("move", move, 0.2, 3600.0),
         ("noise", noise, 0.0, 1e3),
+        ("gravity", gravity, 0.5, 50.0),
     ):
         if not low <= value <= high:
             raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
