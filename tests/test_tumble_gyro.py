@@ -228,6 +228,9 @@ def test_the_top_of_a_turn_in_coarse_steps_is_not_clipped(case):
     recording, attitudes, record = case
     coarse = recording.with_columns({f"gyro_{a}": np.round(recording.columns[f"gyro_{a}"]) for a in "xyz"}, {})
     assert len(fit_gyro(record, attitudes, coarse).residuals) == 29
+    index = np.arange(len(recording)) // 4 * 4  # a gyroscope read at a quarter of the rate of the log
+    slow = recording.with_columns({f"gyro_{a}": recording.columns[f"gyro_{a}"][index] for a in "xyz"}, {})
+    assert len(fit_gyro(record, attitudes, slow).residuals) == 29
 
 
 @pytest.mark.parametrize(

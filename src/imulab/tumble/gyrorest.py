@@ -23,7 +23,7 @@ _MARGIN = 0.1  # s
 _DEEPEST = 2.0  # s
 _MAD = 1.4826
 _SIGNIFICANT = 0.01
-_FLAT_TOP = 4  # samples in a row
+_FLAT_TOP = 4  # readings in a row
 _CUT_OFF = 3.0  # steps of the output
 _LATE = 0.3  # s
 
@@ -108,16 +108,19 @@ def clock_notes(holds: Holds, attitudes: Attitudes, time: Array) -> list[str]:
 def beyond_range(output: Array) -> NDArray[np.bool_]:
     """Return which samples lie in a flat top at the largest or smallest output of an axis, shape (n, 3).
 
-    Four in a row, cut off where the output was still changing: the top of a slow turn in coarse steps is none.
+    Four readings in a row, cut off where the output was still changing: the top of a slow turn in coarse steps is none,
+    nor are readings that are each logged several times.
     """
     clipped = np.zeros(output.shape, dtype=np.bool_)
     least = _CUT_OFF * _resolution(output)
     for axis, values in enumerate(output.T):
+        repeats = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(values) != 0, [True]])))
+        flat = _FLAT_TOP * float(np.median(repeats))
         for extreme in (values.max(), values.min()):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
             for start, stop in edges.reshape(-1, 2).tolist():
                 before, after = values[max(start - 1, 0)], values[min(stop, len(values) - 1)]
-                if stop - start >= _FLAT_TOP and max(abs(before - extreme), abs(after - extreme)) > least[axis]:
+                if stop - start >= flat and max(abs(before - extreme), abs(after - extreme)) > least[axis]:
                     clipped[start:stop, axis] = True
     return clipped
 
