@@ -167,6 +167,18 @@ def test_sensitivity_to_acceleration_is_found_from_rest(case):
     assert fit.cost < 0.1 * ignored.cost
 
 
+def test_a_zero_that_drifts_along_a_path_over_the_sphere_is_no_sensitivity():
+    """From face to face by neighbours, as a plan goes: the drift runs along with the direction of gravity."""
+    steps = np.linspace(0, np.pi, 20)
+    spiral = np.column_stack([np.sin(steps) * np.cos(7 * steps), np.sin(steps) * np.sin(7 * steps), np.cos(steps)])
+    recording = il.simulate_tumble(order=1, attitudes=spiral, seed=4)
+    attitudes = il.find_attitudes(recording)
+    record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
+    drift = 0.05 * recording.columns["time"] / recording.columns["time"][-1]
+    drifting = recording.with_columns({f"gyro_{a}": recording.columns[f"gyro_{a}"] + drift for a in "xyz"}, {})
+    assert fit_gyro(record, attitudes, drifting).sensitivity is None
+
+
 def test_the_record_holds_both_triads_and_corrects_both(case, tmp_path):
     recording, attitudes, record = case
     both = with_gyro(record, fit_gyro(record, attitudes, recording), recording, recording)

@@ -23,6 +23,7 @@ _MARGIN = 0.1  # s
 _DEEPEST = 2.0  # s
 _MAD = 1.4826
 _SIGNIFICANT = 0.01
+_QUIET = 0.75
 _FLAT_TOP = 4  # readings in a row
 _CUT_OFF = 3.0  # steps of the output
 _LATE = 0.3  # s
@@ -126,25 +127,40 @@ def beyond_range(output: Array) -> NDArray[np.bool_]:
 
 
 def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest:
-    """Zero and g-sensitivity from the mean still outputs of each hold, least squares over the holds."""
+    """Zero and g-sensitivity from the mean still outputs of each quiet hold, least squares over the holds.
+
+    Quiet is a hold that is still for three quarters of its samples; where fewer than half are, that half.
+    """
     edges = np.column_stack([holds.start, holds.stop]).ravel()
     kept = np.where(holds.still[:, None], np.column_stack([output, np.ones(len(output))]), 0.0)
     sums = np.add.reduceat(np.vstack([kept, np.zeros((1, 4))]), edges, axis=0)[::2]
-    mean = sums[:, :3] / sums[:, 3:]
+    fraction = sums[:, 3] / (holds.stop - holds.start)
+    quiet = fraction >= min(_QUIET, float(np.median(fraction)))
+    mean, force = (sums[:, :3] / sums[:, 3:])[quiet], force[quiet]
     n = len(mean)
+    middle = (holds.start + holds.stop)[quiet] / 2
+    when = (middle - middle.mean()) / max(float(np.ptp(middle)), 1.0)
     flat = mean - mean.mean(axis=0)
-    design = np.column_stack([np.ones(n), force])
-    solution = np.asarray(np.linalg.lstsq(design, mean, rcond=None)[0], dtype=np.float64)
-    left = mean - design @ solution
-    costs = float((flat**2).sum()), float((left**2).sum())
-    shown = n > 6 and f_test(costs[0], 3, costs[1], 12, 3 * n) < _SIGNIFICANT
+    # A zero that drifts goes with some direction of f by chance: held against, and found beside, a slope in time.
+    drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), force, when])
+    left = _left(whole, mean)
+    costs = float((_left(drift, mean) ** 2).sum()), float((left**2).sum())
+    shown = n > 7 and f_test(costs[0], 6, costs[1], 15, 3 * n) < _SIGNIFICANT
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
         scatter: Array = np.sqrt((flat**2).sum(axis=0) / (n - 1) / n)
         return Rest(mean.mean(axis=0), None, scatter, None)
-    spread: Array = np.sqrt((left**2).sum(axis=0) / max(n - 4, 1))
-    root = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    uncertainty: Array = spread[:, None] * root[1:]
-    return Rest(solution[0], solution[1:].T, spread * root[0], uncertainty)
+    solution = np.asarray(np.linalg.lstsq(whole, mean, rcond=None)[0], dtype=np.float64)
+    root = np.sqrt(np.diag(np.linalg.inv(whole.T @ whole)))
+    spread = np.sqrt((left**2).sum(axis=0) / max(n - 5, 1))
+    wander = np.sqrt((_left(whole[:, :4], mean) ** 2).sum(axis=0) / max(n - 4, 1))
+    uncertainty: Array = spread[:, None] * root[1:4]
+    return Rest(solution[0], solution[1:4].T, np.maximum(spread, wander) * root[0], uncertainty)
+
+
+def _left(design: Array, values: Array) -> Array:
+    """What a least-squares fit of each column leaves."""
+    left: Array = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    return left
 
 
 def _resolution(output: Array) -> Array:
