@@ -8,10 +8,12 @@ import pytest
 
 import madeup
 from conftest import REPOSITORY
+from imulab.arraytable import METHODS
 from imulab.exporters import export
 from imulab.exporters.c import _header
+from imulab.packing import pack
 from imulab.runtime import ArraySettings, Stream, Unit, array_table
-from imulab.tables import METHODS, MODELS, pack, tables_of
+from imulab.tables import MODELS, tables_of
 
 G = madeup.G
 MANY = 1_000_000

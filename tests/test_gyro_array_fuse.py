@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.arraytable import ArraySettings
 from imulab.blob import Blob, make_blob
 from imulab.gyro_array.fit import calibrate_array
 from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream, parse_memory
@@ -15,7 +16,7 @@ from imulab.gyro_array.model import METHODS, find_elements
 from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording
 from imulab.runtime import Stream
-from imulab.tables import ArraySettings, tables_of
+from imulab.tables import tables_of
 from reference import gyro_array as reference
 
 

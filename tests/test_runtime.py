@@ -10,9 +10,11 @@ import pytest
 
 import madeup
 from imulab import _runtime
+from imulab.arraytable import METHODS
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.packing import pack
 from imulab.runtime import ALONE, NOT_FINITE, ArraySettings, Stream, Unit, array_stream, array_table, fuse_table
-from imulab.tables import METHODS, pack, tables_of
+from imulab.tables import tables_of
 
 
 def readings(samples=600, elements=6, axes=1, seed=1):

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab import _runtime
+from imulab.arraytable import ArraySettings, array_table
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.packing import Table, pack
 from imulab.recording import Array
-from imulab.tables import ArraySettings, Table, array_table, pack
 
 NOT_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, BEYOND, ALONE = (1 << bit for bit in range(8))
 _STATE = b"imulab.stream 1\n"

@@ -332,8 +332,8 @@ class _InUnits:
 
 def _blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
     """Return the stream of an exported blob."""
+    from imulab.arraytable import ArraySettings
     from imulab.runtime import Stream
-    from imulab.tables import ArraySettings
 
     section = next((s for s in blob.text["sections"] if s["kind"] == "array"), None)
     if section is None:
