@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from imulab.calibration import Calibration
-from imulab.exhibit import Exhibits, Figure
+from imulab.exhibit import Exhibits, Figure, Table
 from imulab.files import write_text
 
 _TITLES = {
@@ -20,6 +21,7 @@ _TITLES = {
     "warmup": "Warm-up table",
     "centrifuge": "Centrifuge test",
 }
+_NUMBER = re.compile(r"[<>±+−-]?\s?[\d.]+(?![\w.-])|nan")
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
@@ -50,11 +52,18 @@ def render_page(
             warnings=warnings,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
+            columns_of_words=_columns_of_words,
             plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
             plotly=_plotly(),
             provenance=provenance,
         )
     )
+
+
+def _columns_of_words(table: Table) -> list[bool]:
+    """Return which columns hold no number, and stand better at the left."""
+    columns = ([row[n] for row in table.rows] for n in range(len(table.columns)))
+    return [any(c not in ("", "–") for c in cells) and not any(_NUMBER.match(c) for c in cells) for cells in columns]
 
 
 def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicted: list[tuple[str, str, str]]) -> str:
@@ -138,4 +147,8 @@ def _plain(value: Any) -> str:
             origin = f" ({value['from']})" if "from" in value else ""
             return f"{value['value']:.9g} {value['unit']}{origin}"
         return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
-    return str(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(item) for item in value if item != "") or "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "–" if value is None else str(value)
