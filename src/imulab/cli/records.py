@@ -103,8 +103,9 @@ def show(
     if formats:
         from imulab.cli.show import aligned
         from imulab.readers.formats import table
+        from imulab.readers.layout import EXAMPLE
 
-        print("\n".join(aligned(*table())))
+        print("\n".join([*aligned(*table()), "", "A layout (--layout FILE.toml):", "", EXAMPLE.rstrip("\n")]))
         return
     if not files:
         raise OptionError("show: expected a FILE, two records, or --formats")

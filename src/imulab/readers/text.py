@@ -214,12 +214,16 @@ class TextFile:
         """Take the comment lines and return the first line that is none."""
         while (line := self._line()) is not None:
             if line.startswith("#"):
-                key, colon, value = line.lstrip("# ").partition(":")
-                if colon and key.strip():
-                    self._metadata[key.strip()] = value.strip()
+                self._note(line)
             elif line.strip():
                 return line
         return None
+
+    def _note(self, comment: str) -> None:
+        """Keep a comment ``# key: value``; what a layout says goes before."""
+        key, colon, value = comment.lstrip("# ").partition(":")
+        if colon and key.strip() and not (self._layout and key.strip() in (self._layout.metadata or {})):
+            self._metadata[key.strip()] = value.strip()
 
     def _native_head(self) -> tuple[list[str], dict[str, str], np.ndarray]:
         line = self._comments()
@@ -232,7 +236,7 @@ class TextFile:
         if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
             raise ReadError(
                 f"{self._name}: line {self._lines_before}: expected titles such as 'time [s],accel_x [m/s^2]', "
-                "found numbers; describe a foreign file with --layout FILE.toml"
+                "found numbers; describe a foreign file with --layout FILE.toml (imulab show --formats has an example)"
             )
         titles, units = [], {}
         for title in line.split(","):
@@ -247,14 +251,15 @@ class TextFile:
 
     def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
         for _ in range(layout.skip_lines):
-            self._line()
+            line = self._line() or ""
+            if line.startswith("#"):
+                self._note(line)
         if layout.header:
-            header = self._line() or ""
-            present = [title.strip().strip('"') for title in _fields(header.lstrip("# "), layout.delimiter)]
+            present = self._layout_titles(layout)
         else:
             self._fill_line()
             while self._rest.startswith(b"#"):
-                self._line()
+                self._note(self._line() or "")
                 self._fill_line()
             first = self._rest.partition(b"\n")[0].decode("utf-8", "replace")
             present = [str(number) for number in range(len(_fields(first, layout.delimiter)))]
@@ -277,6 +282,16 @@ class TextFile:
                 raise ReadError(f"{self._name}: {layout.name} takes both {other} and {name} from column {origin}")
             slots[index] = slot
         return list(layout.columns), {name: c.unit for name, c in layout.columns.items()}, slots
+
+    def _layout_titles(self, layout: Layout) -> list[str]:
+        """Take the line of titles, which may itself begin with #; comments above it are kept."""
+        wanted = {column.origin for column in layout.columns.values() if isinstance(column.origin, str)}
+        while True:
+            line = self._line() or ""
+            titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), layout.delimiter)]
+            if not (wanted and line.startswith("#") and wanted.isdisjoint(titles)):
+                return titles
+            self._note(line)
 
     # --- rows --------------------------------------------------------------------------------------------------
 
