@@ -223,20 +223,22 @@ def test_the_headline_says_by_how_much_the_drift_is_not_linear(record):
 def test_the_table_of_runs_has_drift_and_uncertainty_of_each(record):
     table = next(item for item in exhibits_of(record).items if item.title == "Runs")
     assert table.columns == [
-        "run", "file", "cycle", "g", "sense", "table rate, deg/s", "periods", "X drift, deg/h", "u, deg/h",
-        "Y drift, deg/h", "u, deg/h", "FOG line, deg/h",
+        "run", "file", "cycle", "g", "sense", "table rate, deg/s", "periods", "X drift ± u, deg/h",
+        "Y drift ± u, deg/h", "FOG line, deg/h",
     ]  # fmt: skip
     assert "Table rates from: encoder." in table.caption
     loaded = [
         (row, run) for row, run in zip(table.rows, record.sections["runs"], strict=True) if run["role"] == "loaded"
     ]
     assert all(len(row) == len(table.columns) for row in table.rows)
+    assert [row[0] for row in table.rows] == [str(n) for n in range(1, len(table.rows) + 1)]  # as messages count
+    assert table.rows[0][3:6] == ["0", "static", "–"]
     for row, run in loaded:
         assert float(row[3]) == pytest.approx(run["specific_force"]["value"] / G, rel=1e-3)
         assert row[4] == f"{run['sense']:+d}"
         K = run["x"]["K"]
-        u = float(row[8])
-        assert float(row[7]) == pytest.approx(K["value"] * run["specific_force"]["value"] / DEG_H, abs=2 * u)
+        drift, u = map(float, row[7].split(" ± "))
+        assert drift == pytest.approx(K["value"] * run["specific_force"]["value"] / DEG_H, abs=2 * u)
         assert u == pytest.approx(np.sqrt(run["x"]["covariance"][0][0]) / DEG_H, rel=0.06)
 
 

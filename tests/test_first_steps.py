@@ -185,3 +185,14 @@ def test_another_instruments_file_gives_what_our_own_gives(imulab, tmp_path, rec
         assert theirs.parameters[name].value * per_unit == pytest.approx(
             parameter.value, abs=1e-3 * parameter.standard_uncertainty
         )
+
+
+@pytest.mark.parametrize("name", ["sheet.pdf", "picture.PNG"])
+def test_a_report_is_no_paper(imulab, tmp_path, recording, name):
+    il.write_csv(recording, tmp_path / "t.csv")
+    done = imulab("tumble", "fit", "t.csv", "--gravity", "9.81", "-o", "t.json", "--report", name)
+    assert done.returncode == 2
+    assert (
+        done.stderr == f"imulab: {name}: no such file is written; reports are HTML (.html), which any browser prints\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]

@@ -141,15 +141,13 @@ def run_table(record: Calibration) -> Table:
     columns = ["run", "file", *said, "g", "sense", "table rate, deg/s"]
     columns += ["from"] * (len(origins) > 1)
     columns += ["periods"]
-    for axis in axes:
-        columns += [f"{axis.upper()} drift, deg/h", "u, deg/h"]
-    columns += ["FOG line, deg/h"]
+    columns += [*(f"{axis.upper()} drift ± u, deg/h" for axis in axes), "FOG line, deg/h"]
     rows = []
     for index, run in enumerate(runs):
-        row = [str(index), run["file"]]
+        row = [str(index + 1), run["file"]]
         row += [str(run["power_cycle"] if name == "cycle" else run["spin_axis"]) for name in said]
         if run["role"] == "static":
-            rows.append([*row, "static", *["–"] * (len(columns) - len(row) - 1)])
+            rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])
             continue
         row += [
             f"{from_si(run['specific_force']['value'], 'g'):.4g}",
@@ -158,8 +156,7 @@ def run_table(record: Calibration) -> Table:
         ]
         row += [run["table_rate_from"]] * (len(origins) > 1)
         row += [f"{run['periods']:.0f}"]
-        for axis in axes:
-            row += _line(run[axis])
+        row += [" ± ".join(_line(run[axis])) for axis in axes]
         rows.append([*row, _line(run["fog"])[0]])
     source = f" Table rates from: {origins[0]}." if len(origins) == 1 else ""
     caption = (
