@@ -196,3 +196,13 @@ def test_a_report_is_no_paper(imulab, tmp_path, recording, name):
         done.stderr == f"imulab: {name}: no such file is written; reports are HTML (.html), which any browser prints\n"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_a_recording_before_its_record_is_named(imulab, tmp_path, recording):
+    il.write_csv(recording, tmp_path / "t.csv")
+    il.fit_tumble(il.find_attitudes(recording), order=1, gravity=9.81).calibration.save(tmp_path / "t.json")
+    done = imulab("apply", "t.csv", "t.json", "-o", "c.csv")
+    assert done.returncode == 2
+    assert done.stderr == "imulab: t.json: expected a recording as the last file, found a record: records go first\n"
+    done = imulab("report", "t.csv", "-o", "r.html")
+    assert done.stderr == "imulab: t.csv: not a calibration record: it is not JSON (a recording?)\n"
