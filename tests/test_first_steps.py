@@ -69,6 +69,22 @@ def test_who_is_told_to_write_a_layout_is_shown_one(imulab, tmp_path, content):
     assert "".join(f"    {line}\n" for line in EXAMPLE.splitlines()) in (DOCS / "recordings.md").read_text()
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"time [s] accel_x [g]\n0 1\n", "titles 'time [s] accel_x [g]': separated by blanks, expected ','"),
+        (b"time [s],accel_x [g],\n0,1,\n", "line 1: a column without a name (a comma at the end of the line?)"),
+        ("time [s],accel_x [g]\n0,1\n".encode("utf-16"), "expected text, found binary data (UTF-16? expected UTF-8)"),
+    ],
+)
+def test_what_a_spreadsheet_saved_is_named(tmp_path, content, message):
+    path = tmp_path / "f.csv"
+    path.write_bytes(content)
+    with pytest.raises((ReadError, UnitError)) as caught:
+        il.read(path)
+    assert str(caught.value).startswith(f"{path}: {message}")
+
+
 @pytest.mark.parametrize("skip_lines", [0, 1, 3])
 def test_comments_of_a_foreign_file_are_metadata(tmp_path, skip_lines):
     head = "# power_on_temperature: -20\n# serial: of the file\n# free text\n"

@@ -223,8 +223,8 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
 
 def _check_name(name: str, title: str, file: str) -> None:
     """Refuse what is meant as a name of the vocabulary but is not one."""
-    if ";" in title or "\t" in title:
-        mark = "';'" if ";" in title else "a tab"
+    if ";" in title or "\t" in title or title.count("[") > 1:
+        mark = "';'" if ";" in title else "a tab" if "\t" in title else "blanks"
         raise UnitError(
             f"{file}: titles {title.strip()[:40]!r}: separated by {mark}, expected ','; describe the file with "
             "--layout FILE.toml (imulab show --formats has an example)"

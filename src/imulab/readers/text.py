@@ -10,7 +10,7 @@ import hashlib
 import os
 import re
 import stat
-from codecs import BOM_UTF8
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -108,7 +108,8 @@ class TextFile:
         if not self._rest.strip():
             raise ReadError(f"{name}: the file is empty")
         if b"\0" in self._rest[:4096]:
-            raise ReadError(f"{name}: expected text, found binary data")
+            wide = " (UTF-16? expected UTF-8)" if self._rest.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ""
+            raise ReadError(f"{name}: expected text, found binary data{wide}")
         self._delimiter = layout.delimiter if layout else ","
         self._blanks = b" \r\n" if self._delimiter == "\t" else b" \t\r\n"
         self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
@@ -242,7 +243,8 @@ class TextFile:
         for title in line.split(","):
             name, unit = parse_column_title(title, self._name)
             if not name:
-                raise ReadError(f"{self._name}: line {self._lines_before}: a column without a name")
+                at_end = " (a comma at the end of the line?)" if line.rstrip().endswith(",") else ""
+                raise ReadError(f"{self._name}: line {self._lines_before}: a column without a name{at_end}")
             if name in units:
                 raise ReadError(f"{self._name}: line {self._lines_before}: column {name} appears twice")
             titles.append(name)
