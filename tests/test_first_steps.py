@@ -222,3 +222,27 @@ def test_a_recording_before_its_record_is_named(imulab, tmp_path, recording):
     assert done.stderr == "imulab: t.json: expected a recording as the last file, found a record: records go first\n"
     done = imulab("report", "t.csv", "-o", "r.html")
     assert done.stderr == "imulab: t.csv: not a calibration record: it is not JSON (a recording?)\n"
+
+
+def test_what_is_printed_of_a_recording_is_a_line(recording):
+    table = Recording(columns={"accel_x": np.ones(2), "x": np.ones(2)}, units={"accel_x": "g"}, name="t.csv")
+    assert repr(table) == "Recording(t.csv: 2 samples of accel_x [g], x [1])"
+    assert repr(il.find_attitudes(recording)) == "Attitudes(20 of simulated tumble, in m/s^2)"
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (
+            ["tumble", "plan", "--order", "1", "--attitudes", "20", "--from", "fixtur:15"],
+            "--from 'fixtur:15': expected sphere, fixture:15, head:15 (steps in deg) or a file of directions",
+        ),
+        (
+            ["centrifuge", "plan", "--levels", "1,2", "--uncertainty", "5"],
+            "uncertainty 5: expected 1e-07 to 1 of K (or percent, such as 0.8 %)",
+        ),
+    ],
+)
+def test_an_option_that_is_none_is_answered_with_those_there_are(imulab, command, message):
+    done = imulab(*command)
+    assert (done.returncode, done.stderr) == (2, f"imulab: {message}\n")

@@ -86,6 +86,10 @@ class Recording:
             check_unit(name, self.units.get(name, ""), self.name)
         object.__setattr__(self, "units", {name: self.units.get(name, "1") for name in self.columns})
 
+    def __repr__(self) -> str:
+        titles = ", ".join(f"{name} [{unit}]" for name, unit in self.units.items())
+        return f"Recording({self.name}: {len(self)} samples of {titles})"
+
     def __len__(self) -> int:
         for column in self.columns.values():
             return len(column)
