@@ -10,8 +10,9 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import RecordError
-from imulab.exhibit import Figure, Table, format_uncertain
+from imulab.exhibit import Exhibits, Figure, Table, format_uncertain
 from imulab.present import exhibits_of
+from imulab.report import render_page
 from reference import tumble as reference
 
 G = 9.80665
@@ -132,3 +133,10 @@ def test_engineering_units_of_the_parameter_table(record):
 )
 def test_values_are_written_to_the_second_digit_of_their_uncertainty(value, uncertainty, expected):
     assert format_uncertain(value, uncertainty) == expected
+
+
+def test_words_stand_at_the_left_and_long_ones_wrap():
+    rows = [["1", "a.csv", "-0.5 to 1", "few.csv: " + "too few attitudes " * 5, "–"], ["2", "12.csv", "–", "", "–"]]
+    shown = Table("T", "", ["run", "file", "interval", "reason", "none"], rows)
+    page = re.sub(r"<script>.*?</script>", "", render_page("T", "", Exhibits("", [], [shown])), flags=re.DOTALL)
+    assert re.findall("<td(.*?)>", page)[:5] == ["", ' class="words"', "", ' class="prose"', ""]

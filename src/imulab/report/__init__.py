@@ -21,6 +21,7 @@ _TITLES = {
     "warmup": "Warm-up table",
     "centrifuge": "Centrifuge test",
 }
+_LONG = 60
 _NUMBER = re.compile(r"[<>±+−-]?\s?[\d.]+(?![\w.-])|nan")
 
 
@@ -52,7 +53,7 @@ def render_page(
             warnings=warnings,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
-            columns_of_words=_columns_of_words,
+            column_kinds=_column_kinds,
             plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
             plotly=_plotly(),
             provenance=provenance,
@@ -60,10 +61,14 @@ def render_page(
     )
 
 
-def _columns_of_words(table: Table) -> list[bool]:
-    """Return which columns hold no number, and stand better at the left."""
-    columns = ([row[n] for row in table.rows] for n in range(len(table.columns)))
-    return [any(c not in ("", "–") for c in cells) and not any(_NUMBER.match(c) for c in cells) for cells in columns]
+def _column_kinds(table: Table) -> list[str]:
+    """Return for each column ``words`` or, where they are long, ``prose``; nothing where it holds numbers."""
+    found = []
+    for number in range(len(table.columns)):
+        cells = [row[number] for row in table.rows]
+        words = any(cell not in ("", "–") for cell in cells) and not any(_NUMBER.match(cell) for cell in cells)
+        found.append(("prose" if max(map(len, cells)) > _LONG else "words") if words else "")
+    return found
 
 
 def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicted: list[tuple[str, str, str]]) -> str:
