@@ -1,6 +1,7 @@
 """What a new user meets first: files of another instrument, slips of the pen, folders for files; what is said then."""
 
 import csv
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -246,3 +247,11 @@ def test_what_is_printed_of_a_recording_is_a_line(recording):
 def test_an_option_that_is_none_is_answered_with_those_there_are(imulab, command, message):
     done = imulab(*command)
     assert (done.returncode, done.stderr) == (2, f"imulab: {message}\n")
+
+
+def test_lists_of_commands_are_cut_nowhere(imulab):
+    groups = [[], ["tumble"], ["array"], ["warmup"], ["centrifuge"], ["fleet"]]
+    for group in groups:
+        lines = imulab(*group, "--help").stdout.split("Commands:\n")[1].splitlines()
+        assert all(re.fullmatch(r"  \w+ +[A-Z].*\.", line) for line in lines), lines
+        assert not any(line.endswith("...") for line in lines)
