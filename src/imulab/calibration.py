@@ -202,6 +202,8 @@ def loads(data: bytes, name: str) -> Calibration:
         content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
         reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
+        if not data.lstrip().startswith(b"{"):
+            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
         raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')

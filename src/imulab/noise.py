@@ -15,7 +15,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.recording import Array, Recording, check_finite, check_time
-from imulab.units import parse_unit
+from imulab.units import from_si, parse_unit
 
 _CHUNK = 1 << 14
 _DENSE_PER_DECADE = 24
@@ -26,6 +26,9 @@ _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
 """Correlation of estimates an octave apart; measured on white noise and random walk (.45 to .6), falling as its
 power."""
+_STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
+"""How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
+_NOISE_REACH = 20.0
 _SENSORS = ("gyro", "dtg", "fog", "accel")
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 
@@ -229,6 +232,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     check_finite(recording, names)
     columns: dict[str, Any] = {}
     for name in names:
+        notes += _motion_notes(recording, name, rate)
         unit = {"rate": "rad/s", "acceleration": "m/s^2"}.get(
             parse_unit(recording.units[name]).quantity, recording.units[name]
         )
@@ -253,6 +257,25 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         "warnings": [*(f"{recording.name}: {note}" for note in recording.notes), *notes],
         "columns": columns,
     }
+
+
+def _motion_notes(recording: Recording, name: str, rate: float) -> list[str]:
+    """Say where means over a second range farther than any zero drifts and than noise explains: the unit moved."""
+    quantity = parse_unit(recording.units[name]).quantity
+    if quantity not in _STILL:
+        return []
+    size = max(1, round(rate))
+    samples = recording.si(name)
+    means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
+    reach = float(np.ptp(means)) if means.size else 0.0
+    noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
+    limit, unit = _STILL[quantity]
+    if reach <= max(limit, _NOISE_REACH * noise):
+        return []
+    return [
+        f"{recording.name}: column {name}: its means over a second range over {from_si(reach, unit):.3g} {unit}: did "
+        "the unit move? Then these are the coefficients of its motion, not of its noise"
+    ]
 
 
 def coefficients_dict(found: NoiseCoefficients, unit: str) -> dict[str, Any]:

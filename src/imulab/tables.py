@@ -201,13 +201,14 @@ def _array(record: Calibration) -> tuple[Table, ...]:
             [e["matrix"]["value"] if "matrix" in e else [[1 / e["scale_factor"]["value"]]] for e in elements]
         )
         white = np.sqrt(np.einsum("nab,bn->an", matrices**2, white**2))
+    inverse = 1 / np.maximum(white, 1e-300) ** 2
     settings = ArraySettings(
         "robust",
         len(elements),
         axes,
         bias=np.array([np.atleast_1d(element["bias"]["value"]) for element in elements]).T,
         matrices=matrices,
-        weights=1 / np.maximum(white, 1e-300) ** 2 / np.mean(1 / np.maximum(white, 1e-300) ** 2),
+        weights=inverse / inverse.sum(axis=1, keepdims=True),
         rate=float(record.fit["sample_rate"]["value"]),
     )
     table = array_table(settings)
