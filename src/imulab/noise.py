@@ -24,8 +24,7 @@ _LONGEST = 5  # coefficients are read from averaging times up to this part of th
 _GAP = 1.5
 _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
-"""Correlation of estimates an octave apart; measured on white noise and random walk (.45 to .6), falling as its
-power."""
+"""Of estimates an octave apart, measured on white noise and random walk (.45 to .6); falls as its power."""
 _SENSORS = ("gyro", "dtg", "fog", "accel")
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 
@@ -206,9 +205,8 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
         return (len(time) - 1) / float(time[-1] - time[0]), []
     worst = int(wide[np.argmax(step[wide])])
     return 1 / usual, [
-        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest "
-        f"{step[worst]:.3g} s after "
-        f"{recording.place(worst)}; the samples on both sides are taken as neighbours"
+        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
+        f"after {recording.place(worst)}; the samples on both sides are taken as neighbours"
     ]
 
 

@@ -43,8 +43,7 @@ class Clock:
         if self.last is not None and not time[0] > self.last:
             raise DataError(
                 f"{block.name}: {block.place(0)}, column time: time runs backwards: expected more than "
-                f"{self.last:.15g} s, "
-                f"found {time[0]:.15g} s"
+                f"{self.last:.15g} s, found {time[0]:.15g} s"
             )
         known = time if self.last is None else np.concatenate([[self.last], time])
         step = np.diff(known)
@@ -158,8 +157,8 @@ def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]
             index = int(np.argmax(apart))
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: the clocks disagree: "
-                f"{own[number][index]:.9g} s "
-                f"where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s apart"
+                f"{own[number][index]:.9g} s where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s "
+                "apart"
             )
     return own
 
