@@ -280,6 +280,21 @@ def test_gaps_are_reported_with_place_and_length_and_fusion_goes_on():
     np.testing.assert_array_equal(ours.rate, fuse(recording).rate)
 
 
+def test_a_time_in_whole_milliseconds_has_no_gaps():
+    # 700 Hz: steps of 1 and 2 ms. One sample in a hundred missing at 100 Hz: that is a gap.
+    recording = array_recording(np.random.default_rng(1).standard_normal((7000, 4)))
+    coarse = recording.with_columns({"time": np.round(np.arange(7000) / 0.7)}, {"time": "ms"})
+    fuser = Fuser(FuseOptions())
+    list(fuser.fuse([coarse]))
+    assert fuser.notes() == []
+    assert fuser.clock.rate == pytest.approx(700, rel=0.1)
+    holes = np.delete(np.arange(7000) * 10.0, np.arange(50, 7000, 100))
+    kept = {n: c[: len(holes)] for n, c in recording.columns.items()} | {"time": holes}
+    fuser = Fuser(FuseOptions())
+    list(fuser.fuse([Recording(kept, recording.units | {"time": "ms"}, name="a.csv")]))
+    assert fuser.notes()[-1] == "a.csv: 67 more gaps; 1.4 s in all 70 together"
+
+
 def test_elements_on_clocks_of_their_own_are_brought_to_one():
     time = np.arange(3000) / 50
     rng = np.random.default_rng(4)
@@ -357,7 +372,9 @@ def test_memory_is_growing_or_a_gain(text, memory):
     assert parse_memory(text) == memory
 
 
-@pytest.mark.parametrize("text", ["0", "1", "-0.1", "nan", "inf", "growing:0", "growing:x", "fading", ""])
+@pytest.mark.parametrize(
+    "text", ["0", "1", "-0.1", "nan", "inf", "growing:0", "growing:99999999999", "growing:x", "fading", ""]
+)
 def test_other_memories_are_refused(text):
     from imulab.errors import OptionError
 

@@ -22,6 +22,7 @@ _DENSE_PER_DECADE = 24
 _FEWEST = 3
 _LONGEST = 5  # coefficients are read from averaging times up to this part of the recording
 _GAP = 1.5
+_COARSE = 0.2
 _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
 """Of estimates an octave apart, measured on white noise and random walk (.45 to .6); falls as its power."""
@@ -185,6 +186,19 @@ def noise_columns(recording: Recording) -> Iterator[str]:
     return (name for name in recording.columns if name.split("_")[0] in _SENSORS)
 
 
+def usual_step(step: Array) -> tuple[float, float]:
+    """Return the usual step of time, s, and the longest that is no gap, from steps of time, shape (n,), n >= 1.
+
+    Beyond 1.5 times the median a step is a gap, unless a fifth of all steps are: then time is written that coarsely
+    (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
+    fifth exceed. The usual step is the mean of those that are no gaps.
+    """
+    longest = _GAP * float(np.median(step))
+    if np.mean(step > longest) > _COARSE:
+        longest = _GAP * float(np.quantile(step, 1 - _COARSE))
+    return float(step[step <= longest].mean()), longest
+
+
 def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     """Return the sampling rate, Hz, of a recording, and what there is to say of gaps in its time.
 
@@ -199,8 +213,8 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     if len(time) < _FEWEST:
         raise DataError(f"{recording.name}: {len(time)} samples are too few; expected at least {_FEWEST}")
     step = np.diff(time)
-    usual = float(np.median(step))
-    wide = np.flatnonzero(step > _GAP * usual)
+    usual, longest = usual_step(step)
+    wide = np.flatnonzero(step > longest)
     if not wide.size:
         return (len(time) - 1) / float(time[-1] - time[0]), []
     worst = int(wide[np.argmax(step[wide])])

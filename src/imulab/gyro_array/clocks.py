@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imulab.errors import DataError
+from imulab.noise import usual_step
 from imulab.recording import Array, Recording, check_finite, check_time
 
 _GAP = 1.5
@@ -50,8 +51,8 @@ class Clock:
         if len(self.steps) < _TO_ESTIMATE:
             self.steps += step[: _TO_ESTIMATE - len(self.steps)].tolist()
         if self.steps:
-            usual = 1 / self.rate
-            wide = np.flatnonzero(step > _GAP * usual)
+            longest = usual_step(np.array(self.steps))[1] if self.nominal is None else _GAP / self.nominal
+            wide = np.flatnonzero(step > longest)
             for index in wide.tolist():
                 self.count += 1
                 self.total += float(step[index])
@@ -67,7 +68,7 @@ class Clock:
         """Sampling rate, Hz: as given, or from the first steps of time; 100 while there are none."""
         if self.nominal is not None:
             return self.nominal
-        return 1 / float(np.median(self.steps)) if self.steps else 100.0
+        return 1 / usual_step(np.array(self.steps))[0] if self.steps else 100.0
 
     @property
     def settled(self) -> bool:
