@@ -361,6 +361,30 @@ def test_the_real_array_reaches_its_split_half_figures(real_data, capsys):
     np.testing.assert_allclose(found["mean"], [0.197, 0.174, 0.103], atol=0.002)
 
 
+def test_a_jump_in_the_real_array_reaches_the_mean_and_not_robust(real_data):
+    # Gyro 4 steps by -0.12 deg/s about z at 46 to 80 s. An eighth of it is 0.42 deg over the 28 s at rest.
+    whole = il.read(real_data / "mimu4444" / "exp_1.bin")
+
+    def part(start, stop):
+        here = (whole.time >= start) & (whole.time < stop)
+        return Recording({n: c[here] for n, c in whole.columns.items()}, whole.units, name="part")
+
+    def angle(method, record, start):
+        fused = fuse(part(start, 495.93), FuseOptions(method=method, calibration=record))
+        if method == "robust" and start == 0.0:
+            jumped = (fused.flags[:, 2] & 8 > 0) & (fused.time < 460.0)[:, None]
+            assert np.flatnonzero(jumped.any(axis=0)).tolist() == [3]
+            assert fused.time[jumped[:, 3]][0] == pytest.approx(75.3, abs=0.1)
+        return abs(fused.rate[fused.time >= 467.7, 2].sum() / 62.5)
+
+    before = calibrate_array(part(0.0, 19.0), whole).calibration
+    assert angle("mean", before, 0.0) == pytest.approx(1.12, abs=0.02)
+    assert angle("robust", before, 0.0) == pytest.approx(1.12 - 0.42, abs=0.05)
+    after = calibrate_array(part(468.5, 495.5), whole).calibration
+    assert angle("robust", after, 0.0) == pytest.approx(0.42, abs=0.05)
+    assert angle("robust", after, 300.0) < 0.05
+
+
 # ---- options --------------------------------------------------------------------------------------------------------
 
 
