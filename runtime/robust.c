@@ -213,7 +213,7 @@ static void judge(const il_array *a, il_array_axis *s, const sample *p) {
 }
 
 /* Inverse-variance weights of the gyros used, none above the cap; two count alike, one passes through. */
-void il_robust_weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t used) {
+static void weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t used) {
     il_real total = IL_C(0.0), most = IL_C(0.0);
     int32_t top = 0;
     for (int32_t i = 0; i < a->elements; i++) {
@@ -361,7 +361,7 @@ static il_real look_closely(const il_array *a, il_array_axis *s, const il_real *
         for (int32_t i = 0; i < a->elements; i++) s->weight[i] = IL_C(0.0);
         return il_nan();
     }
-    il_robust_weigh(a, s, p, used);
+    weigh(a, s, p, used);
     for (int32_t i = 0; i < a->elements; i++) {
         rate += p->used[i] ? s->weight[i] * p->r[i] : IL_C(0.0);
         pupils += p->learns[i];
@@ -415,8 +415,7 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         for (int32_t i = 0; i < a->elements; i++) il_count(&s->seen[i]);
     }
     if (want_health) {
-        il_real scale = IL_C(1.0) / p.total;
-        for (int32_t i = 0; i < a->elements; i++) s->weight[i] *= scale;
+        for (int32_t i = 0; i < a->elements; i++) s->weight[i] /= p.total;
         memset(s->flags, 0, (size_t)a->elements);
     }
     il_robust_learn(a, t, s, &p);

@@ -95,8 +95,7 @@ static inline il_real drawn(il_real variance, il_real pull, il_real usual) {
     return variance + pull * (usual - variance);
 }
 
-/* robust.c: inverse-variance weights of the gyros used; jumps that are too small for the gate. */
-void il_robust_weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t used);
+/* robust.c: jumps that are too small for the gate. */
 void il_robust_find_small_jumps(const il_array *a, il_array_axis *s, sample *p);
 
 /* robust.c: decide whether the next sample may go the short way; bring the counts of each gyro up to date. */

@@ -82,6 +82,21 @@ static void compare(int32_t n, il_real gate, il_real floor, const il_real *restr
     p->bent = larger(bent[0], bent[1]);
 }
 
+/* Hold the largest weight to the cap. */
+static void hold(const il_array *a, il_real *weight, sample *p) {
+    il_real others = IL_C(0.0), rate = IL_C(0.0);
+    int32_t top = 0;
+    while (weight[top] < p->top) top++;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (i == top) continue;
+        others += weight[i];
+        rate += weight[i] * p->r[i];
+    }
+    weight[top] = a->weight_cap / (IL_C(1.0) - a->weight_cap) * others;
+    p->total = others + weight[top];
+    p->rate = (rate + weight[top] * p->r[top]) / p->total;
+}
+
 /* Biases, variances, means of a second. Returns by how much one of these is beyond what shows that none has jumped. */
 static il_real teach(int32_t n, const il_robust_terms *restrict t, const sample *restrict p, const il_real *restrict r,
                      const il_real *restrict gain, const il_real *restrict trusted, il_real *restrict bias,
@@ -117,13 +132,7 @@ int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axi
     experience(a, s, p);
     const il_real floor = larger(a->weight_floor * p->mean_variance, IL_TINY);
     compare(n, t->gate, floor, p->r, s->variance, s->ratio, p->pull, p->trust, s->weight, p);
-    if (p->top > a->weight_cap * p->total) {
-        memset(p->used, 1, sizeof p->used);
-        il_robust_weigh(a, s, p, n);
-        p->total = IL_C(1.0);
-        p->rate = IL_C(0.0);
-        for (int32_t i = 0; i < n; i++) p->rate += s->weight[i] * p->r[i];
-    }
+    if (p->top > a->weight_cap * p->total) hold(a, s->weight, p);
     const il_real apart = p->middle - p->rate, room = IL_C(2.0) * t->gate * p->mean_variance - p->squares;
     return (p->outside <= room * t->share) & (p->bent + IL_C(5.0) * apart * apart <= IL_C(0.0));
 }
