@@ -28,6 +28,7 @@ typedef IMULAB_REAL il_real;
 #ifndef IL_ARRAY_ELEMENTS
 #define IL_ARRAY_ELEMENTS 32
 #endif
+#define IL_ARRAY_ROOM (IL_ARRAY_ELEMENTS / 2 * 2 + 2) /* taken two at a time */
 
 typedef enum {
     IL_OK = 0,
@@ -187,12 +188,14 @@ typedef struct {
     il_real resolution;                     /* robust: smallest change of a reading seen, 0 before any */
     uint32_t count;                         /* samples so far, from settings.start on */
     uint32_t still;                         /* zero-rate updates so far */
-    il_real bias[IL_ARRAY_ELEMENTS];        /* estimated */
-    il_real variance[IL_ARRAY_ELEMENTS];    /* of the noise, estimated */
-    il_real weight[IL_ARRAY_ELEMENTS];      /* in the last fused sample */
+    uint32_t clean;                         /* robust: samples not yet counted in seen, compared, changed */
+    uint32_t well;                          /* robust: not 0 while no gyro is under suspicion */
+    il_real bias[IL_ARRAY_ROOM];        /* estimated */
+    il_real variance[IL_ARRAY_ROOM];    /* of the noise, estimated */
+    il_real weight[IL_ARRAY_ROOM];      /* in the last fused sample */
     il_real last[IL_ARRAY_ELEMENTS];        /* last finite reading */
-    il_real ratio[IL_ARRAY_ELEMENTS];       /* variance by calibration, in mean variances */
-    il_real fast[IL_ARRAY_ELEMENTS];        /* mean residual of the last second or so */
+    il_real ratio[IL_ARRAY_ROOM];       /* variance by calibration, in mean variances */
+    il_real fast[IL_ARRAY_ROOM];        /* mean residual of the last second or so */
     il_real away_mean[IL_ARRAY_ELEMENTS];   /* of a run of gated readings, */
     il_real away_square[IL_ARRAY_ELEMENTS]; /* and the sum of squares about it */
     uint32_t seen[IL_ARRAY_ELEMENTS];       /* residuals learnt from */
