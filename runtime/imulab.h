@@ -138,6 +138,7 @@ typedef struct {
     il_real rate[3];         /* per tick: of u, or of t / tau0; or the exponents -tick / time_constant */
     il_real log_scale;       /* 1 / log(1 + T_M / tau0) */
     uint32_t settled, ended; /* ticks at T_M, and at the end of the taper */
+    uint32_t span;           /* ticks, a power of two: exp and log1p are led on from multiples of it by a series */
 } il_warmup_state;
 
 /* Once, at power-on: pick the row. Outside the table, or for a temperature that is no number, nothing is corrected. */
@@ -146,9 +147,10 @@ il_status il_warmup_start(const il_warmup *settings, il_warmup_state *state, il_
 /* The bias of every axis, `ticks` ticks (of the length given at start) after power-on. */
 void il_warmup_bias(const il_warmup *settings, const il_warmup_state *state, uint32_t ticks, il_real *bias);
 
-/* Subtract it from n samples: axis i of sample k is output[i][k]; output[i] may be NULL. */
+/* n samples less their bias: output[i][k] = input[i][k] - factor[i] * bias of axis i. `factor`, by which columns in other
+ * units are larger, may be NULL: 1. output[i] may be input[i], or NULL for an axis that is not there. */
 void il_warmup_block(const il_warmup *settings, const il_warmup_state *state, size_t n, const uint32_t *ticks,
-                     il_real *const *output);
+                     const il_real *const *input, const il_real *factor, il_real *const *output);
 
 /* ---- gyro array: n gyros per axis, one or three axes, to one rate ------------------------------------------------- */
 
