@@ -244,7 +244,5 @@ def _row(store: Store, unit: Unit) -> Row:
     reason = store.reason(unit.serial)
     if reason is not None:
         return Row(unit, FAILED, reason, None)
-    record = store.made_for(unit)
-    if record is None:
-        return Row(unit, "missing", "", None)
-    return Row(unit, DONE, "", summarise(record, record.to_dict()))
+    there = store.made_for(unit)
+    return Row(unit, "missing", "", None) if there is None else Row(unit, DONE, "", summarise(*there))
