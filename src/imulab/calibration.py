@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -115,10 +115,13 @@ class Calibration:
             "sensor": dict(self.sensor),
             "created": self.created,
             "software": self.software,
-            "sources": [asdict(source) for source in self.sources],
+            "sources": [{"file": source.file, "sha256": source.sha256} for source in self.sources],
             "model": self.model,
-            "parameters": {name: asdict(parameter) for name, parameter in self.parameters.items()},
-            "covariance": asdict(self.covariance),
+            "parameters": {
+                name: {"value": p.value, "standard_uncertainty": p.standard_uncertainty, "unit": p.unit}
+                for name, p in self.parameters.items()
+            },
+            "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},
             "options": self.options,
             "fit": self.fit,
             "warnings": list(self.warnings),
@@ -260,13 +263,16 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
 
 def plain_values(value: Any, where: str) -> Any:
     """Return `value` as plain JSON types; refuse numbers that are not finite."""
+    kind = type(value)
+    if kind is str or value is None or (kind is float and math.isfinite(value)):
+        return value  # as most are
     if isinstance(value, np.ndarray):
         value = value.tolist()
     elif isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         raise RecordError(f"record: {where.lstrip('.')} is {value}; a record holds finite numbers only")
-    if isinstance(value, Mapping):
+    if kind is dict or isinstance(value, Mapping):
         return {str(key): plain_values(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
         if all_floats(value) and all(map(math.isfinite, value)):

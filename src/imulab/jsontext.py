@@ -72,7 +72,13 @@ def _texts(value: Any, line: str) -> tuple[str, str]:
             return f"[{numbers}]", f"[{inner}{numbers.replace(',', ',' + inner)}{line}]"
         each = [_texts(item, inner) for item in value]
         return f"[{','.join([a for a, _ in each])}]", f"[{inner}{(',' + inner).join([b for _, b in each])}{line}]"
-    text = float.__repr__(value) if type(value) is float else json.dumps(value, ensure_ascii=False, allow_nan=False)
+    kind = type(value)
+    if kind is str:
+        text = _string(value)
+    elif kind is float:
+        text = float.__repr__(value)
+    else:
+        text = "null" if value is None else json.dumps(value, ensure_ascii=False, allow_nan=False)
     return text, text
 
 
