@@ -15,7 +15,9 @@ from imulab.errors import ImulabError
 from imulab.fleet.display import display_of, to_parameter_unit
 from imulab.fleet.history import Past
 from imulab.fleet.limits import Limits, load_limits
-from imulab.fleet.run import run_fleet
+from imulab.fleet.manifest import FleetManifest
+from imulab.fleet.report import fleet_exhibits
+from imulab.fleet.run import FleetState, run_fleet
 from imulab.fleet.statistics import (
     capability,
     change_limit,
@@ -58,9 +60,25 @@ def test_a_unit_far_off_stands_out_and_does_not_hide_itself():
 
 
 def test_equal_values_and_few_units_stand_out_nowhere():
-    for values in ([1.0] * 20 + [1.5], [1.0, 2.0, 9.0], [4.0]):
+    for values in ([1.0] * 21, [1.0, 2.0, 9.0], [4.0]):
         (item,) = line_statistics([summary(str(i), v) for i, v in enumerate(values)], {})
         assert not item.outliers.any()
+
+
+def test_a_unit_among_equal_ones_stands_out_by_the_mean_distance():
+    values = [1.0] * 20 + [-1.0]  # the median distance is zero
+    (item,) = line_statistics([summary(str(i), v) for i, v in enumerate(values)], {})
+    assert item.robust_deviation == pytest.approx(math.sqrt(math.pi / 2) * 2 / 21, rel=1e-14)
+    assert np.flatnonzero(item.outliers).tolist() == [20]
+
+
+def test_few_units_of_a_procedure_have_a_table_and_no_distribution():
+    items = line_statistics([summary(str(i), float(i)) for i in range(3)], {})
+    state = FleetState("d", FleetManifest("m.csv", ".", ()), ())
+    assert [type(item).__name__ for item in fleet_exhibits(state, items, []).items] == ["Table"]
+    more = line_statistics([summary(str(i), float(i)) for i in range(4)], {})
+    found = [type(item).__name__ for item in fleet_exhibits(state, more, []).items]
+    assert found == ["Figure", "Table", "Figure"]
 
 
 @pytest.mark.slow

@@ -79,7 +79,8 @@ def run(
     else:
         made = state.count("done") - state.kept
         kept = f", {state.kept} were there already" if state.kept else ""
-        print(f"{len(state.rows)} units: {made} done{kept}, {state.count('failed')} failed, {state.seconds:.1f} s")
+        units = "1 unit" if len(state.rows) == 1 else f"{len(state.rows)} units"
+        print(f"{units}: {made} done{kept}, {state.count('failed')} failed, {state.seconds:.1f} s")
         print("\n".join([*_failures(state), f"records: {output}", f"table: {table or f'{output}/parameters.csv'}"]))
         warned = sum(bool(row.summary and row.summary.warnings) for row in state.rows)
         if warned:

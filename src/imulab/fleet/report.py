@@ -12,7 +12,7 @@ from imulab.files import write_text
 from imulab.fleet import figures
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
-from imulab.fleet.run import FleetState, default_history, fleet_state
+from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_state, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
     Change,
     ParameterStatistics,
@@ -21,8 +21,11 @@ from imulab.fleet.statistics import (
     line_statistics,
     parameter_units,
 )
+from imulab.fleet.store import Store
 from imulab.report import render_page
 
+_FEWEST_TO_DRAW = 4
+"""Fewer units have no distribution: the table says all there is."""
 _TITLES = {"tumble": "Tumble", "array": "Gyro array", "warmup": "Warm-up", "centrifuge": "Centrifuge"}
 
 
@@ -44,6 +47,7 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
         The folder, the limits or the history cannot be used, or there is no record yet.
     """
     state = fleet_state(folder)
+    refuse_overwriting([Path(output)], {**own_files(Store(Path(folder)), state.manifest), **read_by(state.manifest)})
     found = [row.summary for row in state.rows if row.summary is not None]
     if not found:
         raise OptionError(f"{folder}: no records yet: {state.count('failed')} units failed, the others are missing")
@@ -97,10 +101,11 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = _TITLES.get(procedure, procedure)
         mine = [item for item in statistics if item.procedure == procedure]
+        enough = max(len(item.values) for item in mine) >= _FEWEST_TO_DRAW
         items += [
-            figures.distributions(title, mine),
+            figures.distributions(title, mine) if enough else None,
             figures.summary_table(title, mine),
-            figures.over_date(title, mine),
+            figures.over_date(title, mine) if enough else None,
             figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
         ]
     items += [figures.outlier_table(statistics), figures.change_table(changes)]
@@ -111,10 +116,10 @@ def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
     if url == "none":
         return None
     if url is None:
-        if not (Path(folder) / "history.sqlite").is_file():
+        if not (Path(folder) / HISTORY).is_file():
             return None
         url = default_history(folder)
-    return stack.enter_context(open_history(url))
+    return stack.enter_context(open_history(url, there=True))
 
 
 def _warnings(state: FleetState) -> list[str]:
