@@ -2,6 +2,9 @@
 
 import csv
 
+import pytest
+
+import imulab as il
 from fleets import make_fleet, records, write_manifest
 from imulab.fleet.run import run_fleet
 
@@ -85,3 +88,33 @@ def test_records_of_another_version_are_kept_and_said(tmp_path, monkeypatch):
     (note,) = state.notes
     assert note.startswith("2 records of another version (imulab 0.")
     assert note.endswith("use another folder")
+
+
+def test_a_simulated_line_is_found_as_it_was_made(imulab, tmp_path):
+    done = imulab("fleet", "simulate", "-o", "line", "--units", 10, "--seed", 3)
+    assert done.stdout == "manifests: line/first.csv line/second.csv\nlimits: line/limits.toml\n"
+    for name in ("first", "second"):
+        assert run(tmp_path / "line" / f"{name}.csv", tmp_path / "out").count("done") == 10
+    for number in range(1, 11):
+        truth = il.read(tmp_path / "line" / f"second_{number:04d}.csv").metadata
+        record = il.load(tmp_path / "out" / f"LINE-{number:04d}.json")
+        assert record.sections["fleet"]["date"] == truth["date"]
+        for name, parameter in record.parameters.items():
+            assert abs(parameter.value - float(truth[f"truth_{name}"])) < 5 * parameter.standard_uncertainty
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--units", "7"], "units 7: expected 8 to 2000"),
+        (["--units", "many"], "--units 'many': expected a whole number"),
+        (["--seed", "-1"], "seed -1: expected a whole number from 0"),
+        (["-o", ""], "output '': expected the name of a folder to write to"),
+        (["-o", "file/line"], "file/line: the folder cannot be made: Not a directory"),
+    ],
+)
+def test_a_line_that_cannot_be_is_refused(imulab, tmp_path, arguments, message):
+    (tmp_path / "file").write_text("")
+    done = imulab("fleet", "simulate", "-o", "line", *arguments)
+    assert (done.returncode, done.stderr) == (2, f"imulab: {message}\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -22,6 +22,7 @@ from imulab.fleet.statistics import (
     parameter_units,
 )
 from imulab.fleet.store import Store
+from imulab.fleet.work import Summary
 from imulab.report import render_page
 
 _FEWEST_TO_DRAW = 4
@@ -48,15 +49,7 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
     """
     state = fleet_state(folder)
     refuse_overwriting([Path(output)], {**own_files(Store(Path(folder)), state.manifest), **read_by(state.manifest)})
-    found = [row.summary for row in state.rows if row.summary is not None]
-    if not found:
-        raise OptionError(f"{folder}: no records yet: {state.count('failed')} units failed, the others are missing")
-    known = {} if limits is None else load_limits(limits, parameter_units(found))
-    statistics = line_statistics(found, known)
-    with ExitStack() as stack:
-        past = _history(folder, history, stack)
-        changes = [] if past is None else changes_since(found, past.of([summary.serial for summary in found]))
-    exhibits = fleet_exhibits(state, statistics, changes)
+    exhibits, found = _exhibits(state, limits, history)
     provenance = [
         ("folder", folder),
         ("manifest", state.manifest.name),
@@ -68,6 +61,26 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
     write_text(
         output, render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, warnings=_warnings(state))
     )
+
+
+def exhibits_of_folder(folder: str, *, limits: str | None = None, history: str | None = None) -> Exhibits:
+    """Return what the report of a fleet's folder shows; options and errors as for `write_fleet_report`."""
+    return _exhibits(fleet_state(folder), limits, history)[0]
+
+
+def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tuple[Exhibits, list[Summary]]:
+    """Return what the report shows, and the summaries that it is made of."""
+    found = [row.summary for row in state.rows if row.summary is not None]
+    if not found:
+        raise OptionError(
+            f"{state.folder}: no records yet: {state.count('failed')} units failed, the others are missing"
+        )
+    known = {} if limits is None else load_limits(limits, parameter_units(found))
+    statistics = line_statistics(found, known)
+    with ExitStack() as stack:
+        past = _history(state.folder, history, stack)
+        changes = [] if past is None else changes_since(found, past.of([summary.serial for summary in found]))
+    return fleet_exhibits(state, statistics, changes), found
 
 
 def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics], changes: Sequence[Change]) -> Exhibits:
@@ -86,10 +99,9 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
     said = [f"{state.count('done')} of {len(state.rows)} units have their record"]
     if state.failures:
         said.append(f"{len(state.failures)} failed")
-    said.append(f"{len(out)} stand out in some parameter" if out else "none stands out")
+    said.append(f"{_named(sorted(out))} {'stands' if len(out) == 1 else 'stand'} out" if out else "none stands out")
     if drifting:
-        some = ", ".join(drifting[:4]) + (" and others" if len(drifting) > 4 else "")
-        said.append(f"{some} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
+        said.append(f"{_named(drifting)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
     if capable:
         worst = min(capable, key=lambda item: item.capability.cpk if item.capability else 0.0)
         if worst.capability is not None:
@@ -97,6 +109,8 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
             said.append(f"the smallest Cpk is {worst.capability.cpk:.2f} ({worst.name})")
     if fresh:
         facts.append(("changed since last", str(len(moved))))
+    if moved:
+        said.append(f"{_named(sorted(moved))} changed since the last calibration")
     items: list[Figure | Table | None] = [figures.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = _TITLES.get(procedure, procedure)
@@ -110,6 +124,10 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
         ]
     items += [figures.outlier_table(statistics), figures.change_table(changes)]
     return Exhibits("; ".join(said) + ".", facts, [item for item in items if item is not None])
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
