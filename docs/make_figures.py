@@ -102,6 +102,7 @@ def main() -> None:
         folder = Path(name).resolve()
         run(folder, commands)
         screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 930)
+        screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 1075)
         first_figure(folder, "array.json", "gyro_array")
         first_figure(folder, "warmup.json", "warmup")
         centrifuge(folder)

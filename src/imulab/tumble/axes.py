@@ -55,9 +55,11 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
         return
     bias = np.mean([rate[a:b].mean(axis=0) for a, b, _ in pieces], axis=0)
     turn = frame_rotations(rate - bias, time, start[short], stop[short])
-    mirrored = frame_rotations(bias - rate, time, start[short], stop[short])
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     before, after = up[:-1][short], up[1:][short]
+    if not _median_miss(turn, before, after) > _WRONG:
+        return
+    mirrored = frame_rotations(bias - rate, time, start[short], stop[short])
     miss = {name: _median_miss(turn, before @ m.T, after @ m.T) for name, m in _signed_permutations().items()}
     miss |= {
         f"{name} and the gyroscopes all reversed": _median_miss(mirrored, before @ m.T, after @ m.T)
@@ -65,7 +67,7 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
     }
     # Reversing all three axes of gravity changes nothing: of two equals, the one with fewer reversals is meant.
     best = min(miss, key=lambda name: (round(miss[name], 9), name.count("-")))
-    if miss["x y z"] > _WRONG and miss[best] < _RIGHT:
+    if miss[best] < _RIGHT:
         raise DataError(
             f"{recording.name}: columns accel_x accel_y accel_z: axes swapped or reversed: between attitudes the "
             f"direction of gravity misses the turn of gyro_x gyro_y gyro_z by {np.degrees(miss['x y z']):.0f} deg "

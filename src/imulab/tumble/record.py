@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -113,7 +113,7 @@ def make_record(
             "rank": observability.rank,
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
-            "orders": [asdict(row) for row in orders],
+            "orders": [dict(vars(row)) for row in orders],
             **_propagated(monte_carlo, scaling, g, order),
             **_prior_shares(prior, problem, covariance),
         },
