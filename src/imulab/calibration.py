@@ -51,6 +51,11 @@ class Covariance:
         """Return the matrix, shape (p, p)."""
         return np.array(self.matrix, dtype=np.float64).reshape(len(self.names), len(self.names))
 
+    def block(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the matrix of some of the parameters, in this order, shape (q, q)."""
+        index = [self.names.index(name) for name in names]
+        return self.array()[np.ix_(index, index)]
+
 
 @dataclass(frozen=True)
 class Calibration:

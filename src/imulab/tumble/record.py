@@ -14,6 +14,7 @@ from imulab.errors import OptionError, RecordError
 from imulab.estimate import Observability, coverage_factor, leverage
 from imulab.recording import Array, Recording
 from imulab.texts import quantity
+from imulab.tumble.checks import check_prior
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
@@ -115,13 +116,16 @@ def make_record(
             "iterations": int(solution.iterations[0]),
             "orders": [dict(vars(row)) for row in orders],
             **_propagated(monte_carlo, scaling, g, order),
-            **_prior_shares(prior, problem, covariance),
+            **_prior_shares(prior, names, matrix),
         },
         options=dict(options),
         data=_data(attitudes, scaling, problem, solution, g),
         sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
-        warnings=tuple(_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0))),
+        warnings=(
+            *_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0)),
+            *_prior_warnings(prior, attitudes),
+        ),
     )
 
 
@@ -132,8 +136,7 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
         b, s = record.parameters[f"bias_{axis}"], record.parameters[f"scale_factor_{axis}"]
         uncertainty = None
         if record.covariance.names:
-            index = [record.covariance.names.index(f"{name}_{axis}") for name in ("bias", "scale_factor")]
-            block = record.covariance.array()[np.ix_(index, index)]
+            block = record.covariance.block([f"bias_{axis}", f"scale_factor_{axis}"])
             gradient = np.array([s.value, b.value])
             uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
         found[axis] = Parameter(s.value * b.value, uncertainty, str(record.model["output_unit"]))
@@ -173,8 +176,9 @@ def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prio
     Raises
     ------
     RecordError
-        The record's outputs have another unit.
+        The record cannot be a prior, or its outputs have another unit.
     """
+    check_prior(record)
     if record.model["output_unit"] != unit:
         raise RecordError(f"the prior has outputs in {record.model['output_unit']}, the recording in {unit}")
     order = int(record.model["order"])
@@ -191,25 +195,29 @@ def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prio
         ]
     )
     derivative = np.linalg.inv(_to_si(theta, scaling, g, order)[1])
-    index = [record.covariance.names.index(name) for name in names]
-    covariance = derivative @ record.covariance.array()[np.ix_(index, index)] @ derivative.T
+    covariance = derivative @ record.covariance.block(names) @ derivative.T
     spread = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(covariance / np.outer(spread, spread))
     return Prior(theta, np.linalg.inv(root) / spread)
 
 
-def _prior_shares(prior: Calibration | None, problem: Problem, covariance: Array | None) -> dict[str, Any]:
-    """Say what came from the prior: the diagonal of ``H^-1 P``, 1 where the data added nothing."""
-    if prior is None or problem.prior is None or covariance is None:
+def _prior_shares(prior: Calibration | None, names: list[str], matrix: Array | None) -> dict[str, Any]:
+    """Say what came from the prior: variance now over variance before, 1 where the data added nothing."""
+    if prior is None or matrix is None:
         return {}
-    shares = np.diag(covariance @ problem.prior.rows.T @ problem.prior.rows)
+    shares = np.diag(matrix) / np.diag(prior.covariance.block(names))
     return {
         "prior": {
             "content_sha256": prior.to_dict()["content_sha256"],
             "created": prior.created,
-            "shares": {n: float(s) for n, s in zip(parameter_names(problem.order), shares, strict=True)},
+            "shares": {n: float(s) for n, s in zip(names, shares, strict=True)},
         }
     }
+
+
+def _prior_warnings(prior: Calibration | None, attitudes: Attitudes) -> list[str]:
+    mine, its = (None if prior is None else prior.sensor.get("serial")), attitudes.recording.metadata.get("serial")
+    return [f"the prior is a record of {mine}, the recording one of {its}"] if mine and its and mine != its else []
 
 
 def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
