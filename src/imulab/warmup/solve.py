@@ -202,7 +202,8 @@ def amplitude_slopes(knots: Array, amplitudes: Array, constants: Sequence[float]
     curve = np.exp(-at[:, None] / at)
     if not np.linalg.cond(curve) < _WORST_CONDITION:  # constants that coincide, in a table edited by hand
         return _pchip_slopes(knots, values)
-    return np.linalg.solve(curve, _pchip_slopes(knots, values @ curve.T).swapaxes(1, 2)).swapaxes(1, 2)
+    slopes = _pchip_slopes(knots, values @ curve.T)
+    return np.asarray(np.linalg.solve(curve, slopes.swapaxes(1, 2)).swapaxes(1, 2), dtype=np.float64)
 
 
 def _pchip_slopes(knots: Array, values: Array) -> Array:
