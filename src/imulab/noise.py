@@ -230,9 +230,9 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
             f"{recording.name}: no sensor column (gyro_.. accel_.. dtg_.. fog); found {' '.join(recording.columns)}"
         )
     check_finite(recording, names)
+    notes += _motion_notes(recording, names, rate)
     columns: dict[str, Any] = {}
     for name in names:
-        notes += _motion_notes(recording, name, rate)
         unit = {"rate": "rad/s", "acceleration": "m/s^2"}.get(
             parse_unit(recording.units[name]).quantity, recording.units[name]
         )
@@ -259,22 +259,25 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     }
 
 
-def _motion_notes(recording: Recording, name: str, rate: float) -> list[str]:
+def _motion_notes(recording: Recording, names: list[str], rate: float) -> list[str]:
     """Say where means over a second range farther than any zero drifts and than noise explains: the unit moved."""
-    quantity = parse_unit(recording.units[name]).quantity
-    if quantity not in _STILL:
-        return []
     size = max(1, round(rate))
-    samples = recording.si(name)
-    means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
-    reach = float(np.ptp(means)) if means.size else 0.0
-    noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
-    limit, unit = _STILL[quantity]
-    if reach <= max(limit, _NOISE_REACH * noise):
-        return []
+    moved: dict[str, dict[str, float]] = {}
+    for name in names:
+        quantity = parse_unit(recording.units[name]).quantity
+        if quantity not in _STILL:
+            continue
+        samples = recording.si(name)
+        means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
+        reach = float(np.ptp(means)) if means.size else 0.0
+        noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
+        if reach > max(_STILL[quantity][0], _NOISE_REACH * noise):
+            moved.setdefault(quantity, {})[name] = reach
     return [
-        f"{recording.name}: column {name}: its means over a second range over {from_si(reach, unit):.3g} {unit}: did "
-        "the unit move? Then these are the coefficients of its motion, not of its noise"
+        f"{recording.name}: column{'s' * (len(reaches) > 1)} {' '.join(reaches)}: means over a second range over up to "
+        f"{from_si(max(reaches.values()), _STILL[quantity][1]):.3g} {_STILL[quantity][1]}: did the unit move? Then "
+        "these are the coefficients of its motion, not of its noise"
+        for quantity, reaches in moved.items()
     ]
 
 
