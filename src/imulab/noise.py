@@ -26,11 +26,11 @@ _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
 """Correlation of estimates an octave apart; measured on white noise and random walk (.45 to .6), falling as its
 power."""
+_SENSORS = ("gyro", "dtg", "fog", "accel")
+COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
 _NOISE_REACH = 20.0
-_SENSORS = ("gyro", "dtg", "fog", "accel")
-COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 
 
 @dataclass(frozen=True)
