@@ -22,7 +22,7 @@ _TITLES = {
     "centrifuge": "Centrifuge test",
 }
 _LONG = 60
-_NUMBER = re.compile(r"[<>±+−-]?\s?[\d.]+(?![\w.-])|nan")
+_NUMBER = re.compile(r"[<>±+−-]?\s?\d[\d.,]*(?:e[-+]?\d+)?(?![\w.-])|nan\b")
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
