@@ -12,13 +12,13 @@ from imulab.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
 from imulab.tumble.solve import Solution
 from imulab.units import from_si, parse_unit, to_si
 
+_MANY_ROWS = 200
 _ENOUGH_TO_TELL = 5
 _DEAD_SPAN = 0.02
 _GYRO_SPAN = 0.05
 _PROPORTIONAL = 0.9999
 _FARTHEST = 5.0
 _WORST_RMS = 0.1
-_MANY_ROWS = 200
 _LEAST_EIGENVALUE = 1e-12
 
 
