@@ -1,4 +1,4 @@
-/* Gyro array: the plain methods, and the frame that all methods share. The robust method is in robust.c. */
+/* Gyro array: the plain methods, and what all methods share; robust.c and robust_well.c hold the robust one. */
 #include "array.h"
 
 /* A reading may come with an alignment of its element over the axes; then one lost axis loses all. */
@@ -184,11 +184,12 @@ static il_real kalman_step(const il_array *a, il_array_axis *s, const il_real *z
     return s->filtered;
 }
 
-static il_real axis_step(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, int32_t axis) {
+static il_real axis_step(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
+                         const il_real *reading, int32_t axis, int want_health) {
     switch (a->method) {
         case IL_SUPPORT: return support_step(a, s, z);
         case IL_LEAST_SQUARES: return least_squares_step(a, s, z);
-        case IL_ROBUST: return il_robust_step(a, s, z, reading);
+        case IL_ROBUST: return il_robust_step(a, t, s, z, reading, want_health);
         case IL_COVARIANCE: return fixed_step(a, s, z, axis);
         case IL_KALMAN: return kalman_step(a, s, z, axis);
         default: return mean_step(a, s, z);
@@ -205,8 +206,8 @@ static void feedback_health(const il_array *a, il_array_axis *s, const il_real *
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] /= total;
 }
 
-static inline unsigned step(const il_array *a, il_array_state *state, const il_real *reading, il_real *rate,
-                            int want_health) {
+static inline unsigned step(const il_array *a, const il_robust_terms *t, il_array_state *state,
+                            const il_real *reading, il_real *rate, int want_health) {
     il_real moved[3 * IL_ARRAY_ELEMENTS];
     const il_real *z = reading;
     unsigned flags = 0;
@@ -222,7 +223,7 @@ static inline unsigned step(const il_array *a, il_array_state *state, const il_r
             s->rate = feedback_step(a, s, mine, axis);
             if (want_health) feedback_health(a, s, mine);
         } else {
-            s->rate = axis_step(a, s, mine, reading + axis * a->elements, axis);
+            s->rate = axis_step(a, t, s, mine, reading + axis * a->elements, axis, want_health);
         }
         rate[axis] = s->rate - s->common;
         if (!il_finite(s->rate)) flags |= IL_NOT_FINITE;
@@ -262,12 +263,15 @@ il_status il_array_start(const il_array *settings, il_array_state *state) {
             sum += s->ratio[i] / (il_real)n;
         }
         for (int32_t i = 0; i < n; i++) s->ratio[i] /= sum;
+        s->ratio[n] = (il_real)INFINITY; /* robust: of the last one's partner, where n is odd */
     }
     return IL_OK;
 }
 
 unsigned il_array_step(const il_array *settings, il_array_state *state, const il_real *reading, il_real *rate) {
-    return step(settings, state, reading, rate, 1);
+    il_robust_terms t;
+    if (settings->method == IL_ROBUST) t = il_robust_prepare(settings);
+    return step(settings, &t, state, reading, rate, 1);
 }
 
 void il_array_still(const il_array *settings, il_array_state *state) {
@@ -286,9 +290,11 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
     size_t width = (size_t)a.axes * (size_t)a.elements, elements = (size_t)a.elements;
     unsigned all = 0;
     int want_health = flags != NULL || weight != NULL;
+    il_robust_terms t;
+    if (a.method == IL_ROBUST) t = il_robust_prepare(&a);
     for (size_t k = 0; k < n; k++) {
         /* the last sample leaves flags and weights in the state, as single steps do */
-        all |= step(&a, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
+        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
         if (still != NULL && still[k]) il_array_still(&a, state);
         for (size_t axis = 0; want_health && axis < (size_t)a.axes; axis++) {
             const il_array_axis *s = &state->axis[axis];

@@ -62,14 +62,19 @@ def test_a_vague_prior_changes_nothing_and_a_sharp_one_everything():
 
 
 def test_shares_say_what_few_attitudes_cannot_tell():
-    """Six faces of a cube say nothing of misalignment, and much of bias and scale factor."""
+    """Six faces of a cube say nothing of misalignment, and much of bias and scale factor.
+
+    With a prior that does not tie misalignment to them, that is: else they do so through it.
+    """
     truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
     record = fit(attitudes_of(truth, 1, 12, 1))
+    variances = np.diag(np.diag(record.covariance.array()))
+    record = replace(record, covariance=Covariance(record.covariance.names, tuple(map(tuple, variances.tolist()))))
     rng = np.random.default_rng(2)
     faces = table(G * np.vstack([np.eye(3), -np.eye(3)]) + SIGMA * rng.standard_normal((6, 3)), sigma=SIGMA)
     shares = fit(faces, prior=record).fit["prior"]["shares"]
     assert min(shares[f"misalignment_{p}"] for p in ("yx", "zx", "zy")) > 0.95
-    # all of them against (P + J' J / sigma^2)^-1 P with derivatives of the transcribed residual
+    # all of them against the variances of (P + J' J / sigma^2)^-1 with derivatives of the transcribed residual
     values = {name: p.value for name, p in record.parameters.items()}
     jacobian = np.column_stack(
         [
@@ -82,8 +87,27 @@ def test_shares_say_what_few_attitudes_cannot_tell():
         ]
     )
     precision = np.linalg.inv(record.covariance.array())
-    expected = np.diag(np.linalg.solve(precision + jacobian.T @ jacobian / SIGMA**2, precision))
+    posterior = np.linalg.inv(precision + jacobian.T @ jacobian / SIGMA**2)
+    expected = np.diag(posterior) / np.diag(record.covariance.array())
     np.testing.assert_allclose(list(shares.values()), expected, atol=0.01)
+
+
+@pytest.mark.parametrize("unit", ["m/s^2", "count"])
+def test_shares_are_shares_whatever_the_zero(unit):
+    """With three attitudes, and a bias of 8 g in counts as some units have it, none is above 1 or below 0."""
+    truth = reference.random_truth(np.random.default_rng(3), 2)
+    if unit == "count":
+        truth |= {f"scale_factor_{a}": 400.0 for a in "xyz"} | {f"bias_{a}": 80.0 for a in "xyz"}
+    sigma = SIGMA * truth["scale_factor_x"]
+    record = fit(attitudes_of(truth, 2, 24, 1, sigma, unit), 2)
+    for few in (3, 6):
+        updated = fit(attitudes_of(truth, 2, few, 2, sigma, unit), 2, prior=record)
+        shares = updated.fit["prior"]["shares"]
+        assert min(shares.values()) > 0
+        assert max(shares.values()) <= 1
+        for name, share in shares.items():
+            ratio = updated.parameters[name].standard_uncertainty / record.parameters[name].standard_uncertainty
+            assert share == pytest.approx(ratio**2)
 
 
 def test_a_prior_of_a_unit_that_changed_shows():
@@ -124,6 +148,55 @@ def test_a_prior_without_uncertainties_is_refused():
     bare = fit(attitudes_of(truth, 1, 9, 1, stated=False))
     with pytest.raises(OptionError, match="expected a tumble record that states uncertainties"):
         fit(attitudes_of(truth, 1, 20, 2), prior=bare)
+
+
+def bad_priors():
+    """What is wrong with a record, as a prior, and what is said."""
+    truth = reference.random_truth(np.random.default_rng(8), 1)
+    good = fit(attitudes_of(truth, 1, 24, 1))
+    names, matrix = good.covariance.names, good.covariance.array()
+
+    def with_covariance(changed, kept=None):
+        return replace(good, covariance=Covariance(names[:kept], tuple(map(tuple, changed[:kept, :kept].tolist()))))
+
+    certain, indefinite = matrix.copy(), matrix.copy()
+    certain[4], certain[:, 4] = 0.0, 0.0
+    indefinite[0, 1] = indefinite[1, 0] = 5 * np.sqrt(matrix[0, 0] * matrix[1, 1])
+    yield good, with_covariance(certain), "scale_factor_y has the variance 0; a prior needs more than 0 for each"
+    yield good, with_covariance(0 * matrix), "bias_x has the variance 0"
+    yield good, with_covariance(-matrix), "bias_x has the variance -"
+    yield good, with_covariance(indefinite), "covariance is not positive definite"
+    yield good, with_covariance(matrix, 6), "no misalignment_yx, or no covariance of it"
+    lacking = {name: p for name, p in good.parameters.items() if name != "bias_z"}
+    yield good, replace(good, parameters=lacking), "no bias_z, or no covariance of it"
+    yield good, replace(good, model={**good.model, "order": 7}), "a record of order 7 cannot be a prior"
+    yield good, replace(good, model={**good.model, "gauge": "upper"}), "a record in the gauge 'upper'"
+    yield good, replace(good, procedure="centrifuge"), "a centrifuge record cannot be a prior"
+
+
+@pytest.mark.parametrize("number", range(9))
+def test_records_that_cannot_be_priors_are_refused_in_a_sentence(number, imulab, tmp_path):
+    good, bad, message = list(bad_priors())[number]
+    bad.save(tmp_path / "bad.json")
+    il.write_csv(attitudes_of({name: p.value for name, p in good.parameters.items()}, 1, 20, 2), tmp_path / "f.csv")
+    done = imulab("tumble", "fit", "f.csv", "--gravity", str(G), "--prior", "bad.json", "-o", "out.json")
+    assert done.returncode == 2
+    assert done.stderr.startswith("imulab: bad.json: ")
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_the_same_recording_does_not_count_twice_and_another_unit_is_named(imulab, tmp_path):
+    for seed in ("3", "4"):
+        imulab("tumble", "simulate", "-o", f"{seed}.csv", "--order", "1", "--seed", seed)
+        imulab("tumble", "fit", f"{seed}.csv", "--gravity", str(G), "--order", "1", "-o", f"{seed}.json")
+    twice = imulab("tumble", "fit", "3.csv", "--gravity", str(G), "--prior", "3.json")
+    assert twice.returncode == 2
+    assert "3.csv: the prior 3.json was made from this recording, which would count twice" in twice.stderr
+    other = imulab("tumble", "fit", "3.csv", "--gravity", str(G), "--prior", "4.json")
+    assert other.returncode == 0, other.stderr
+    assert "the prior is a record of SIM-0004, the recording one of SIM-0003" in other.stderr
 
 
 def test_the_command_updates_a_record_from_few_attitudes(imulab, tmp_path):

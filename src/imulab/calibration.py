@@ -51,6 +51,11 @@ class Covariance:
         """Return the matrix, shape (p, p)."""
         return np.array(self.matrix, dtype=np.float64).reshape(len(self.names), len(self.names))
 
+    def block(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the matrix of some of the parameters, in this order, shape (q, q)."""
+        index = [self.names.index(name) for name in names]
+        return self.array()[np.ix_(index, index)]
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -197,6 +202,8 @@ def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
         content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
         reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
+        if not data.lstrip().startswith(b"{"):
+            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
         raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')

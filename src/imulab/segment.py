@@ -30,7 +30,10 @@ _CLEAR_DRIFT = 6.0
 _SLOW = 5.0
 _MUCH_LOST = 0.05
 _LONG_TABLE = 1000
-_NO_TIME = "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with motion?"
+_NO_TIME = (
+    "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with "
+    "motion? Then it needs a column time, or a layout with sample_rate"
+)
 _BATCHES = 4
 """Batches per attitude: few, so that they are long against the correlation of the noise, which is pooled."""
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)

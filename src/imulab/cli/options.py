@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
-LayoutFile = Annotated[str | None, typer.Option("--layout", metavar="L.toml", help="Columns of a foreign file.")]
+LayoutFile = Annotated[
+    str | None,
+    typer.Option("--layout", metavar="L.toml", help="Columns of a foreign file; imulab show --formats has an example."),
+]
 OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
 ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]
 Topic = Annotated[
@@ -33,6 +36,7 @@ Instance = Annotated[
 Window = Annotated[
     str | None, typer.Option("--window", metavar="FROM:TO", help="Part to read, s; either side may be left out.")
 ]
+_PAPER = (".pdf", ".png", ".svg", ".docx")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
@@ -101,6 +105,8 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
             continue
         if name in ("", "-"):
             raise OptionError(f"output {name!r}: expected the name of a file to write")
+        if Path(name).suffix.lower() in _PAPER:
+            raise OptionError(f"{name}: no such file is written; reports are HTML (.html), which any browser prints")
         if Path(name).resolve() in taken:
             raise OptionError(f"{name}: would overwrite {taken[Path(name).resolve()]}; expected another name")
         if not Path(name).resolve().parent.is_dir():

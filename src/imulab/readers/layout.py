@@ -1,15 +1,4 @@
-r"""Layout files: where the columns of a foreign file are, and in which units.
-
-delimiter = "whitespace"            # or "," ";" "\t"
-header = false                      # true: the first line names the columns
-skip_lines = 0                      # lines above the header or the data
-sample_rate = { value = 100, unit = "Hz" }      # only where no column holds time
-[columns]
-time = { from = 0, unit = "s" }     # 0-based number, or name in the header; "variable" or "group/dataset" elsewhere
-accel_x = { from = 1, unit = "count" }
-[metadata]
-serial = "SN42"
-"""
+"""Layout files: where the columns of a foreign file are, and in which units; `EXAMPLE` has every key."""
 
 from __future__ import annotations
 
@@ -23,6 +12,19 @@ from imulab.errors import ReadError, UnitError
 from imulab.recording import check_unit
 from imulab.units import parse_unit, to_si
 
+EXAMPLE = """\
+delimiter = "whitespace"                        # or "," ";" "\\t"
+header = false                                  # true: the first line names the columns
+skip_lines = 0                                  # lines above the header or the data
+# sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
+[columns]
+time = { from = 0, unit = "s" }                 # 0-based number, or a name in the header
+accel_x = { from = 1, unit = "count" }
+accel_y = { from = 2, unit = "count" }
+accel_z = { from = 3, unit = "count" }
+[metadata]
+serial = "SN42"
+"""
 _DELIMITERS = {"whitespace": " ", " ": " ", ",": ",", ";": ";", "\t": "\t"}
 _KEYS = {"delimiter", "header", "skip_lines", "sample_rate", "columns", "metadata"}
 
@@ -68,6 +70,8 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ReadError(f"{name}: no such layout file") from None
+    except IsADirectoryError:
+        raise ReadError(f"{name}: expected a layout file, found a folder") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ReadError(f"{name}: the layout cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:

@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import OptionError
+from imulab.errors import DataError, OptionError, RecordError
 from imulab.tasks.task import Files, Task
 from imulab.texts import chosen, quantity, whole_number
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
+    from imulab.recording import Recording
     from imulab.tumble.record import Gravity
 
 
@@ -40,17 +41,34 @@ def _tumble_fit(
     from imulab.segment import find_attitudes
     from imulab.tumble.fit import fit_tumble
 
-    attitudes = find_attitudes(access.recording(files[0], values["layout"], **values["part"]))
+    recording = access.recording(files[0], values["layout"], **values["part"])
+    prior = None if values["prior"] is None else _prior(values["prior"], recording, access)
+    attitudes = find_attitudes(recording)
     return fit_tumble(
         attitudes,
         order=values["order"],
         gravity=values["gravity"],
         method=values["method"],
         loss=values["loss"],
-        prior=None if values["prior"] is None else access.record(values["prior"]),
+        prior=prior,
         monte_carlo=values["monte_carlo"],
         progress=progress,
     ).calibration
+
+
+def _prior(file: str, recording: Recording, access: Files) -> Calibration:
+    """Read a record that can be a prior for this recording."""
+    from imulab.tumble.checks import check_prior
+
+    record = access.record(file)
+    try:
+        check_prior(record)
+    except RecordError as error:
+        raise RecordError(f"{file}: {error}") from None
+    own = recording.source
+    if own is not None and own.sha256 in [source.sha256 for source in record.sources]:
+        raise DataError(f"{recording.name}: the prior {file} was made from this recording, which would count twice")
+    return record
 
 
 def _gravity(gravity: str | None, latitude: str | None, height: str | None, label: str) -> Gravity | float | None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from imulab.attitudes import Attitudes
-from imulab.errors import DataError
+from imulab.calibration import Calibration
+from imulab.errors import DataError, RecordError
+from imulab.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
 from imulab.tumble.solve import Solution
 from imulab.units import from_si, parse_unit, to_si
 
@@ -15,6 +17,8 @@ _GYRO_SPAN = 0.05
 _PROPORTIONAL = 0.9999
 _FARTHEST = 5.0
 _WORST_RMS = 0.1
+_MANY_ROWS = 200
+_LEAST_EIGENVALUE = 1e-12
 
 
 def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
@@ -83,8 +87,15 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
         raise DataError(
             f"{attitudes.recording.name}: {attitudes.label(index)}, columns accel_x accel_y accel_z: "
             f"the specific force is {from_si(magnitude[index] * gravity, unit.symbol):.4g} {unit.symbol}, expected "
-            f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}"
+            f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}{_untimed(attitudes)}"
         )
+
+
+def _untimed(attitudes: Attitudes) -> str:
+    """Return what to say of a table that may be a recording whose time was left out."""
+    if attitudes.trace is not None or len(attitudes) <= _MANY_ROWS:
+        return ""
+    return "; without a column time every row is an attitude: a recording needs one, or a layout with sample_rate"
 
 
 def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) -> None:
@@ -101,3 +112,32 @@ def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) ->
             f"{attitudes.recording.name}: the calibrated magnitudes miss gravity ({gravity:.5g} m/s^2) by "
             f"{typical * gravity:.3g} m/s^2 in the median attitude: these are not static attitudes of an accelerometer"
         )
+
+
+def check_prior(record: Calibration) -> None:
+    """Check that a record can be a prior: a normal distribution of all its parameters, in this model and gauge.
+
+    Raises
+    ------
+    RecordError
+        The message says what is missing.
+    """
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record cannot be a prior; expected a tumble record")
+    if not record.covariance.names:
+        raise RecordError("a record that states no uncertainties cannot be a prior")
+    order = record.model["order"]
+    if order not in range(1, HIGHEST_ORDER + 1):
+        raise RecordError(f"a record of order {order} cannot be a prior; expected 1 to {HIGHEST_ORDER}")
+    if record.model["gauge"] != GAUGE:
+        raise RecordError(f"a record in the gauge {record.model['gauge']!r} cannot be a prior; expected {GAUGE!r}")
+    for name in parameter_names(order):
+        if name not in record.parameters or name not in record.covariance.names:
+            raise RecordError(f"the record has no {name}, or no covariance of it, and cannot be a prior")
+    block = record.covariance.block(parameter_names(order))
+    for name, variance in zip(parameter_names(order), np.diag(block).tolist(), strict=True):
+        if not 0 < variance < np.inf:
+            raise RecordError(f"the record's {name} has the variance {variance:g}; a prior needs more than 0 for each")
+    spread = np.sqrt(np.diag(block))
+    if not np.linalg.eigvalsh(block / np.outer(spread, spread))[0] > _LEAST_EIGENVALUE:
+        raise RecordError("the record's covariance is not positive definite, and cannot be a prior")

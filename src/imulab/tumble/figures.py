@@ -45,6 +45,11 @@ def exhibits(record: Calibration) -> Exhibits:
     if record.covariance.names:
         items.append(_correlation(record))
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} down-weighted" if bad else ""
+    if "gyro" in fit:
+        missed = from_si(fit["gyro"]["rms"]["value"], "deg")
+        aside += (
+            f"; {fit['gyro']['turns']} turns of the gyroscopes carry gravity's direction within {missed:.2g} deg rms"
+        )
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
         f"{small_g(_rms(used))} rms (before: {small_g(_rms(data['residual_before']))}){aside}.",
@@ -162,9 +167,10 @@ def _span(values: list[float], bars: list[float] | None) -> float:
 
 
 def _parameters(record: Calibration) -> Table:
-    factor = record.fit["coverage_factor_95"]
+    factors = {False: record.fit["coverage_factor_95"], True: record.fit.get("gyro", {}).get("coverage_factor_95")}
     rows = []
     for row in engineering_rows(record):
+        factor = factors[row.name.startswith("gyro_")]
         value, uncertainty = row.text()
         interval = "not stated"
         if row.standard_uncertainty is not None and factor is not None:
@@ -178,9 +184,13 @@ def _parameters(record: Calibration) -> Table:
         if known
         else f"Noise estimated from the residuals; Student's t with {freedom} degrees of freedom."
     )
+    turned = ""
+    if "gyro" in record.fit:
+        degrees = record.fit["gyro"]["degrees_of_freedom"]
+        turned = f" Gyroscopes: M = S (T ω + b + G f), Student's t with {degrees} degrees of freedom."
     return Table(
         title="Parameters",
-        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.",
+        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.{turned}",
         columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit"],
         rows=rows,
     )
@@ -204,7 +214,8 @@ def _shares(record: Calibration) -> Table:
     return Table(
         title="Prior and data",
         caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior['created']}) or "
-        "these attitudes. A prior that no longer holds shows as scatter beyond the noise.",
+        "these attitudes; variance now over variance in the prior. A prior that no longer holds shows as scatter "
+        "beyond the noise.",
         columns=["parameter", "from the prior", "from the data"],
         rows=rows,
     )
@@ -228,11 +239,12 @@ def _orders(record: Calibration) -> Table:
                 "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
             ]
         )
+    huber = " Rms of all attitudes, a down-weighted one by its weight." if record.fit["loss"] == "huber" else ""
     return Table(
         title="Choice of the order",
         caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
         "attitudes it has not seen (leave-one-out), if the F-test finds the gain significant, and if the attitudes can "
-        "observe it.",
+        f"observe it.{huber}",
         columns=[
             "order",
             "parameters",

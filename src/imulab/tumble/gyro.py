@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
-from imulab.estimate import Observability, covariance, f_test, levenberg_marquardt, observability
+from imulab.estimate import Observability, covariance, levenberg_marquardt, observability
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rotation import Turns, weighted_turns
 from imulab.tumble.apply import output_factor, specific_force
-from imulab.units import parse_unit, to_si
+from imulab.tumble.directions import direction_covariance
+from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, beyond_range, clock_notes, find_holds
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
-SENSITIVITIES = ("auto", "yes", "no")
 _ROWS, _COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
-_EDGE = 0.1  # s back into the 0.3 s of each hold that segmentation drops; slow beginnings of a turn lie there
 _FEWEST_TURNS = 8
+_FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
 _LONGEST_TURN = 60.0  # s
 _WORST_TURN = np.radians(20.0)
-_SIGNIFICANT = 0.01
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
@@ -66,6 +66,8 @@ class GyroFit:
         Whether the biases were fitted to the turns instead of taken from rest.
     observability
         Of the parameters that were fitted to the turns.
+    notes
+        What a user should know, a sentence each.
     """
 
     scale_factor: Array
@@ -80,6 +82,7 @@ class GyroFit:
     unit: str
     fit_bias: bool
     observability: Observability
+    notes: tuple[str, ...] = ()
 
     @property
     def cost(self) -> float:
@@ -97,16 +100,8 @@ class _Segments:
     after: Array
     start: Array
     stop: Array
-
-
-@dataclass(frozen=True)
-class _Rest:
-    """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties."""
-
-    zero: Array
-    slope: Array | None
-    zero_uncertainty: Array
-    slope_uncertainty: Array | None
+    attitude: NDArray[np.intp]
+    """Index of the attitude before each turn; the one after it is the next."""
 
 
 def fit_gyro(
@@ -155,10 +150,15 @@ def fit_gyro(
     check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
     time, output = check_time(recording), recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
-    force = specific_force(record, attitudes.mean * factor)
-    rest = _at_rest(attitudes, time, output, force, sensitivity, recording.name)
+    means = attitudes.mean * factor
+    force = specific_force(record, means)
+    holds = find_holds(attitudes, time, output, recording.name)
+    rest = at_rest(holds, output, force, sensitivity)
     moving = _force_at(record, attitudes.recording, time, factor) if rest.slope is not None else None
-    segments = _segments(attitudes, time, output, force, rest, moving, recording.name)
+    segments, notes = _segments(holds, time, output, force, rest, moving, recording.name)
+    notes += _record_notes(record, attitudes, force)
+    if attitudes.recording is not recording:
+        notes += clock_notes(holds, attitudes, time)
     scale = _start_scale(segments, unit)
     theta, jacobian, residual = _estimate(segments, scale, fit_bias)
     miss = np.linalg.norm(residual.reshape(-1, 3), axis=1)
@@ -168,16 +168,29 @@ def fit_gyro(
             f"{np.degrees(np.median(miss)):.0f} deg (median of {len(miss)}): swapped or reversed axes, or a wrong unit?"
         )
     # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
-    freedom = 2 * len(miss) - theta.size
-    variance = float(residual @ residual) / max(freedom, 1)
-    weights = np.full(len(residual), 1 / max(variance, 1e-30))
-    seen = observability(jacobian, weights)
+    freedom = max(2 * len(miss) - theta.size, 1)
+    seen = observability(jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
     if seen.rank < theta.size:
         confused = " ".join(seen.confused(gyro_names()[: theta.size]))
         raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
-    return _result(
-        theta, covariance(jacobian[None], weights[None])[0], scale, rest, miss, segments, unit, fit_bias, seen
-    )
+    known = direction_covariance(record, attitudes, means, force)
+    matrix = _covariance(segments, scale, theta, jacobian, residual, known, None if fit_bias else rest)
+    result = _result(theta, matrix, scale, rest, miss, segments, unit, fit_bias, seen)
+    return replace(result, notes=tuple(notes))
+
+
+def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
+    """Say if the accelerometers' record is hardly of this unit."""
+    mine, its = record.sensor.get("serial"), attitudes.recording.metadata.get("serial")
+    found = [f"gyro: the record is of {mine}, the recording of {its}"] if mine and its and mine != its else []
+    length = np.linalg.norm(force, axis=1)
+    scatter, usual = float(length.std()), float(record.fit["rms"]["value"])
+    if scatter > _FOREIGN * usual + _TOUCHED:
+        found.append(
+            f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
+            f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?"
+        )
+    return found
 
 
 def gyro_names() -> list[str]:
@@ -193,7 +206,7 @@ def _result(
     theta: Array,
     matrix: Array,
     scale: Array,
-    rest: _Rest,
+    rest: Rest,
     miss: Array,
     segments: _Segments,
     unit: str,
@@ -230,30 +243,6 @@ def _result(
     )
 
 
-def _at_rest(attitudes: Attitudes, time: Array, output: Array, force: Array, sensitivity: str, name: str) -> _Rest:
-    """Zero and g-sensitivity from the mean outputs of each attitude, least squares over the attitudes."""
-    edges = np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop]))
-    if (edges[:, 1] <= edges[:, 0]).any():
-        index = int(np.argmax(edges[:, 1] <= edges[:, 0]))
-        raise DataError(f"{name}: no samples during {attitudes.label(index)}: do the two recordings share one clock?")
-    sums = np.add.reduceat(np.vstack([output, np.zeros((1, 3))]), edges.ravel(), axis=0)[::2]
-    mean = sums / np.diff(edges, axis=1)
-    n = len(mean)
-    flat = mean - mean.mean(axis=0)
-    design = np.column_stack([np.ones(n), force])
-    solution = np.asarray(np.linalg.lstsq(design, mean, rcond=None)[0], dtype=np.float64)
-    left = mean - design @ solution
-    costs = float((flat**2).sum()), float((left**2).sum())
-    shown = n > 6 and f_test(costs[0], 3, costs[1], 12, 3 * n) < _SIGNIFICANT
-    if sensitivity == "no" or (sensitivity == "auto" and not shown):
-        scatter: Array = np.sqrt((flat**2).sum(axis=0) / (n - 1) / n)
-        return _Rest(mean.mean(axis=0), None, scatter, None)
-    spread: Array = np.sqrt((left**2).sum(axis=0) / max(n - 4, 1))
-    root = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
-    uncertainty: Array = spread[:, None] * root[1:]
-    return _Rest(solution[0], solution[1:].T, spread * root[0], uncertainty)
-
-
 def _force_at(record: Calibration, recording: Recording, time: Array, factor: float) -> Array:
     """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
     force = specific_force(record, recording.triad("accel") * factor)
@@ -264,17 +253,23 @@ def _force_at(record: Calibration, recording: Recording, time: Array, factor: fl
 
 
 def _segments(
-    attitudes: Attitudes, time: Array, output: Array, force: Array, rest: _Rest, moving: Array | None, name: str
-) -> _Segments:
-    begin, end = attitudes.stop[:-1] + _EDGE, attitudes.start[1:] - _EDGE
-    keep = (end > begin) & (end - begin <= _LONGEST_TURN)
-    start, stop = np.searchsorted(time, begin[keep]), np.searchsorted(time, end[keep])
-    inside_file = (start > 0) & (stop < len(time)) & (stop > start)
-    if np.count_nonzero(inside_file) < _FEWEST_TURNS:
-        raise SegmentError(
-            f"{name}: {np.count_nonzero(inside_file)} turns between attitudes; expected at least {_FEWEST_TURNS}"
-        )
-    start, stop = start[inside_file], stop[inside_file]
+    holds: Holds, time: Array, output: Array, force: Array, rest: Rest, moving: Array | None, name: str
+) -> tuple[_Segments, list[str]]:
+    begin, end = holds.leave[:-1], holds.arrive[1:]
+    clipped = np.vstack([np.zeros((1, 3), dtype=np.int64), np.cumsum(beyond_range(output), axis=0)])
+    turns = (end > begin) & (time[end] - time[begin] <= _LONGEST_TURN)
+    beyond = (clipped[end + 1] > clipped[begin]) & turns[:, None]
+    chosen = np.flatnonzero(turns & ~beyond.any(axis=1))
+    notes = []
+    if beyond.any():
+        axes = " ".join(f"gyro_{'xyz'[axis]}" for axis in range(3) if beyond[:, axis].any())
+        where = np.flatnonzero(beyond.any(axis=1))
+        at = " ".join(f"{t:.1f}" for t in time[begin[where[:6]]].tolist()) + (" ..." if len(where) > 6 else "")
+        notes.append(f"gyro: {len(where)} turns left out, clipped: {axes} stay at the end of their range (from {at} s)")
+    if len(chosen) < _FEWEST_TURNS:
+        aside = f" ({int(beyond.any(axis=1).sum())} more are clipped)" if notes else ""
+        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes{aside}; expected at least {_FEWEST_TURNS}")
+    start, stop = begin[chosen], end[chosen]
     index = start[:, None] + np.arange(int((stop - start).max()))
     inside = index < stop[:, None]
     here, there = np.where(inside, index, 0), np.where(inside, index + 1, 0)
@@ -282,9 +277,8 @@ def _segments(
     if moving is not None and rest.slope is not None:
         mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    chosen = np.flatnonzero(keep)[inside_file]
     step = np.where(inside, time[there] - time[here], 0.0)
-    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop])
+    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop], chosen), notes
 
 
 def _start_scale(segments: _Segments, unit: str) -> Array:
@@ -297,7 +291,8 @@ def _start_scale(segments: _Segments, unit: str) -> Array:
     # A turn goes at least as far as the direction of gravity does.
     guess = float(np.median((turned / np.maximum(angle, 1e-3))[angle > 0.3])) if (angle > 0.3).any() else 1.0
     few = replace(
-        segments, **{f: getattr(segments, f)[:40] for f in ("output", "step", "before", "after", "start", "stop")}
+        segments,
+        **{f: getattr(segments, f)[:40] for f in ("output", "step", "before", "after", "start", "stop", "attitude")},
     )
     costs = []
     for factor in _START_FACTORS:
@@ -318,6 +313,50 @@ def _estimate(segments: _Segments, scale: Array, fit_bias: bool) -> tuple[Array,
     count = 12 if fit_bias else 9
     fit = levenberg_marquardt(model, np.zeros((1, count)), np.ones((1, 3 * len(segments.before))), tolerance=1e-8)
     return fit.parameters[0], fit.jacobian[0], fit.residuals[0]
+
+
+def _covariance(
+    segments: _Segments, scale: Array, theta: Array, jacobian: Array, residual: Array, known: Array, rest: Rest | None
+) -> Array:
+    """Covariance of a least-squares estimate whose observations share errors: (J'J)^-1 J' V J (J'J)^-1.
+
+    V is what the directions of gravity (`known`) and the zero at rest bring to the residuals, and a common variance of
+    each for all else, which takes up what the residuals scatter beyond them.
+    """
+    m, size = len(segments.before), theta.size
+    turn = _turns(segments, scale, theta).matrix
+    rows = jacobian.reshape(m, 3, size)
+    count = len(known) // 3
+    seen = np.zeros((count, 3, size))
+    np.add.at(seen, segments.attitude, np.swapaxes(turn, 1, 2) @ rows)
+    np.add.at(seen, segments.attitude + 1, -rows)
+    pulled = seen.reshape(3 * count, size)
+    meat: Array = pulled.T @ known @ pulled
+    blocks = known.reshape(count, 3, count, 3)
+    here, there = segments.attitude, segments.attitude + 1
+    spent = float(
+        np.einsum("mii->", blocks[here, :, here]) + np.einsum("mii->", blocks[there, :, there])
+        - 2 * np.einsum("mij,mji->", turn, blocks[here, :, there])
+    )  # fmt: skip
+    if rest is not None:
+        zero = _model(segments, scale, np.concatenate([theta, np.zeros(3)]), fit_bias=True)[1][:, size:]
+        zero = zero * (rest.zero_uncertainty / scale)
+        meat += (jacobian.T @ zero) @ (zero.T @ jacobian)
+        spent += float((zero**2).sum())
+    bread = covariance(jacobian[None], np.ones((1, 3 * m)))[0]
+    left = float(residual @ residual) - (spent - float(np.trace(bread @ meat)))
+    variance = max(left, 0.0) / max(2 * m - size, 1)
+    found: Array = bread @ meat @ bread + variance * bread
+    return found
+
+
+def _turns(segments: _Segments, scale: Array, theta: Array) -> Turns:
+    """Turns under given parameters, without their derivatives."""
+    t = np.eye(3)
+    t[_ROWS, _COLUMNS] = theta[3:9]
+    moved = scale * theta[9:12] if theta.size > 9 else 0.0
+    rate = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(t).T
+    return weighted_turns(rate, segments.step, np.empty((*rate.shape[:2], 0)))
 
 
 def _model(segments: _Segments, scale: Array, theta: Array, fit_bias: bool) -> tuple[Array, Array]:

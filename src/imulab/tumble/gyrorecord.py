@@ -15,6 +15,7 @@ from imulab.units import parse_unit
 _AXES = ("x", "y", "z")
 _WORST_SCALE = 0.1
 _STANDS_OUT = 6.0
+_LARGE_MISS = 2.0  # deg
 
 
 def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerometers: Recording) -> Calibration:
@@ -30,8 +31,7 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
     sources |= {r.source.file: r.source for r in (accelerometers, recording) if r.source is not None}
     turns = len(fit.residuals)
     freedom = 2 * turns - (12 if fit.fit_bias else 9)
-    # The triads are fitted one after the other: what the accelerometers' uncertainty adds to the gyroscopes' is not
-    # carried along; it is seen in the residual angles, which scale the covariance.
+    # The gyroscopes' covariance holds what the accelerometers' adds; the covariance between the two is not kept.
     joined = _diagonal_blocks(block, _covariance(fit))
     return replace(
         record,
@@ -104,7 +104,7 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
 
 
 def _warnings(fit: GyroFit) -> list[str]:
-    found = []
+    found = list(fit.notes)
     if parse_unit(fit.unit).quantity == "rate":
         nominal = 1 / parse_unit(fit.unit).factor
         found += [
@@ -112,6 +112,9 @@ def _warnings(fit: GyroFit) -> list[str]:
             for axis, value in zip(_AXES, fit.scale_factor, strict=True)
             if abs(value / nominal - 1) > _WORST_SCALE
         ]
+    rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
+    if rms > _LARGE_MISS:
+        found.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
     worst = int(np.argmax(fit.residuals))
     others = float(np.sqrt(np.mean(np.delete(fit.residuals, worst) ** 2)))
     if fit.residuals[worst] > _STANDS_OUT * others:

@@ -10,9 +10,11 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import RecordError
+from imulab.errors import OptionError, RecordError
 from imulab.estimate import Observability, coverage_factor, leverage
-from imulab.recording import Array
+from imulab.recording import Array, Recording
+from imulab.texts import quantity
+from imulab.tumble.checks import check_prior
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
@@ -23,6 +25,8 @@ _STANDS_OUT = 5.0
 _MOST_NAMED = 8
 _ENOUGH_DEGREES = 9
 _ON_EARTH = (9.76, 9.84)
+_SAME_GRAVITY = 3e-6
+"""Far below any scale factor's uncertainty; a height of 10 m."""
 _WORST_SCALE = 0.1
 _WORST_MISALIGNMENT = 0.1
 _DOWN_WEIGHTED = 0.5
@@ -112,13 +116,16 @@ def make_record(
             "iterations": int(solution.iterations[0]),
             "orders": [dict(vars(row)) for row in orders],
             **_propagated(monte_carlo, scaling, g, order),
-            **_prior_shares(prior, problem, covariance),
+            **_prior_shares(prior, names, matrix),
         },
         options=dict(options),
         data=_data(attitudes, scaling, problem, solution, g),
         sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
-        warnings=tuple(_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0))),
+        warnings=(
+            *_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0)),
+            *_prior_warnings(prior, attitudes),
+        ),
     )
 
 
@@ -129,8 +136,7 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
         b, s = record.parameters[f"bias_{axis}"], record.parameters[f"scale_factor_{axis}"]
         uncertainty = None
         if record.covariance.names:
-            index = [record.covariance.names.index(f"{name}_{axis}") for name in ("bias", "scale_factor")]
-            block = record.covariance.array()[np.ix_(index, index)]
+            block = record.covariance.block([f"bias_{axis}", f"scale_factor_{axis}"])
             gradient = np.array([s.value, b.value])
             uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
         found[axis] = Parameter(s.value * b.value, uncertainty, str(record.model["output_unit"]))
@@ -170,8 +176,9 @@ def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prio
     Raises
     ------
     RecordError
-        The record's outputs have another unit.
+        The record cannot be a prior, or its outputs have another unit.
     """
+    check_prior(record)
     if record.model["output_unit"] != unit:
         raise RecordError(f"the prior has outputs in {record.model['output_unit']}, the recording in {unit}")
     order = int(record.model["order"])
@@ -188,25 +195,29 @@ def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prio
         ]
     )
     derivative = np.linalg.inv(_to_si(theta, scaling, g, order)[1])
-    index = [record.covariance.names.index(name) for name in names]
-    covariance = derivative @ record.covariance.array()[np.ix_(index, index)] @ derivative.T
+    covariance = derivative @ record.covariance.block(names) @ derivative.T
     spread = np.sqrt(np.diag(covariance))
     root = np.linalg.cholesky(covariance / np.outer(spread, spread))
     return Prior(theta, np.linalg.inv(root) / spread)
 
 
-def _prior_shares(prior: Calibration | None, problem: Problem, covariance: Array | None) -> dict[str, Any]:
-    """Say what came from the prior: the diagonal of ``H^-1 P``, 1 where the data added nothing."""
-    if prior is None or problem.prior is None or covariance is None:
+def _prior_shares(prior: Calibration | None, names: list[str], matrix: Array | None) -> dict[str, Any]:
+    """Say what came from the prior: variance now over variance before, 1 where the data added nothing."""
+    if prior is None or matrix is None:
         return {}
-    shares = np.diag(covariance @ problem.prior.rows.T @ problem.prior.rows)
+    shares = np.diag(matrix) / np.diag(prior.covariance.block(names))
     return {
         "prior": {
             "content_sha256": prior.to_dict()["content_sha256"],
             "created": prior.created,
-            "shares": {n: float(s) for n, s in zip(parameter_names(problem.order), shares, strict=True)},
+            "shares": {n: float(s) for n, s in zip(names, shares, strict=True)},
         }
     }
+
+
+def _prior_warnings(prior: Calibration | None, attitudes: Attitudes) -> list[str]:
+    mine, its = (None if prior is None else prior.sensor.get("serial")), attitudes.recording.metadata.get("serial")
+    return [f"the prior is a record of {mine}, the recording one of {its}"] if mine and its and mine != its else []
 
 
 def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
@@ -276,14 +287,20 @@ def _warnings(
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
-        *_gravity_warnings(gravity),
+        *_gravity_warnings(gravity, attitudes.recording),
         *_attitude_warnings(attitudes, problem, solution, reduced_chi_square),
         *_freedom_warnings(problem, solution, observability),
         *_size_warnings(attitudes, solution),
     ]
 
 
-def _gravity_warnings(gravity: Gravity) -> list[str]:
+def _gravity_warnings(gravity: Gravity, recording: Recording) -> list[str]:
+    stated = _stated_gravity(recording)
+    if stated is not None and abs(gravity.value - stated) > _SAME_GRAVITY * stated:
+        return [
+            f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says {stated:.6g} "
+            f"m/s^2: scale factors differ by {_TO_MICRO * (stated / gravity.value - 1):+.0f} ppm between the two"
+        ]
     if gravity.origin.startswith("standard"):
         return [
             f"no local gravity was given: standard gravity {gravity.value} m/s^2 was used, and every scale factor "
@@ -293,6 +310,15 @@ def _gravity_warnings(gravity: Gravity) -> list[str]:
     if not low <= gravity.value <= high:
         return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
     return []
+
+
+def _stated_gravity(recording: Recording) -> float | None:
+    """Return what a comment ``# gravity: 9.81362 m/s^2`` of the recording says, m/s^2."""
+    text = recording.metadata.get("gravity")
+    try:
+        return None if text is None else quantity(text, "gravity", "acceleration", "m/s^2")
+    except OptionError:
+        return None
 
 
 def _attitude_warnings(
