@@ -1,12 +1,15 @@
 """Fleets: what must not be lost, and what is said of the records as a whole."""
 
 import csv
+import fcntl
 
 import pytest
 
 import imulab as il
 from fleets import make_fleet, records, write_manifest
 from imulab.fleet.run import run_fleet
+from imulab.fleet.store import Store
+from imulab.fleet.work import work
 
 
 def run(manifest, folder):
@@ -76,6 +79,10 @@ def test_one_file_under_two_serials_is_said(tmp_path):
     edited(manifest, lambda rows: rows[2].update(file="u0.csv"))
     (note,) = run(manifest, tmp_path / "out").notes
     assert note == "serials SN000, SN002 were made from files of the same content: is a file named twice?"
+    edited(
+        manifest, lambda rows: [row.update(order="1" if number == 2 else "") for number, row in enumerate(rows)]
+    )  # as of a log
+    assert run(manifest, tmp_path / "out").notes == ()
 
 
 def test_records_of_another_version_are_kept_and_said(tmp_path, monkeypatch):
@@ -118,3 +125,23 @@ def test_a_line_that_cannot_be_is_refused(imulab, tmp_path, arguments, message):
     done = imulab("fleet", "simulate", "-o", "line", *arguments)
     assert (done.returncode, done.stderr) == (2, f"imulab: {message}\n")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_half_written_file_of_a_killed_worker_does_not_outlive_the_run(tmp_path, monkeypatch):
+    manifest = make_fleet(tmp_path / "in", 2)
+    part, held = tmp_path / "out" / ".imulab.x.part", tmp_path / "out" / ".fleet" / "turn"
+
+    def killed_under_it(unit, job):
+        part.write_text("{")
+        return work(unit, job)
+
+    monkeypatch.setattr("imulab.fleet.engine.work", killed_under_it)
+    assert run(manifest, tmp_path / "out").count("done") == 2
+    assert not part.exists()
+    part.write_text("{")
+    with held.open("a") as stream:  # a worker that is still at a unit may be the one that writes it
+        fcntl.flock(stream, fcntl.LOCK_SH)
+        Store(tmp_path / "out").tidy()
+        assert part.exists()
+    Store(tmp_path / "out").tidy()
+    assert not part.exists()

@@ -47,8 +47,13 @@ def frame_rotations(rate: Array, time: Array, start: NDArray[np.int64], stop: ND
 
 def _quaternions(vector: Array) -> Array:
     """Rotation vectors (..., 3) as quaternions (..., 4), scalar first."""
-    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)], axis=-1)
+    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", vector, vector))
+    quaternions = np.empty((*half.shape, 4))
+    quaternions[..., 0] = np.cos(half)
+    # sin(half) / half is 1 to rounding below the least angle that is told from none.
+    least = np.maximum(half, 1e-150)
+    quaternions[..., 1:] = (0.5 * np.sin(least) / least)[..., None] * vector
+    return quaternions
 
 
 def _compose(second: Array, first: Array) -> Array:

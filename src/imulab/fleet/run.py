@@ -137,6 +137,7 @@ def run_fleet(
         keeper = _Keeper(store, fleet, past, progress)
         _work_through(machine, Job(str(store.folder), fleet.base, token), keeper)
         keeper.flush()
+        store.tidy()
         rows = keeper.rows()
         write_table(rows, table_file)
     return FleetState(
@@ -262,9 +263,11 @@ def _said_of(rows: Sequence[Row]) -> Iterator[str]:
             f"{_counted(len(others), 'record')} of another version ({', '.join(sorted(set(others)))}) kept: "
             f"to fit again with imulab {VERSION}, use another folder"
         )
-    owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for summary in made:
-        owners.setdefault((summary.procedure, summary.inputs), []).append(summary.serial)
+    owners: dict[object, list[str]] = {}
+    for row in rows:
+        if row.summary is not None:  # one log may hold several sensors: options tell them apart
+            key = row.unit.procedure, row.summary.inputs, tuple(row.unit.options.items())
+            owners.setdefault(key, []).append(row.unit.serial)
     shared = [serials for serials in owners.values() if len(serials) > 1]
     if shared:
         more = f" (and {_counted(len(shared) - 1, 'more set')} like these)" if len(shared) > 1 else ""

@@ -135,11 +135,20 @@ class Store:
 
     def clear(self) -> None:
         """Remove what a killed run has left: half-written files, marks, and reasons of units that are tried again."""
-        for part in (*self.folder.glob(".imulab.*.part"), *self.hidden.rglob(".imulab.*.part")):
-            part.unlink(missing_ok=True)
+        self._clear_parts()
         for name in ("failed", "active"):
             for path in (self.hidden / name).iterdir():
                 path.unlink(missing_ok=True)
+
+    def tidy(self) -> None:
+        """Remove what workers that were killed under this run have half written, if nobody is at a unit any more."""
+        with (self.hidden / "turn").open("a") as stream:
+            if _lock(stream.fileno(), exclusive=True):
+                self._clear_parts()
+
+    def _clear_parts(self) -> None:
+        for part in (*self.folder.glob(".imulab.*.part"), *self.hidden.rglob(".imulab.*.part")):
+            part.unlink(missing_ok=True)
 
     def begin(self, serial: str) -> int:
         """Mark a unit as under work, and return how often this was begun and not ended before."""

@@ -263,7 +263,9 @@ def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tup
     if jacobian is None:
         jacobian = norm_and_jacobian(theta, problem.reading, problem.order)[1]
     q = -jacobian[:, :, 0:3]
-    covariance = np.broadcast_to(problem.covariance, (count, n, 3, 3))
+    covariance = problem.covariance
+    if len(covariance) != count:
+        covariance = np.broadcast_to(covariance, (count, n, 3, 3))
     along = np.einsum("bni,bnij,bnj->bn", q, covariance, q)
     # df/dM = T^-1 diag(1 / (slope S)); the nonlinearity's slope is 1 to the order that matters here
     carried = _unalign(theta[:, 6:9]) / theta[:, None, 3:6]
@@ -274,7 +276,7 @@ def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tup
 def _unalign(misalignment: Array) -> Array:
     """T^-1 of each problem, shape (b, 3, 3)."""
     inverse = np.zeros((len(misalignment), 3, 3))
-    inverse[:, range(3), range(3)] = 1.0
+    inverse[:, 0, 0] = inverse[:, 1, 1] = inverse[:, 2, 2] = 1.0
     yx, zx, zy = misalignment.T
     inverse[:, 1, 0] = -yx
     inverse[:, 2, 0] = zy * yx - zx
