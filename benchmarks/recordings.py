@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -12,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from timing import Row, measured
 
 import imulab as il
 from imulab.recording import Recording
@@ -94,20 +93,17 @@ def _wide(rows: int, decimals: int | None) -> Recording:
 
 def _memory(*arguments: str) -> str:
     """Peak memory of a command."""
-    code = (
-        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True, stdout=subprocess.DEVNULL); "
-        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, sys.executable, "-m", "imulab", *arguments],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return f"{done.stdout.strip()} MB"
+    return f"{measured('-m', 'imulab', *arguments)[1]:.0f} MB"
 
 
-def rows() -> list[tuple[str, str, str]]:
+def _peaks(what: str, file: Path, theirs: str) -> Row:
+    """Peak memory of a process that reads this file, ours and the peer's."""
+    ours = measured("-c", f"import imulab; imulab.read({str(file)!r})")[1]
+    peer = measured("-c", theirs)[1]
+    return (f"{what}, peak memory of a process", f"{ours:.0f} MB (the peer's {peer:.0f} MB)", "")
+
+
+def rows() -> list[Row]:
     """Return what was measured, what was found, what was asked."""
     import polars
 
@@ -119,6 +115,11 @@ def rows() -> list[tuple[str, str, str]]:
             mine, theirs, ratio = _compared(lambda path=path: il.read(path), lambda path=path: _by_rosbags(path))
             rate = f"{MESSAGES / mine:,.0f} messages/s (rosbags {MESSAGES / theirs:,.0f}), {ratio:.0f} times"
             found.append((f"read {title}, {MESSAGES} Imu messages", rate, "the library's own rate"))
+            by_rosbags = (
+                f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from pathlib import Path; "
+                f"import recordings; recordings._by_rosbags(Path({str(path)!r}))"
+            )
+            found.append(_peaks(f"read {title}, {MESSAGES} Imu messages", path, by_rosbags))
         for decimals, title in ((6, "6 decimals"), (None, "17 digits")):
             file = folder / "wide.csv"
             recording = _wide(1_000_000, decimals)
@@ -133,15 +134,12 @@ def rows() -> list[tuple[str, str, str]]:
         il.write((_wide(250_000, None) for _ in range(CSV_ROWS // 250_000)), file)
         mine, theirs, ratio = _compared(lambda: il.read(file), lambda: polars.read_csv(file), 3)
         text = f"{mine:.2f} s with SHA-256 (polars {theirs:.2f} s), ratio {1 / ratio:.2f}"
-        found.append((f"read CSV, {file.stat().st_size / 1e9:.2f} GB", text, "ratio <= 1.5"))
+        what = f"read CSV, {file.stat().st_size / 1e9:.2f} GB"
+        found.append((what, text, "ratio <= 1.5"))
+        found.append(_peaks(what, file, f"import polars; polars.read_csv({str(file)!r})"))
         for target in ("out.parquet", "out.csv"):
             peak = _memory("convert", str(file), "-o", str(folder / target))
             found.append((f"convert that file to .{target.partition('.')[2]}, peak memory", peak, "< 400 MB"))
         peak = _memory("convert", str(folder / "out.parquet"), "-o", str(folder / "again.csv"))
         found.append(("convert it back to .csv, peak memory", peak, "< 400 MB"))
     return found
-
-
-if __name__ == "__main__":
-    for what, value, asked in rows():
-        print(f"{what}: {value}" + (f" (asked: {asked})" if asked else ""))

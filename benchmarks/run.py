@@ -23,6 +23,7 @@ PARTS = {
     "warmup": "Warm-up",
     "centrifuge": "Centrifuge",
     "fleet": "Fleet",
+    "accuracy": "Accuracy and real recordings",
     "growth": "Growth",
 }
 PEERS = ("numpy", "scipy", "polars", "allantools", "filterpy", "imucal", "rosbags", "joblib", "dask")

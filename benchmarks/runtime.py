@@ -7,6 +7,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import madeup
+from imulab.exporters import export
 from imulab.runtime import Unit
 from imulab.tables import MODELS, tables_of
 
@@ -31,7 +33,7 @@ NAMES = {
 
 def rows() -> list[tuple[str, str, str]]:
     """Return what was measured, what was found, and what was asked."""
-    return [*_in_c(), *_through_python(), *_footprint()]
+    return [*_in_c(), *_through_python(), *_exported(), *_footprint()]
 
 
 def _in_c() -> list[tuple[str, str, str]]:
@@ -81,6 +83,22 @@ def _through_python() -> list[tuple[str, str, str]]:
         )
         made.append((f"`Unit.warmup`, {model}, 2 axes, against `numpy.copy`", f"{ratio:.2f} times its time", "<= 4"))
     return made
+
+
+def _exported() -> list[tuple[str, str, str]]:
+    """The self-test of an exported unit: what its own compiler makes of it against Python's numbers."""
+    made = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        export("c", [madeup.tumble(5, gyro=True, sensitive=True), madeup.centrifuge(), madeup.warmup()], folder)
+        for real, asked in (("double", "0 (bit for bit)"), ("float", "<= 2e-6")):
+            command = ["make", "-s", "-C", name, "test", f"CC=cc -DIMULAB_REAL={real}"]
+            done = subprocess.run(command, check=True, capture_output=True, text=True)
+            (worst,) = re.findall(r"worst (\S+)", done.stdout)
+            made.append((f"exported unit, {real}, against Python: worst difference of full scale", worst, asked))
+    done = subprocess.run(["make", "-s", "-C", str(CORE), "coverage"], check=True, capture_output=True, text=True)
+    lines, branches = re.findall(r"([\d.]+) % of", done.stdout.splitlines()[-1])
+    return [*made, ("C core: lines / branches that its own tests run", f"{lines} % / {branches} %", ">= 98 %")]
 
 
 def _footprint() -> list[tuple[str, str, str]]:

@@ -39,10 +39,13 @@ def screenshot(page: Path, picture: Path, width: int, height: int) -> None:
 
 def centrifuge(folder: Path) -> None:
     """The report of a simulated test, and what 10 arcsec of tilt do to a perfectly linear gyroscope."""
-    test = make_manifest(levels=[n * 9.80665 for n in LEVELS], radius=2.0, net_rate=math.radians(40), cycles=2)
+    test = make_manifest(
+        levels=[n * 9.80665 for n in LEVELS], radius=2.0, net_rate=math.radians(40), cycles=2, both_senses=True,
+        sensor={"serial": "DTG-7"},
+    )  # fmt: skip
     fit = il.fit_centrifuge(test, il.simulate_centrifuge(test, sample_rate=20.0, static_duration=20.0))
     il.write_report(fit.calibration, folder / "centrifuge.html")
-    screenshot(folder / "centrifuge.html", FIGURES / "centrifuge.png", 1080, 1130)
+    screenshot(folder / "centrifuge.html", FIGURES / "centrifuge.png", 1080, 818)
 
     K = math.radians(3.3 / 3600) / 9.80665
     tilted = RigTruth(tilt=math.radians(10 / 3600), tilt_phase=2.4, earth_rate=5.6e-5)
@@ -99,6 +102,7 @@ def main() -> None:
         folder = Path(name).resolve()
         run(folder, commands)
         screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 930)
+        screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 1075)
         first_figure(folder, "array.json", "gyro_array")
         first_figure(folder, "warmup.json", "warmup")
         centrifuge(folder)

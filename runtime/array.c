@@ -1,4 +1,4 @@
-/* Gyro array: the plain methods, and the frame that all methods share. The robust method is in robust.c. */
+/* Gyro array: the plain methods, and what all methods share; robust.c and robust_well.c hold the robust one. */
 #include "array.h"
 
 /* A reading may come with an alignment of its element over the axes; then one lost axis loses all. */
@@ -127,28 +127,39 @@ static il_real start_bias(const il_array *a, il_array_axis *s, const il_real *z,
 }
 
 /* The recursion of CN109443333B, to the letter: it has no defence against readings that are no numbers.
- *   b = (1-g) b + g (Z - Zr'),  Y = Z - b,  D = (1-g) D + g (Y - Zr')^2,  Zr = sum Y/D / sum 1/D,  Zr' one sample old */
-static inline il_real feedback_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
-    int32_t n = a->elements;
+ *   b = (1-g) b + g (Z - Zr'),  Y = Z - b,  D = (1-g) D + g (Y - Zr')^2,  Zr = sum Y/D / sum 1/D,  Zr' one sample old
+ * Two gyros at a time, each with sums of its own: compilers make one instruction of both. Of an odd number the last
+ * one's partner has an infinite variance. */
+il_real il_feedback_loop(int32_t n, il_real gain, il_real before, il_real least, const il_real *restrict z,
+                         il_real *restrict bias, il_real *restrict variance, il_real *restrict weight) {
+    const il_real keep = IL_C(1.0) - gain;
+    il_real total[2] = {IL_C(0.0), IL_C(0.0)}, sum[2] = {IL_C(0.0), IL_C(0.0)};
+    for (int32_t i = 0; i < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) {
+            /* Written as a step: (1-g) and g as rounded do not add up to one, which would let the common bias leak. */
+            const il_real b = bias[i + j] + gain * (z[i + j] - bias[i + j] - before), y = z[i + j] - b;
+            const il_real error = y - before, d = keep * variance[i + j] + gain * (error * error);
+            const il_real share = IL_C(1.0) / (least > d ? least : d);
+            bias[i + j] = b;
+            variance[i + j] = d;
+            weight[i + j] = share;
+            total[j] += share;
+            sum[j] += share * y;
+        }
+    }
+    return (sum[0] + sum[1]) / (total[0] + total[1]);
+}
+
+static il_real feedback_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+    const int32_t n = a->elements;
+    il_real even[IL_ARRAY_ROOM];
     if (s->count == a->start) return start_bias(a, s, z, axis);
-    il_real gain = il_array_gain(a, s->count), keep = IL_C(1.0) - gain, before = s->rate;
-    il_real total = IL_C(0.0), sum = IL_C(0.0), part[IL_ARRAY_ELEMENTS];
-    /* What does not depend on the other gyros first: compilers divide two or four at once here. */
-    for (int32_t i = 0; i < n; i++) {
-        /* Written as a step: (1-g) and g as rounded do not add up to one, which would let the common bias leak away. */
-        il_real b = s->bias[i] + gain * (z[i] - s->bias[i] - before), y = z[i] - b, error = y - before;
-        il_real d = keep * s->variance[i] + gain * (error * error);
-        il_real share = IL_C(1.0) / (d < IL_TINY ? IL_TINY : d);
-        s->bias[i] = b;
-        s->variance[i] = d;
-        s->weight[i] = share;
-        part[i] = share * y;
+    if (n % 2) {
+        memcpy(even, z, (size_t)n * sizeof *z);
+        even[n] = s->rate;
+        z = even;
     }
-    for (int32_t i = 0; i < n; i++) {
-        total += s->weight[i];
-        sum += part[i];
-    }
-    return sum / total;
+    return il_feedback_loop(n, il_array_gain(a, s->count), s->rate, IL_TINY, z, s->bias, s->variance, s->weight);
 }
 
 /* Virtual gyro: state (rate, bias_1 .. bias_n), a random walk each, with the steady-state gain. */
@@ -184,11 +195,12 @@ static il_real kalman_step(const il_array *a, il_array_axis *s, const il_real *z
     return s->filtered;
 }
 
-static il_real axis_step(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, int32_t axis) {
+static il_real axis_step(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
+                         const il_real *reading, int32_t axis, int want_health) {
     switch (a->method) {
         case IL_SUPPORT: return support_step(a, s, z);
         case IL_LEAST_SQUARES: return least_squares_step(a, s, z);
-        case IL_ROBUST: return il_robust_step(a, s, z, reading);
+        case IL_ROBUST: return il_robust_step(a, t, s, z, reading, want_health);
         case IL_COVARIANCE: return fixed_step(a, s, z, axis);
         case IL_KALMAN: return kalman_step(a, s, z, axis);
         default: return mean_step(a, s, z);
@@ -205,8 +217,8 @@ static void feedback_health(const il_array *a, il_array_axis *s, const il_real *
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] /= total;
 }
 
-static inline unsigned step(const il_array *a, il_array_state *state, const il_real *reading, il_real *rate,
-                            int want_health) {
+static inline unsigned step(const il_array *a, const il_robust_terms *t, il_array_state *state,
+                            const il_real *reading, il_real *rate, int want_health) {
     il_real moved[3 * IL_ARRAY_ELEMENTS];
     const il_real *z = reading;
     unsigned flags = 0;
@@ -222,7 +234,7 @@ static inline unsigned step(const il_array *a, il_array_state *state, const il_r
             s->rate = feedback_step(a, s, mine, axis);
             if (want_health) feedback_health(a, s, mine);
         } else {
-            s->rate = axis_step(a, s, mine, reading + axis * a->elements, axis);
+            s->rate = axis_step(a, t, s, mine, reading + axis * a->elements, axis, want_health);
         }
         rate[axis] = s->rate - s->common;
         if (!il_finite(s->rate)) flags |= IL_NOT_FINITE;
@@ -262,12 +274,17 @@ il_status il_array_start(const il_array *settings, il_array_state *state) {
             sum += s->ratio[i] / (il_real)n;
         }
         for (int32_t i = 0; i < n; i++) s->ratio[i] /= sum;
+        /* of the last one's partner, where n is odd */
+        if (settings->method == IL_ROBUST) s->ratio[n] = (il_real)INFINITY;
+        if (settings->method == IL_FEEDBACK) s->variance[n] = (il_real)INFINITY;
     }
     return IL_OK;
 }
 
 unsigned il_array_step(const il_array *settings, il_array_state *state, const il_real *reading, il_real *rate) {
-    return step(settings, state, reading, rate, 1);
+    il_robust_terms t;
+    if (settings->method == IL_ROBUST) t = il_robust_prepare(settings);
+    return step(settings, &t, state, reading, rate, 1);
 }
 
 void il_array_still(const il_array *settings, il_array_state *state) {
@@ -286,9 +303,11 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
     size_t width = (size_t)a.axes * (size_t)a.elements, elements = (size_t)a.elements;
     unsigned all = 0;
     int want_health = flags != NULL || weight != NULL;
+    il_robust_terms t;
+    if (a.method == IL_ROBUST) t = il_robust_prepare(&a);
     for (size_t k = 0; k < n; k++) {
         /* the last sample leaves flags and weights in the state, as single steps do */
-        all |= step(&a, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
+        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
         if (still != NULL && still[k]) il_array_still(&a, state);
         for (size_t axis = 0; want_health && axis < (size_t)a.axes; axis++) {
             const il_array_axis *s = &state->axis[axis];

@@ -28,6 +28,7 @@ typedef IMULAB_REAL il_real;
 #ifndef IL_ARRAY_ELEMENTS
 #define IL_ARRAY_ELEMENTS 32
 #endif
+#define IL_ARRAY_ROOM (IL_ARRAY_ELEMENTS / 2 * 2 + 2) /* taken two at a time */
 
 typedef enum {
     IL_OK = 0,
@@ -137,6 +138,7 @@ typedef struct {
     il_real rate[3];         /* per tick: of u, or of t / tau0; or the exponents -tick / time_constant */
     il_real log_scale;       /* 1 / log(1 + T_M / tau0) */
     uint32_t settled, ended; /* ticks at T_M, and at the end of the taper */
+    uint32_t span;           /* ticks, a power of two: exp and log1p are led on from multiples of it by a series */
 } il_warmup_state;
 
 /* Once, at power-on: pick the row. Outside the table, or for a temperature that is no number, nothing is corrected. */
@@ -145,9 +147,10 @@ il_status il_warmup_start(const il_warmup *settings, il_warmup_state *state, il_
 /* The bias of every axis, `ticks` ticks (of the length given at start) after power-on. */
 void il_warmup_bias(const il_warmup *settings, const il_warmup_state *state, uint32_t ticks, il_real *bias);
 
-/* Subtract it from n samples: axis i of sample k is output[i][k]; output[i] may be NULL. */
+/* n samples less their bias: output[i][k] = input[i][k] - factor[i] * bias of axis i. `factor`, by which columns in other
+ * units are larger, may be NULL: 1. output[i] may be input[i], or NULL for an axis that is not there. */
 void il_warmup_block(const il_warmup *settings, const il_warmup_state *state, size_t n, const uint32_t *ticks,
-                     il_real *const *output);
+                     const il_real *const *input, const il_real *factor, il_real *const *output);
 
 /* ---- gyro array: n gyros per axis, one or three axes, to one rate ------------------------------------------------- */
 
@@ -187,12 +190,14 @@ typedef struct {
     il_real resolution;                     /* robust: smallest change of a reading seen, 0 before any */
     uint32_t count;                         /* samples so far, from settings.start on */
     uint32_t still;                         /* zero-rate updates so far */
-    il_real bias[IL_ARRAY_ELEMENTS];        /* estimated */
-    il_real variance[IL_ARRAY_ELEMENTS];    /* of the noise, estimated */
-    il_real weight[IL_ARRAY_ELEMENTS];      /* in the last fused sample */
+    uint32_t clean;                         /* robust: samples not yet counted in seen, compared, changed */
+    uint32_t well;                          /* robust: not 0 while no gyro is under suspicion */
+    il_real bias[IL_ARRAY_ROOM];        /* estimated */
+    il_real variance[IL_ARRAY_ROOM];    /* of the noise, estimated */
+    il_real weight[IL_ARRAY_ROOM];      /* in the last fused sample */
     il_real last[IL_ARRAY_ELEMENTS];        /* last finite reading */
-    il_real ratio[IL_ARRAY_ELEMENTS];       /* variance by calibration, in mean variances */
-    il_real fast[IL_ARRAY_ELEMENTS];        /* mean residual of the last second or so */
+    il_real ratio[IL_ARRAY_ROOM];       /* variance by calibration, in mean variances */
+    il_real fast[IL_ARRAY_ROOM];        /* mean residual of the last second or so */
     il_real away_mean[IL_ARRAY_ELEMENTS];   /* of a run of gated readings, */
     il_real away_square[IL_ARRAY_ELEMENTS]; /* and the sum of squares about it */
     uint32_t seen[IL_ARRAY_ELEMENTS];       /* residuals learnt from */

@@ -41,6 +41,17 @@ static inline int il_finite(il_real x) {
     return x - x == IL_C(0.0);
 }
 
+/* A hint, where there are caches: these addresses will be read, and written. */
+static inline void il_prefetch(const il_real *read, const il_real *written) {
+#if defined(__GNUC__) && (defined(__x86_64__) || defined(__aarch64__))
+    __builtin_prefetch(read, 0);
+    __builtin_prefetch(written, 1);
+#else
+    (void)read;
+    (void)written;
+#endif
+}
+
 static inline il_real il_nan(void) {
     return (il_real)NAN;
 }

@@ -34,6 +34,12 @@ static void jump(il_array_axis *s, int32_t i) {
     s->fast[i] = IL_C(0.0);
 }
 
+/* Halve how often readings were compared and had changed, so that the ratio goes on. */
+static void halve(il_array_axis *s, int32_t i) {
+    s->changed[i] >>= 1;
+    s->compared[i] >>= 1;
+}
+
 /* Repeated and missing readings. Returns whether there is anything that needs a closer look. */
 static int examine(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, sample *p) {
     int closer = 0;
@@ -46,10 +52,7 @@ static int examine(const il_array *a, il_array_axis *s, const il_real *z, const 
         il_real change = il_fabs(reading[i] - s->last[i]);
         int same = change == IL_C(0.0) && s->compared[i] > 0;
         s->repeats[i] = same ? s->repeats[i] + (s->repeats[i] < UINT32_MAX) : 0;
-        if (s->compared[i] == UINT32_MAX) { /* halve both, so that their ratio goes on */
-            s->changed[i] >>= 1;
-            s->compared[i] >>= 1;
-        }
+        if (s->compared[i] == UINT32_MAX) halve(s, i);
         if (s->compared[i] > 0 && !same) {
             s->changed[i]++;
             if (change < s->resolution || s->resolution == IL_C(0.0)) s->resolution = change;
@@ -116,22 +119,12 @@ static il_real mean_variance(const il_array *a, const il_array_axis *s) {
     return known > 0 ? larger(sum / (il_real)known, IL_C(0.0)) : IL_C(0.0);
 }
 
-/* Residuals that a variance rests on. */
-static il_real weight_of_evidence(const il_array *a, const il_array_axis *s, int32_t i) {
-    il_real count = (il_real)(s->seen[i] < a->cap ? s->seen[i] : a->cap);
-    return a->memory > IL_C(0.0) && count * a->memory > IL_C(1.0) ? IL_C(1.0) / a->memory : count;
-}
-
-/* Variances, drawn to the mean of all while they rest on few residuals. */
+/* Variances as far as they can be trusted. */
 static void trust(const il_array *a, const il_array_axis *s, sample *p) {
-    il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = IL_C(0.0), share = IL_C(0.0);
-    il_real own = prior * p->mean_variance, least = larger(a->weight_floor * p->mean_variance, IL_TINY);
+    il_real least = larger(a->weight_floor * p->mean_variance, IL_TINY);
     for (int32_t i = 0; i < a->elements; i++) {
-        if (i == 0 || s->seen[i] != s->seen[i - 1]) { /* nearly always all have seen the same: one division serves */
-            count = weight_of_evidence(a, s, i);
-            share = IL_C(1.0) / (prior + count);
-        }
-        p->trust[i] = larger((own * s->ratio[i] + count * s->variance[i]) * share, least);
+        il_real pull = pull_of(a, s->seen[i]);
+        p->trust[i] = larger(drawn(s->variance[i], pull, p->mean_variance * s->ratio[i]), least);
     }
 }
 
@@ -243,7 +236,7 @@ static void weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t 
 
 /* A jump too small for the gate shows in the mean of a second, where the others' means agree. Not while the array as a
  * whole is finding its biases; but a gyro that came back is watched at once. */
-static void find_small_jumps(const il_array *a, il_array_axis *s, sample *p) {
+void il_robust_find_small_jumps(const il_array *a, il_array_axis *s, sample *p) {
     il_real share = IL_C(1.0) / (IL_C(2.0) * (il_real)a->quiet), largest = IL_C(0.0), smallest = IL_C(-1.0), scatter;
     il_real least = larger(IL_C(64.0) * share, IL_C(1.0)); /* variances: (8 sqrt(f / 2))^2 */
     for (int32_t i = 0; i < a->elements; i++) {
@@ -264,12 +257,6 @@ static void find_small_jumps(const il_array *a, il_array_axis *s, sample *p) {
     }
 }
 
-/* Gain of a bias and of a variance after `seen` residuals. */
-static il_real learning_gain(const il_array *a, uint32_t seen) {
-    il_real growing = IL_C(1.0) / (il_real)(seen < a->cap ? seen : a->cap);
-    return a->memory > IL_C(0.0) ? larger(a->memory, IL_C(1.0) / (il_real)seen) : growing;
-}
-
 /* Residuals against the mean of those who learn, of readings held to what may teach about the fused rate. */
 static void residuals(const il_array *a, const il_array_axis *s, const sample *p, il_real m, il_real rate, il_real *e) {
     il_real mean = IL_C(0.0), most = MOST * MOST * p->mean_variance;
@@ -288,18 +275,18 @@ static void residuals(const il_array *a, const il_array_axis *s, const sample *p
 /* Biases, variances and means of a second take in the sample; learns[] says whose. */
 static void learn(const il_array *a, il_array_axis *s, sample *p, int32_t pupils, il_real rate) {
     il_real m = (il_real)pupils, squares = IL_C(0.0), gain = IL_C(0.0), recent = IL_C(1.0) / (il_real)a->quiet;
-    il_real e[IL_ARRAY_ELEMENTS], gains[IL_ARRAY_ELEMENTS];
+    il_real e[IL_ARRAY_ELEMENTS];
     residuals(a, s, p, m, rate, e);
     uint32_t known = 0; /* nearly always all gyros have seen the same: one division serves */
     for (int32_t i = 0; i < a->elements; i++) {
-        gains[i] = IL_C(0.0);
+        p->gain[i] = IL_C(0.0);
         if (!p->learns[i]) continue;
         il_count(&s->seen[i]);
         if (s->seen[i] != known) {
             known = s->seen[i];
             gain = learning_gain(a, known);
         }
-        gains[i] = gain;
+        p->gain[i] = gain;
         squares += e[i] * e[i];
         /* a start other than 1 is experience in the bias, from the second residual on */
         il_real bias_gain = gain;
@@ -314,35 +301,10 @@ static void learn(const il_array *a, il_array_axis *s, sample *p, int32_t pupils
     for (int32_t i = 0; i < a->elements; i++) {
         if (!p->learns[i]) continue;
         il_real grubbs = hat * (e[i] * e[i] - squares);
-        s->variance[i] = (IL_C(1.0) - gains[i]) * (s->variance[i] + gains[i] * grubbs);
+        s->variance[i] = (IL_C(1.0) - p->gain[i]) * (s->variance[i] + p->gain[i] * grubbs);
         s->fast[i] = (IL_C(1.0) - recent) * s->fast[i] + recent * (p->r[i] - rate); /* as it came */
     }
-    find_small_jumps(a, s, p);
-}
-
-/* All is well in nearly every sample; then the gates need no median. Of any numbers, the median is no further from the
- * mean than the root mean square deviation, so that |r - median|^2 <= 2 (e^2 + mean e^2). */
-static int all_inside(const il_array *a, const il_array_axis *s, sample *p) {
-    il_real n = (il_real)a->elements, sum = IL_C(0.0), squares = IL_C(0.0), gate = a->gate * a->gate;
-    int out = p->learnt < 2;
-    uint32_t trouble = 0;
-    for (int32_t i = 0; i < a->elements; i++) {
-        sum += p->r[i];
-        trouble |= s->standing[i] | s->bad[i] | (uint32_t)(s->seen[i] == 0);
-    }
-    if (out | (trouble != 0)) return 0;
-    p->middle = sum / n; /* stands for the median where only its size matters */
-    for (int32_t i = 0; i < a->elements; i++) {
-        il_real e = p->r[i] - p->middle;
-        squares += e * e;
-    }
-    squares /= n;
-    il_real extra = IL_C(2.0) * p->mean_variance / n;
-    for (int32_t i = 0; i < a->elements; i++) {
-        il_real e = p->r[i] - p->middle;
-        out |= IL_C(2.0) * (e * e + squares) > gate * (p->trust[i] + extra);
-    }
-    return !out;
+    il_robust_find_small_jumps(a, s, p);
 }
 
 /* The long way: who is trusted, who is inside, who is used, who teaches. Returns the number used. */
@@ -384,38 +346,78 @@ static void teach_fresh(const il_array *a, il_array_axis *s, const sample *p, il
     }
 }
 
-il_real il_robust_step(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading) {
-    sample p;
+/* The long way, for samples in which something is wrong or new. */
+static il_real look_closely(const il_array *a, il_array_axis *s, const il_real *z, sample *p, int closer) {
     il_real rate = IL_C(0.0);
-    int32_t used = a->elements, pupils = 0;
-    int closer = examine(a, s, z, reading, &p);
-    if (closer) find_stuck(a, s, &p);
-    p.learnt = 0;
-    for (int32_t i = 0; i < a->elements; i++) {
-        if (s->seen[i] > p.learnt) p.learnt = s->seen[i];
-    }
-    p.mean_variance = mean_variance(a, s);
-    trust(a, s, &p);
-    for (int32_t i = 0; i < a->elements; i++) {
-        p.r[i] = z[i] - s->bias[i];
-        p.used[i] = p.learns[i] = 1;
-    }
-    int closely = closer || !all_inside(a, s, &p);
-    if (closely) used = choose(a, s, z, &p);
+    int32_t pupils = 0;
+    if (closer) find_stuck(a, s, p);
+    p->learnt = most_seen(a, s);
+    p->mean_variance = mean_variance(a, s);
+    trust(a, s, p);
+    for (int32_t i = 0; i < a->elements; i++) p->r[i] = z[i] - s->bias[i];
+    int32_t used = choose(a, s, z, p);
+    report(a, s, p, used);
     if (used == 0) {
-        report(a, s, &p, used);
         for (int32_t i = 0; i < a->elements; i++) s->weight[i] = IL_C(0.0);
         return il_nan();
     }
-    weigh(a, s, &p, used);
+    weigh(a, s, p, used);
     for (int32_t i = 0; i < a->elements; i++) {
-        rate += p.used[i] ? s->weight[i] * p.r[i] : IL_C(0.0);
-        pupils += p.learns[i];
+        rate += p->used[i] ? s->weight[i] * p->r[i] : IL_C(0.0);
+        pupils += p->learns[i];
     }
-    if (closely) { /* else all are used and there is nothing to tell */
-        report(a, s, &p, used);
-        if (used < a->elements) teach_fresh(a, s, &p, rate);
-    }
-    if (pupils >= 2) learn(a, s, &p, pupils, rate);
+    if (used < a->elements) teach_fresh(a, s, p, rate);
+    if (pupils >= 2) learn(a, s, p, pupils, rate);
     return rate;
+}
+
+/* Whether all gyros are in use and none is under suspicion: then the next sample may go the short way. */
+void il_robust_muster(const il_array *a, il_array_axis *s) {
+    uint32_t trouble = s->resolution == IL_C(0.0), differ = 0, full = a->memory > IL_C(0.0) ? UINT32_MAX : a->cap;
+    /* a start other than 1 has gains of its own until the memory is full */
+    uint32_t least = a->start > 1 && full == a->cap ? full : 2;
+    for (int32_t i = 0; i < a->elements; i++) {
+        trouble |= s->standing[i] | s->bad[i] | s->away[i] | (uint32_t)(s->seen[i] < least);
+        differ |= (s->seen[i] < full ? s->seen[i] : full) ^ (s->seen[0] < full ? s->seen[0] : full);
+    }
+    s->well = trouble ? 0 : differ ? UNEQUAL : ALIKE;
+}
+
+/* Count the samples since the last time in which all was well. */
+void il_robust_settle(const il_array *a, il_array_axis *s) {
+    if (s->clean == 0) return;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (s->compared[i] > UINT32_MAX - s->clean) halve(s, i);
+        s->compared[i] += s->clean;
+        s->changed[i] += s->clean;
+        s->seen[i] = il_counted(s->seen[i], s->clean);
+        s->repeats[i] = 0;
+    }
+    s->clean = 0;
+}
+
+il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
+                       const il_real *reading, int want_health) {
+    sample p;
+    int well = s->well && il_robust_all_well(a, t, s, z, reading, &p);
+    if (well && p.change > IL_C(0.0) && s->clean < MOST_CLEAN) {
+        s->clean++;
+        s->resolution = smaller(p.change, s->resolution);
+        memcpy(s->last, reading, (size_t)a->elements * sizeof(il_real));
+    } else {
+        il_robust_settle(a, s);
+        int closer = examine(a, s, z, reading, &p);
+        if (closer || !well) {
+            il_real rate = look_closely(a, s, z, &p, closer);
+            il_robust_muster(a, s);
+            return rate;
+        }
+        for (int32_t i = 0; i < a->elements; i++) il_count(&s->seen[i]);
+    }
+    if (want_health) {
+        for (int32_t i = 0; i < a->elements; i++) s->weight[i] /= p.total;
+        memset(s->flags, 0, (size_t)a->elements);
+    }
+    il_robust_learn(a, t, s, &p);
+    return p.rate;
 }

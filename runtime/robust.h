@@ -1,4 +1,4 @@
-/* What the robust method works with: its constants, one sample at work, and the median. */
+/* What robust.c and robust_well.c share: constants, one sample at work, the median, gains. */
 #ifndef IL_ROBUST_H
 #define IL_ROBUST_H
 
@@ -17,23 +17,36 @@
 enum { STUCK = 1, OUT = 2, FRESH = 4, JUMPED = 8 }; /* standing of a gyro, from sample to sample */
 enum { ENOUGH = 20 };                               /* repeats that nobody takes for chance */
 enum { SETTLING = 16 };                             /* residuals before a variance is fit to bound others */
+enum { UNEQUAL = 1, ALIKE = 2 };                    /* all is well: gyros have learnt differently, or alike */
+enum { MOST_CLEAN = 1 << 16 };                      /* samples between two counts of each gyro */
 enum { FORMING = 5 };                               /* quiet periods in which the array finds its own biases */
 
 /* One sample at work. */
 typedef struct {
     uint8_t usable[IL_ARRAY_ELEMENTS], core[IL_ARRAY_ELEMENTS], inside[IL_ARRAY_ELEMENTS];
     uint8_t learns[IL_ARRAY_ELEMENTS], used[IL_ARRAY_ELEMENTS];
-    il_real r[IL_ARRAY_ELEMENTS];    /* reading less bias */
-    il_real trust[IL_ARRAY_ELEMENTS]; /* variance as far as it can be trusted */
-    il_real half[IL_ARRAY_ELEMENTS];  /* width of the gate */
-    il_real middle;                  /* median of those trusted */
+    il_real r[IL_ARRAY_ROOM];        /* reading less bias */
+    il_real trust[IL_ARRAY_ROOM];    /* variance as far as it can be trusted */
+    il_real gain[IL_ARRAY_ROOM];     /* of bias and variance in this sample */
+    il_real pull[IL_ARRAY_ROOM];     /* of the mean variance on this one */
+    il_real half[IL_ARRAY_ELEMENTS]; /* width of the gate */
+    il_real middle;                  /* median of those trusted; their mean where all is well */
     il_real mean_variance;
+    il_real rate;                    /* where all is well: fused, */
+    il_real change;                  /* smallest change of a reading, */
+    il_real squares, total;          /* sums of squared residuals and of weights, */
+    il_real top;                     /* largest weight, */
+    il_real outside, bent;           /* by how much a squared residual is beyond the gate, and beyond full teaching */
     uint32_t learnt; /* residuals of the most experienced gyro */
     int waived;      /* nobody is trusted: the quiet period does not count */
 } sample;
 
 static inline il_real larger(il_real a, il_real b) {
     return a > b ? a : b;
+}
+
+static inline il_real smaller(il_real a, il_real b) {
+    return a < b ? a : b;
 }
 
 static inline il_real median(il_real *values, int32_t n) {
@@ -58,5 +71,40 @@ static inline il_real median_of(int32_t n, const uint8_t *chosen, const il_real 
     *typical = DEVIATION * median(sorted, count);
     return middle;
 }
+
+static inline uint32_t most_seen(const il_array *a, const il_array_axis *s) {
+    uint32_t most = 0;
+    for (int32_t i = 0; i < a->elements; i++) most = s->seen[i] > most ? s->seen[i] : most;
+    return most;
+}
+
+/* Gain of a bias and of a variance after `seen` residuals. */
+static inline il_real learning_gain(const il_array *a, uint32_t seen) {
+    il_real growing = IL_C(1.0) / (il_real)(seen < a->cap ? seen : a->cap);
+    return a->memory > IL_C(0.0) ? larger(a->memory, IL_C(1.0) / (il_real)seen) : growing;
+}
+
+/* How far a variance that rests on `seen` residuals is drawn to the mean of all. */
+static inline il_real pull_of(const il_array *a, uint32_t seen) {
+    il_real prior = a->weight != NULL ? CALIBRATED : OWN, count = (il_real)(seen < a->cap ? seen : a->cap);
+    if (count * a->memory > IL_C(1.0)) count = IL_C(1.0) / a->memory;
+    return prior / (prior + count);
+}
+
+static inline il_real drawn(il_real variance, il_real pull, il_real usual) {
+    return variance + pull * (usual - variance);
+}
+
+/* robust.c: jumps that are too small for the gate. */
+void il_robust_find_small_jumps(const il_array *a, il_array_axis *s, sample *p);
+
+/* robust.c: decide whether the next sample may go the short way; bring the counts of each gyro up to date. */
+void il_robust_muster(const il_array *a, il_array_axis *s);
+void il_robust_settle(const il_array *a, il_array_axis *s);
+
+/* robust_well.c: whether all is well in a sample, which is then fused, and what it teaches. */
+int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
+                       const il_real *reading, sample *p);
+void il_robust_learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, sample *p);
 
 #endif

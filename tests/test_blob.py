@@ -15,8 +15,9 @@ from imulab.calibration import Calibration
 from imulab.cli import main
 from imulab.errors import RecordError
 from imulab.exporters import export
+from imulab.packing import pack
 from imulab.recording import Recording
-from imulab.tables import pack, tables_of
+from imulab.tables import tables_of
 
 G = madeup.G
 

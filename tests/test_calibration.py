@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imulab.calibration import Calibration, Covariance, Parameter, content_sha256, json_text, load, loads
+from imulab.calibration import Calibration, Covariance, Parameter, content_sha256, json_text, load, loads, loads_sealed
 from imulab.errors import OptionError, RecordError
 from imulab.files import replacing, write_text
 from imulab.recording import Source
@@ -379,5 +379,15 @@ def test_the_text_of_a_record_is_that_of_the_standard_library():
         "deep": [[], [{}]],
         "numbers": [1, 2.5, -0.0, 1e-300, 1e22, 123456789.123456789, 5e-324], "floats": [0.1, 1e100], "whole": 2**70,
         "rows": [[1.0, 2.0], [3.0, None]], "nested": {"a": {"b": [1, {"c": "d"}]}},
+        "many": [*np.random.default_rng(1).standard_normal(500).tolist(), -0.0, 0.0, 5e-324, 1e16, 1e-5, -1.7e308],
     }  # fmt: skip
     assert json_text(content) == json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+
+
+def test_the_sealed_text_is_the_record_with_its_hash():
+    sha256, text = record(data={"b": {"z": 1, "a": [0.1] * 100}, "a": "µ"}).sealed()
+    content = json.loads(text)
+    assert list(content)[-1] == "content_sha256"
+    assert content["content_sha256"] == content_sha256(content) == sha256
+    assert text == json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    assert loads_sealed(text.encode(), "r.json")[1] == sha256

@@ -17,6 +17,7 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.exhibit import Figure
 from imulab.present import exhibits_of
 from imulab.recording import Recording
+from imulab.report import render
 
 G = 9.80665
 DEG_H = np.pi / 180 / 3600
@@ -195,8 +196,64 @@ def test_the_report_shows_what_was_asked(record):
         "Spectrum around the table rate",
     ]  # fmt: skip
     assert exhibits.headline.startswith("X drifts by 3.")
-    assert exhibits_of(record_of(False)).headline
+    undirected = exhibits_of(record_of(False))
+    assert undirected.headline
+    assert "Complex drift factor of each level" not in [item.title for item in undirected.items]
     assert exhibits_of(record_of(y=None)).items
+
+
+def test_the_headline_says_by_how_much_the_drift_is_not_linear(record):
+    test = make_manifest(levels=[G, 5 * G, 20 * G], radius=2.0, net_rate=NET)
+    linear = il.fit_centrifuge(test, Simulation(test, typical_truth(0.0), 50.0, 60.0, 5.0), curve="constant")
+    K0 = r"3\.\d+ ± 0\.0\d+ deg/h per g"
+    assert re.fullmatch(
+        rf"X drifts linearly with g, by {K0} from 1 g to 20 g; the factor at 20 g is [\d.]+ ± [\d.]+ % "
+        r"(larger|smaller) than that at 1 g\.",
+        exhibits_of(linear.calibration).headline,
+    )
+    falling = exhibits_of(record_of(y=None, x=replace(typical_truth(0.02).x, c1=-3e-4))).headline
+    assert re.search(
+        r"at 20 g the factor is [\d.]+ ± [\d.]+ % smaller measured .* [\d.]+ ± [\d.]+ % smaller by", falling
+    )
+    one = make_manifest(levels=[5 * G], radius=2.0, net_rate=NET)
+    found = il.fit_centrifuge(one, Simulation(one, typical_truth(), 50.0, 60.0, 5.0)).calibration
+    assert re.fullmatch(rf"X drifts by {K0} at 5 g\.", exhibits_of(found).headline)
+
+
+def test_the_table_of_runs_has_drift_and_uncertainty_of_each(record):
+    table = next(item for item in exhibits_of(record).items if item.title == "Runs")
+    assert table.columns == [
+        "run", "file", "cycle", "g", "sense", "table rate, deg/s", "periods", "X drift ± u, deg/h",
+        "Y drift ± u, deg/h", "FOG line, deg/h",
+    ]  # fmt: skip
+    assert "Table rates from: encoder." in table.caption
+    loaded = [
+        (row, run) for row, run in zip(table.rows, record.sections["runs"], strict=True) if run["role"] == "loaded"
+    ]
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    assert [row[0] for row in table.rows] == [str(n) for n in range(1, len(table.rows) + 1)]  # as messages count
+    assert table.rows[0][3:6] == ["0", "static", "–"]
+    for row, run in loaded:
+        assert float(row[3]) == pytest.approx(run["specific_force"]["value"] / G, rel=1e-3)
+        assert row[4] == f"{run['sense']:+d}"
+        K = run["x"]["K"]
+        drift, u = map(float, row[7].split(" ± "))
+        assert drift == pytest.approx(K["value"] * run["specific_force"]["value"] / DEG_H, abs=2 * u)
+        assert u == pytest.approx(np.sqrt(run["x"]["covariance"][0][0]) / DEG_H, rel=0.06)
+
+
+def test_the_table_of_runs_says_what_differs_between_them():
+    test = make_manifest(levels=[G, 5 * G], radius=2.0, net_rate=NET)
+    down = tuple(replace(run, file=f"d_{run.file}", spin_axis="down") for run in test.runs)
+    both = replace(test, runs=(*test.runs, *down))
+    record = il.fit_centrifuge(both, Simulation(both, typical_truth(), 50.0, 60.0, 5.0)).calibration
+    table = next(item for item in exhibits_of(record).items if item.title == "Runs")
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    half = len(test.runs)
+    assert [row[table.columns.index("spin axis")] for row in table.rows] == ["up"] * half + ["down"] * half
+    page = render(record, exhibits_of(record))
+    assert '<th class="text">file</th>' in page
+    assert "<th>g</th>" in page
 
 
 # --- plan --------------------------------------------------------------------------------------------------------

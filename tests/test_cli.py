@@ -151,6 +151,10 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     assert {"imulab.c", "imulab.h", "unit.c", "README.md"} <= {
         p.name for p in (tmp_path / "here" / "firmware").iterdir()
     }
+    assert {"line", "fleet.html"} <= names
+    assert 'href="fleet.html"' in (tmp_path / "here" / "index.html").read_text()
+    assert "12 of 12 units have their record; LINE-0005 stands out; bias_z drifts over the date" in done.stdout
+    assert "LINE-0007 changed since the last calibration" in done.stdout
     assert il.load(tmp_path / "here" / "tumble.json").model["order"] == 2
     assert "±" in done.stdout
     assert "down-weighted" in done.stdout

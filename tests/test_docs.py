@@ -50,3 +50,9 @@ def test_docstring_examples_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     failed, _ = doctest.testmod(importlib.import_module(name))
     assert failed == 0
+
+
+def test_the_page_on_python_describes_every_public_name():
+    page = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
+    described = re.findall(r"^\.\. auto\w+:: imulab\.(\w+)$", page, re.MULTILINE)
+    assert sorted(described) == sorted(set(imulab.__all__) - {"__version__"})

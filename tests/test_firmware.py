@@ -6,12 +6,15 @@ import subprocess
 import numpy as np
 import pytest
 
+import imulab as il
 import madeup
 from conftest import REPOSITORY
+from imulab.arraytable import METHODS
 from imulab.exporters import export
 from imulab.exporters.c import _header
+from imulab.packing import pack
 from imulab.runtime import ArraySettings, Stream, Unit, array_table
-from imulab.tables import METHODS, MODELS, pack, tables_of
+from imulab.tables import MODELS, tables_of
 
 G = madeup.G
 MANY = 1_000_000
@@ -242,6 +245,14 @@ def test_the_self_test_notices_a_wrong_number(exported, tmp_path, compiler):
     assert worst(line) > 1e-6
 
 
+def test_the_readme_speaks_of_flags_only_where_there_are_some(exported, tmp_path):
+    export("c", [madeup.warmup()], tmp_path)
+    alone, all_of_them = ((folder / "README.md").read_text(encoding="utf-8") for folder in (tmp_path, exported))
+    assert "returns flags" not in alone
+    assert "Each call but that for the warm-up returns flags" in all_of_them
+    assert all("stop at `UINT32_MAX`" in text for text in (alone, all_of_them))
+
+
 @pytest.mark.parametrize("define", [[], ["-DIMULAB_REAL=float"]])
 def test_the_code_in_the_readme_compiles_and_runs(define, exported, tmp_path, compiler):
     blocks = (exported / "README.md").read_text(encoding="utf-8").split("```")[1::2]
@@ -267,6 +278,37 @@ int main(void) {
     command = [compiler, *STRICT, *define, f"-I{exported}", *files, "-o", tmp_path / "project", "-lm"]
     subprocess.run(command, check=True)
     assert subprocess.run([tmp_path / "project"], check=False).returncode == 0
+
+
+def test_the_readme_of_an_array_leads_to_what_fuse_gives(compiler, tmp_path):
+    """In the unit and at the rate that it names; readings in rad/s, so that no conversion rounds."""
+    record = il.calibrate_array(il.simulate_array(experiment="static", duration=60.0, unit="rad/s")).calibration
+    flight = il.simulate_array(session=1, sample_rate=100.0, duration=20.0, unit="rad/s")
+    export("c", [record], tmp_path)
+    code = (tmp_path / "README.md").read_text(encoding="utf-8").split("```")[1].removeprefix("c\n")
+    assert "all gyros, in rad/s, to one rate per axis, in rad/s; 100 times a second" in code
+    steps = """
+int main(void) {
+    double z[6];
+    if (!compensation_start()) return 1;
+    while (scanf("%lf %lf %lf %lf %lf %lf", z, z + 1, z + 2, z + 3, z + 4, z + 5) == 6) {
+        const il_real reading[1][6] = {{z[0], z[1], z[2], z[3], z[4], z[5]}};
+        il_real rate[1];
+        fuse(reading, rate);
+        printf("%.17g\\n", rate[0]);
+    }
+    return 0;
+}
+"""
+    (tmp_path / "project.c").write_text(f"#include <stdio.h>\n{code}{steps}", encoding="utf-8")
+    files = [tmp_path / name for name in ("project.c", "imulab.c", "unit.c")]
+    command = [compiler, "-std=c99", "-ffp-contract=off", f"-I{tmp_path}", *files, "-o", tmp_path / "project", "-lm"]
+    subprocess.run(command, check=True)
+    rows = np.column_stack([flight.column(f"gyro_{n}") for n in range(1, 7)])
+    text = "\n".join(" ".join(map(repr, row)) for row in rows.tolist())
+    done = subprocess.run([tmp_path / "project"], input=text, capture_output=True, text=True, check=True)
+    expected = il.fuse(flight, il.FuseOptions(calibration=record)).rate[:, 0]
+    assert np.array_equal(np.array(done.stdout.split(), dtype=float), expected)
 
 
 def test_a_large_array_has_room_in_the_header():

@@ -15,7 +15,7 @@ from fleets import command, make_fleet, records, wait_for, workers_of
 from imulab.fleet.run import fleet_state, run_fleet
 from imulab.fleet.store import MOST_ATTEMPTS
 
-UNITS = 40
+UNITS = 300
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +221,7 @@ def test_workers_that_do_not_see_the_folder_send_their_records_back(fleet, refer
 
 
 def test_a_lost_scheduler_is_said_in_one_line(cluster, tmp_path):
-    fleet, folder = make_fleet(tmp_path / "in", 30, monte_carlo=3000), tmp_path / "out"
+    fleet, folder = make_fleet(tmp_path / "in", 30, monte_carlo=10000), tmp_path / "out"
     cluster.add_worker()
     process = on(cluster, fleet, folder)
     wait_for(lambda: len(list(folder.glob("*.json"))) >= 5)

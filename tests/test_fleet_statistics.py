@@ -13,9 +13,12 @@ from imulab.calibration import Parameter
 from imulab.cli import main
 from imulab.errors import ImulabError
 from imulab.fleet.display import display_of, to_parameter_unit
+from imulab.fleet.figures import summary_table
 from imulab.fleet.history import Past
 from imulab.fleet.limits import Limits, load_limits
-from imulab.fleet.run import run_fleet
+from imulab.fleet.manifest import FleetManifest
+from imulab.fleet.report import fleet_exhibits
+from imulab.fleet.run import FleetState, run_fleet
 from imulab.fleet.statistics import (
     capability,
     change_limit,
@@ -58,9 +61,32 @@ def test_a_unit_far_off_stands_out_and_does_not_hide_itself():
 
 
 def test_equal_values_and_few_units_stand_out_nowhere():
-    for values in ([1.0] * 20 + [1.5], [1.0, 2.0, 9.0], [4.0]):
+    for values in ([1.0] * 21, [1.0, 2.0, 9.0], [4.0]):
         (item,) = line_statistics([summary(str(i), v) for i, v in enumerate(values)], {})
         assert not item.outliers.any()
+
+
+def test_a_unit_among_equal_ones_stands_out_by_the_mean_distance():
+    values = [1.0] * 20 + [-1.0]  # the median distance is zero
+    (item,) = line_statistics([summary(str(i), v) for i, v in enumerate(values)], {})
+    assert item.robust_deviation == pytest.approx(math.sqrt(math.pi / 2) * 2 / 21, rel=1e-14)
+    assert np.flatnonzero(item.outliers).tolist() == [20]
+
+
+def test_few_units_of_a_procedure_have_a_table_and_no_distribution():
+    items = line_statistics([summary(str(i), float(i)) for i in range(3)], {})
+    state = FleetState("d", FleetManifest("m.csv", ".", ()), ())
+    assert [type(item).__name__ for item in fleet_exhibits(state, items, []).items] == ["Table"]
+    more = line_statistics([summary(str(i), float(i)) for i in range(4)], {})
+    found = [type(item).__name__ for item in fleet_exhibits(state, more, []).items]
+    assert found == ["Figure", "Table", "Figure"]
+
+
+def test_one_unit_is_shown_to_its_uncertainty_and_has_no_spread():
+    table = summary_table("Tumble", line_statistics([summary("A", 9.80665e-3 * 1.23456, u=9.80665e-6)], {}))
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert (row["median"], row["typical u"], row["unit"]) == ("1.23456", "0.00100", "mg")
+    assert row["robust σ"] == row["σ"] == row["drift per day"] == "–"
 
 
 @pytest.mark.slow
@@ -286,15 +312,16 @@ def test_the_report_says_what_is_there(line, capsys):
     page = (line / "r.html").read_text()
     head = page[: page.index("<dl")]
     assert "16 of 16 units have their record" in head
-    assert "bias_z drifts over the date" in head
+    assert "SN005 stands out; bias_z drifts over the date; " in head
+    assert "SN003 changed since the last calibration" in head
     assert "the smallest Cpk is" in head
     for title in ("distribution over the units", "every parameter", "over the date", "change since each unit"):
         assert f"Tumble: {title}" in page
     stands_out = page[page.index("Units that stand out") : page.index("Largest changes")]
-    assert "<td>SN005</td><td>bias_x</td>" in stands_out
+    assert '<td>SN005</td><td class="text">bias_x</td>' in stands_out
     changes = page[page.index("Largest changes") :]
     first = changes[changes.index("<tbody>") :][:600]
-    assert "<td>SN003</td><td>bias_y</td><td>5.1" in first
+    assert '<td>SN003</td><td class="text">bias_y</td><td>5.1' in first
     assert "changed" in first
     assert "2026-01-04" in first
 

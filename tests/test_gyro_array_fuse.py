@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.arraytable import ArraySettings
 from imulab.blob import Blob, make_blob
 from imulab.gyro_array.fit import calibrate_array
 from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream, parse_memory
@@ -15,7 +16,7 @@ from imulab.gyro_array.model import METHODS, find_elements
 from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording
 from imulab.runtime import Stream
-from imulab.tables import ArraySettings, tables_of
+from imulab.tables import tables_of
 from reference import gyro_array as reference
 
 
@@ -66,8 +67,9 @@ def transcribed(method: str, readings: np.ndarray, **settings: object) -> np.nda
 
 @pytest.mark.parametrize("method", ["mean", "support", "least-squares", "feedback", "robust"])
 @pytest.mark.parametrize("memory", [None, 0.02])
-def test_each_method_agrees_with_its_transcription(method, memory):
-    readings = dynamic(count=1500)[0]
+@pytest.mark.parametrize("elements", [3, 6, 9])
+def test_each_method_agrees_with_its_transcription(method, memory, elements):
+    readings = dynamic(count=1500, elements=elements)[0]
     settings = {} if method == "mean" else {"memory": memory}
     ours = fuse(array_recording(readings), FuseOptions(method=method, memory="growing" if memory is None else memory))
     np.testing.assert_allclose(ours.rate[:, 0], transcribed(method, readings, **settings), rtol=0, atol=12.5e-12)
@@ -280,6 +282,21 @@ def test_gaps_are_reported_with_place_and_length_and_fusion_goes_on():
     np.testing.assert_array_equal(ours.rate, fuse(recording).rate)
 
 
+def test_a_time_in_whole_milliseconds_has_no_gaps():
+    # 700 Hz: steps of 1 and 2 ms. One sample in a hundred missing at 100 Hz: that is a gap.
+    recording = array_recording(np.random.default_rng(1).standard_normal((7000, 4)))
+    coarse = recording.with_columns({"time": np.round(np.arange(7000) / 0.7)}, {"time": "ms"})
+    fuser = Fuser(FuseOptions())
+    list(fuser.fuse([coarse]))
+    assert fuser.notes() == []
+    assert fuser.clock.rate == pytest.approx(700, rel=0.1)
+    holes = np.delete(np.arange(7000) * 10.0, np.arange(50, 7000, 100))
+    kept = {n: c[: len(holes)] for n, c in recording.columns.items()} | {"time": holes}
+    fuser = Fuser(FuseOptions())
+    list(fuser.fuse([Recording(kept, recording.units | {"time": "ms"}, name="a.csv")]))
+    assert fuser.notes()[-1] == "a.csv: 67 more gaps; 1.4 s in all 70 together"
+
+
 def test_elements_on_clocks_of_their_own_are_brought_to_one():
     time = np.arange(3000) / 50
     rng = np.random.default_rng(4)
@@ -346,6 +363,30 @@ def test_the_real_array_reaches_its_split_half_figures(real_data, capsys):
     np.testing.assert_allclose(found["mean"], [0.197, 0.174, 0.103], atol=0.002)
 
 
+def test_a_jump_in_the_real_array_reaches_the_mean_and_not_robust(real_data):
+    # Gyro 4 steps by -0.12 deg/s about z at 46 to 80 s. An eighth of it is 0.42 deg over the 28 s at rest.
+    whole = il.read(real_data / "mimu4444" / "exp_1.bin")
+
+    def part(start, stop):
+        here = (whole.time >= start) & (whole.time < stop)
+        return Recording({n: c[here] for n, c in whole.columns.items()}, whole.units, name="part")
+
+    def angle(method, record, start):
+        fused = fuse(part(start, 495.93), FuseOptions(method=method, calibration=record))
+        if method == "robust" and start == 0.0:
+            jumped = (fused.flags[:, 2] & 8 > 0) & (fused.time < 460.0)[:, None]
+            assert np.flatnonzero(jumped.any(axis=0)).tolist() == [3]
+            assert fused.time[jumped[:, 3]][0] == pytest.approx(75.3, abs=0.1)
+        return abs(fused.rate[fused.time >= 467.7, 2].sum() / 62.5)
+
+    before = calibrate_array(part(0.0, 19.0), whole).calibration
+    assert angle("mean", before, 0.0) == pytest.approx(1.12, abs=0.02)
+    assert angle("robust", before, 0.0) == pytest.approx(1.12 - 0.42, abs=0.05)
+    after = calibrate_array(part(468.5, 495.5), whole).calibration
+    assert angle("robust", after, 0.0) == pytest.approx(0.42, abs=0.05)
+    assert angle("robust", after, 300.0) < 0.05
+
+
 # ---- options --------------------------------------------------------------------------------------------------------
 
 
@@ -357,7 +398,9 @@ def test_memory_is_growing_or_a_gain(text, memory):
     assert parse_memory(text) == memory
 
 
-@pytest.mark.parametrize("text", ["0", "1", "-0.1", "nan", "inf", "growing:0", "growing:x", "fading", ""])
+@pytest.mark.parametrize(
+    "text", ["0", "1", "-0.1", "nan", "inf", "growing:0", "growing:99999999999", "growing:x", "fading", ""]
+)
 def test_other_memories_are_refused(text):
     from imulab.errors import OptionError
 

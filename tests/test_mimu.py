@@ -44,10 +44,10 @@ def test_damage_is_skipped_and_said(tmp_path):
     frames = log(30)
     frames[7] = frames[7][:50] + bytes([frames[7][50] ^ 1]) + frames[7][51:]
     del frames[20:23]
-    (tmp_path / "log.bin").write_bytes(ACKNOWLEDGED + b"".join(frames) + frames[0][:40])
+    (tmp_path / "log.bin").write_bytes(ACKNOWLEDGED + b"".join(frames) + bytes(40))
     recording = il.read(tmp_path / "log.bin")
     assert len(recording) == 26
-    assert recording.notes[0] == "106 bytes between frames were skipped as damaged"
+    assert recording.notes[0] == "146 bytes between frames were skipped as damaged"
     assert recording.notes[1] == "4 frames are missing from the log, the first after row 7"
     assert np.diff(recording.time).min() > 0
 
@@ -64,6 +64,20 @@ def test_what_follows_a_long_damage_is_read(tmp_path):
     assert recording.time[40] == pytest.approx(0.016 * 8540, abs=1e-9)
     (tmp_path / "tail.bin").write_bytes(b"".join(frames[:40]) + junk)
     assert il.read(tmp_path / "tail.bin").notes == ("30000 bytes between frames were skipped as damaged",)
+
+
+@pytest.mark.parametrize("left", [1, 3, 4, 40, 105])
+def test_a_log_cut_within_a_frame_is_read_up_to_there_with_a_warning(tmp_path, imulab, left):
+    whole = ACKNOWLEDGED + b"".join(log(300))
+    (tmp_path / "log.bin").write_bytes(whole + log(301)[-1][:left])
+    recording = il.read(tmp_path / "log.bin")
+    assert len(recording) == 300
+    assert recording.notes == (f"truncated: the last frame, at byte {len(whole)}, is cut; read up to there",)
+    for command in (("array", "fuse", "log.bin", "-o", "out.csv"), ("convert", "log.bin", "-o", "out.csv")):
+        done = imulab(*command)
+        assert done.returncode == 0, done.stderr
+        assert done.stderr.count(f"log.bin: truncated: the last frame, at byte {len(whole)}") == 1
+    assert "warning: truncated" in imulab("show", "log.bin").stdout
 
 
 def test_fuse_says_what_was_skipped(tmp_path, imulab):
@@ -93,7 +107,7 @@ def test_the_real_log(real_data, imulab):
     file = real_data / "mimu4444" / "exp_1.bin"
     recording = il.read(file)
     assert len(recording) == 37_439
-    assert recording.notes == ()
+    assert recording.notes == ("truncated: the last frame, at byte 3968538, is cut; read up to there",)
     assert recording.time[-1] == pytest.approx(599.0, abs=0.1)
     x1, y2 = recording.columns["gyro_x_1"], recording.columns["gyro_y_2"]
     assert np.corrcoef(x1, -y2)[0, 1] > 0.999

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imulab.errors import DataError, OptionError
-from imulab.noise import allan_deviation, analyse, read_coefficients
+from imulab.noise import allan_deviation, analyse, read_coefficients, sampling_rate
 from imulab.recording import Recording
 
 
@@ -104,6 +104,22 @@ def test_analysis_of_a_recording_is_in_si():
     assert gyro["angle_random_walk"]["unit"] == "rad/s/sqrt(Hz)"
     assert gyro["angle_random_walk"]["value"] == pytest.approx(np.radians(1) / np.sqrt(10), rel=0.05)
     assert found["columns"]["accel_x"]["angle_random_walk"]["value"] == pytest.approx(9.80665 / np.sqrt(10), rel=0.05)
+
+
+def test_coarse_stamps_do_not_change_the_sampling_rate():
+    noise = np.random.default_rng(7).standard_normal(7000)
+    coarse = Recording({"time": np.round(np.arange(7000) / 0.7), "gyro_x": noise}, {"time": "ms", "gyro_x": "deg/s"})
+    rate, notes = sampling_rate(coarse)
+    assert notes == []
+    assert rate == pytest.approx(700, rel=1e-3)
+    late = coarse.with_columns({"time": coarse.columns["time"] + np.where(np.arange(7000) >= 3500, 5000.0, 0.0)}, {})
+    rate, notes = sampling_rate(late)
+    assert len(notes) == 1
+    assert rate == pytest.approx(700, rel=1e-3)
+    kept = np.arange(7000) % 10 != 3  # every tenth sample missing at 100 Hz: gaps, and still 100 Hz
+    rate, notes = sampling_rate(Recording({"time": np.arange(7000)[kept] * 10.0}, {"time": "ms"}))
+    assert "700 gaps in time, the longest 0.02 s" in notes[0]
+    assert rate == pytest.approx(100, rel=1e-9)
 
 
 def test_the_command_prints_tables_and_json_and_refuses_in_one_line(imulab, tmp_path):

@@ -10,8 +10,9 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import RecordError
-from imulab.exhibit import Figure, Table, format_uncertain
+from imulab.exhibit import Exhibits, Figure, Table, format_uncertain
 from imulab.present import exhibits_of
+from imulab.report import render_page
 from reference import tumble as reference
 
 G = 9.80665
@@ -125,9 +126,17 @@ def test_engineering_units_of_the_parameter_table(record):
         (12.34567, 0.0996, ("12.35", "0.10")),
         (-7153.4, 21.3, ("-7153", "21")),
         (123456.7, 1234.0, ("123500", "1200")),
+        (-0.0012, 0.83, ("0.00", "0.83")),
         (1.5, None, ("1.5", "not stated")),
         (1.5, 0.0, ("1.5", "not stated")),
     ],
 )
 def test_values_are_written_to_the_second_digit_of_their_uncertainty(value, uncertainty, expected):
     assert format_uncertain(value, uncertainty) == expected
+
+
+def test_words_stand_at_the_left():
+    rows = [["1", "a.csv", "2.7e-13", "few.csv: " + "too few attitudes " * 5, "–"], ["2", "12.csv", "–", "", "–"]]
+    shown = Table("T", "", ["run", "file", "p", "reason", "none"], rows)
+    page = re.sub(r"<script>.*?</script>", "", render_page("T", "", Exhibits("", [], [shown])), flags=re.DOTALL)
+    assert re.findall("<td(.*?)>", page)[:5] == ["", ' class="text"', "", ' class="text"', ""]

@@ -10,9 +10,11 @@ import pytest
 
 import madeup
 from imulab import _runtime
+from imulab.arraytable import METHODS
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.packing import pack
 from imulab.runtime import ALONE, NOT_FINITE, ArraySettings, Stream, Unit, array_stream, array_table, fuse_table
-from imulab.tables import METHODS, pack, tables_of
+from imulab.tables import MODELS, tables_of
 
 
 def readings(samples=600, elements=6, axes=1, seed=1):
@@ -270,6 +272,23 @@ def test_inputs_are_left_alone():
     assert same(untouched[0], raw[0])
     with pytest.raises(ValueError, match="an argument or a setting that cannot be"):
         Unit.of(table).warmup(20.0, 0.0, np.arange(4, dtype=np.uint32), raw)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_warmup_fills_columns_of_other_units(model):
+    """From the bias alone, found by subtracting from zero; a factor of two to some power rounds nothing."""
+    rng = np.random.default_rng(9)
+    unit = Unit.of(*tables_of(madeup.warmup(model, "taper")))
+    ticks = np.sort(rng.integers(0, int(1.3 * madeup.SETTLED / madeup.TICK), 5000)).astype(np.uint32)
+    raw = list(rng.uniform(-1, 1, (2, 5000)))
+    bias, _ = unit.warmup(21.5, madeup.TICK, ticks, [np.zeros(5000), np.zeros(5000)])
+    into = [np.full(5000, np.nan), np.full(5000, np.nan)]
+    out, covered = unit.warmup(21.5, madeup.TICK, ticks, raw, factors=[64.0, 0.5], into=into)
+    assert covered
+    assert out[0] is into[0]
+    assert same(np.array(into), np.array([raw[0] + 64 * bias[0], raw[1] + 0.5 * bias[1]]))
+    with pytest.raises(ValueError, match="expected 2 items, found 3"):
+        unit.warmup(21.5, madeup.TICK, ticks, raw, factors=[1.0, 1.0, 1.0])
 
 
 def test_threads_may_share_a_unit():

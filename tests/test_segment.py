@@ -374,6 +374,21 @@ def test_coarse_counts_are_not_called_clipped(noise, seed):
     )
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.3, 2.0])
+@pytest.mark.parametrize("part", [1, 100, 2000])
+def test_the_smallest_step_of_all_samples_decides_where_a_part_could(noise, part, monkeypatch):
+    samples, time, _ = tumble(DIRECTIONS, noise=noise * G / 256)
+    counts = np.round(256 / G * samples)
+    counts[:3000] = 8 * np.round(counts[:3000] / 8)  # the first samples have larger steps than the others
+    monkeypatch.setattr(segment, "_A_PART", part)
+    few = find_attitudes(recording(counts, time, "count"))
+    monkeypatch.setattr(segment, "_A_PART", None)
+    exact = find_attitudes(recording(counts, time, "count"))
+    np.testing.assert_array_equal(few.covariance, exact.covariance)
+    np.testing.assert_array_equal(few.mean, exact.mean)
+    assert few.trace.threshold == exact.trace.threshold
+
+
 def test_clipping_in_motion_only_is_no_matter():
     samples, time, holds = tumble(DIRECTIONS)
     moving = np.ones(len(time), dtype=bool)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from imulab.tumble.model import invert, norm_and_jacobian, parameter_names
+from imulab.estimate import levenberg_marquardt
+from imulab.tumble.model import fit_lengths, invert, norm_and_jacobian, parameter_names
 from reference import tumble as reference
 
 G = 9.80665
@@ -60,3 +61,57 @@ def test_a_batch_gives_each_problem_what_it_gets_alone():
         np.testing.assert_allclose(norm[i], alone[0][0], rtol=1e-15)
         np.testing.assert_allclose(jacobian[i], alone[1][0], rtol=0, atol=1e-15)
         np.testing.assert_allclose(q[i], alone[3][0], rtol=1e-14)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_the_fit_in_c_takes_the_steps_of_levenberg_and_marquardt(order):
+    rng = np.random.default_rng(20 + order)
+    start = np.zeros((6, 3 * (order + 2)))
+    start[:, 3:6] = 1.0
+    reading = reference.random_attitudes(rng, 30)[None] * 1.03 + 0.01
+    weights = rng.uniform(0.5, 2.0, (6, 30))
+    weights[np.arange(6), np.arange(6)] = 0.0
+    lengthening = rng.uniform(0, 1e-4, (6, 30))
+
+    def model(theta, index):
+        norm, jacobian, _, _ = norm_and_jacobian(theta, reading, order)
+        return norm - 1 - lengthening[index], jacobian
+
+    for most in (1, 2, 3):
+        expected = levenberg_marquardt(model, start, weights, max_iterations=most)
+        found = fit_lengths(start, reading, weights, lengthening, order, tolerance=1e-9, most=most)
+        np.testing.assert_allclose(found.parameters, expected.parameters, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.residuals, expected.residuals, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.jacobian, expected.jacobian, rtol=0, atol=1e-11)
+        assert found.iterations.tolist() == expected.iterations.tolist() == [most] * 6
+        assert not found.converged.any()
+    expected = levenberg_marquardt(model, start, weights)
+    found = fit_lengths(start, reading, weights, lengthening, order, tolerance=1e-9, most=60)
+    assert found.converged.all()
+    # At the end rounding decides whether a last step that the cost no longer feels is taken.
+    np.testing.assert_allclose(found.parameters, expected.parameters, rtol=0, atol=5e-9)
+
+
+def test_a_bad_start_and_what_nothing_senses_are_met_alike():
+    rng = np.random.default_rng(3)
+    reading = reference.random_attitudes(rng, 24)[None].copy()
+    reading[..., 2] = 0.0  # z is never seen
+    start = np.array([[0.4, -0.4, 0.1, 1.9, 0.6, 1.0, 0.3, 0.1, 0.1, 0.05, 0.05, 0.05]])
+
+    def model(theta, index):
+        norm, jacobian, _, _ = norm_and_jacobian(theta, reading, 2)
+        return norm - 1, jacobian
+
+    expected = levenberg_marquardt(model, start, np.ones((1, 24)), max_iterations=6)
+    found = fit_lengths(start, reading, np.ones((1, 24)), np.zeros((1, 24)), 2, tolerance=1e-9, most=6)
+    np.testing.assert_allclose(found.residuals, expected.residuals, rtol=0, atol=1e-9)
+    start[:] = np.nan
+    lost = fit_lengths(start, reading, np.ones((1, 24)), np.zeros((1, 24)), 2, tolerance=1e-9, most=6)
+    assert not lost.converged[0]
+
+
+def test_arrays_that_do_not_go_together_are_refused():
+    with pytest.raises(ValueError, match="do not go together"):
+        norm_and_jacobian(np.zeros((2, 9)), np.zeros((3, 5, 3)), 1)
+    with pytest.raises(ValueError, match="do not go together"):
+        fit_lengths(np.ones((1, 9)), np.ones((1, 5, 3)), np.ones((1, 4)), np.ones((1, 4)), 1, tolerance=1.0, most=1)

@@ -10,8 +10,9 @@ import pytest
 import madeup
 from imulab.calibration import Parameter
 from imulab.errors import RecordError
+from imulab.packing import KINDS, pack
 from imulab.runtime import ArraySettings, Unit, array_table
-from imulab.tables import KINDS, monotone_range, pack, tables_of, warmup_table
+from imulab.tables import monotone_range, tables_of, warmup_table
 
 
 def fields_of(table):

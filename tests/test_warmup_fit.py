@@ -168,22 +168,32 @@ STATED = {
     },
 }
 JUMPS = {"smooth": 108, "bent": 202}
+TESTS = 8
 
 
 @pytest.mark.parametrize("law", ["smooth", "bent"])
-def test_the_table_of_models_comes_out_as_stated(fits, law):
-    rows = {row.label: row for row in fits[law].models}
+def test_the_table_of_models_comes_out_as_stated(law):
+    """Entry by entry, pooled over tests: one test's errors are the draw of three cycles at each temperature."""
+    squares = {name: [] for name in STATED[law]}
+    jumps = []
+    for seed in range(TESTS):
+        cycles = [
+            find_power_cycle(il.simulate_warmup(t, law=law, sample_rate=2.0, seed=[100 + seed, i, c]))
+            for i, t in enumerate(AT)
+            for c in range(3)
+        ]
+        rows = {row.label: row for row in il.fit_warmup(cycles, settling_time=END).models}
+        for name, collected in squares.items():
+            table = None if name == "none" else rows[name].table
+            collected.append([error(table, at, law) ** 2 for at in (AT, [10], [20], [30])])
+        jumps.append(rows["interval-cubic"].edge_jump[:3].max() / HOUR)
     for name, stated in STATED[law].items():
-        table = None if name == "none" else rows[name].table
-        found = [error(table, at, law) for at in (AT, [10], [20], [30])]
+        found = np.sqrt(np.mean(squares[name], axis=0))
         print(law, name, np.round(found, 1), stated)
-        ratio = np.sqrt(np.mean(np.square(found)) / np.mean(np.square(stated)))
-        assert 1 / 1.5 < ratio < 1.5
-        if "exponential" not in name:  # those are up to 2.4 times better than stated where the law bends
-            assert (np.array(found) / stated).max() < 1.5
-            assert (np.array(found) / stated).min() > 1 / 1.5
-    jump = rows["interval-cubic"].edge_jump[:3].max() / HOUR
-    assert 1 / 1.5 < jump / JUMPS[law] < 1.5
+        assert (found / stated).max() < 1.5
+        assert (found / stated).min() > 1 / 2  # better, at 30 degC: two exponentials where the law bends
+        assert 1 / 1.5 < np.sqrt(np.mean(found**2) / np.mean(np.square(stated))) < 1.5
+    assert 1 / 1.5 < np.mean(jumps) / JUMPS[law] < 1.5
 
 
 @pytest.mark.parametrize("law", ["smooth", "bent"])

@@ -6,7 +6,7 @@ from scipy.interpolate import PchipInterpolator
 
 from imulab.errors import RecordError
 from imulab.warmup.model import Table, edge_jumps, evaluate, exit_jump, table_from
-from imulab.warmup.solve import pchip_slopes
+from imulab.warmup.solve import amplitude_slopes
 from imulab.warmup.table import evaluate_float32, to_int16
 from reference import warmup as reference
 
@@ -29,7 +29,7 @@ def a_table(model="interval-cubic", exit_rule="zero", seed=1):
         exit=exit_rule,
         time_scale=20.0 if model == "knot-log-cubic" else None,
         time_constants=(25.0, 120.0) if model == "exponential" else (),
-        slopes=pchip_slopes(AT, c) if model == "exponential" else None,
+        slopes=amplitude_slopes(AT, c, (25.0, 120.0)) if model == "exponential" else None,
     )
 
 
@@ -66,11 +66,49 @@ def test_nan_in_time_comes_out_and_time_before_power_on_counts_as_power_on():
     np.testing.assert_array_equal(z[:, 1], z[:, 2])
 
 
-def test_slopes_are_those_of_scipy_and_amplitudes_run_on_its_curve():
+def test_between_knots_the_curve_at_the_time_constants_runs_on_scipys_monotone_cubics():
     table = a_table("exponential")
-    curve = PchipInterpolator(AT, table.coefficients, axis=0)
+    instants = np.array(table.time_constants)
+    curve = PchipInterpolator(AT, np.stack([evaluate(table, instants, at) for at in AT]), axis=0)
     for temperature in np.linspace(-40, 60, 37):
-        np.testing.assert_allclose(table.coefficients_at(temperature), curve(temperature), rtol=1e-12, atol=1e-18)
+        found = evaluate(table, instants, temperature)
+        np.testing.assert_allclose(found, curve(temperature), rtol=1e-11, atol=1e-16)
+
+
+def test_errors_that_cancel_in_the_curve_at_the_knots_cancel_between_them():
+    """Amplitudes of 20 and 32 s (the closest that a fit may find) off by +1 and nearly -1: what is left is small."""
+    constants = (20.0, 32.0)
+    rng = np.random.default_rng(4)
+    amplitudes = np.column_stack([100 - AT, 0.02 * AT**2])[:, None, :]
+    off = 10 * rng.standard_normal(len(AT))[:, None, None] * np.array([1.0, -np.exp(-1) / np.exp(-20 / 32)])
+    time = np.linspace(0, 300, 301)
+
+    def curve(amplitude, slopes, temperature):
+        row = np.searchsorted(AT, temperature) - 1
+        h, s = AT[row + 1] - AT[row], (temperature - AT[row]) / (AT[row + 1] - AT[row])
+        at = (1 + 2 * s) * (1 - s) ** 2 * amplitude[row] + s * s * (3 - 2 * s) * amplitude[row + 1]
+        at = at + h * (s * (1 - s) ** 2 * slopes[row] - s * s * (1 - s) * slopes[row + 1])
+        return (at @ np.exp(-time / np.array(constants)[:, None]))[0]
+
+    left = []
+    for slopes_of in (
+        lambda a: amplitude_slopes(AT, a, constants),
+        lambda a: PchipInterpolator(AT, a).derivative()(AT),
+    ):
+        changes = [
+            curve(amplitudes + off, slopes_of(amplitudes + off), t) - curve(amplitudes, slopes_of(amplitudes), t)
+            for t in np.linspace(-39.5, 59.5, 50)
+        ]
+        left.append(np.sqrt(np.mean(np.square(changes))))
+    at_knots = np.sqrt(np.mean(np.square((off @ np.exp(-time / np.array(constants)[:, None]))[:, 0])))
+    assert left[0] < 1.1 * at_knots
+    assert left[1] > 1.3 * at_knots  # what each amplitude by itself would leave
+
+
+def test_slopes_of_constants_that_coincide_are_finite():
+    c = np.random.default_rng(2).standard_normal((len(AT), 2, 2))
+    found = amplitude_slopes(AT, c, (50.0, 50.0))
+    np.testing.assert_array_equal(found, PchipInterpolator(AT, c, axis=0).derivative()(AT))
 
 
 def test_jumps_are_those_seen_on_either_side_of_an_edge():

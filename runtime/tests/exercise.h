@@ -24,10 +24,11 @@ static inline void exercise(const il_unit *unit) {
             static il_real columns[EXERCISE_AXES][8];
             il_real bias[EXERCISE_AXES], *place[EXERCISE_AXES];
             il_warmup_state state;
-            for (unsigned i = 0; i < EXERCISE_AXES; i++) place[i] = i % 3 == 1 ? NULL : columns[i];
+            const il_real *from[EXERCISE_AXES];
+            for (unsigned i = 0; i < EXERCISE_AXES; i++) from[i] = place[i] = i % 3 == 1 ? NULL : columns[i];
             (void)il_warmup_start(&unit->warmup, &state, k < 4 ? (il_real)(20.0 * k) - (il_real)10 : odd[k], (il_real)0.1);
             il_warmup_bias(&unit->warmup, &state, ticks[k], bias);
-            il_warmup_block(&unit->warmup, &state, 8, ticks, place);
+            il_warmup_block(&unit->warmup, &state, 8, ticks, from, NULL, place);
         }
     }
     if (unit->has & IL_HAS_ARRAY) {

@@ -97,7 +97,8 @@ static void copy_six(void) {
 }
 
 static void warmup(void) {
-    il_warmup_block(&table, &warm, N, ticks, out);
+    const il_real *const from[AXES] = {in[0], in[1], in[2], in[3], in[4], in[5]};
+    il_warmup_block(&table, &warm, N, ticks, from, NULL, out);
 }
 
 static void warmups(void) {

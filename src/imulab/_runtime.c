@@ -8,7 +8,7 @@
 
 #include "imulab.h"
 
-enum { MOST = 256 }; /* columns in one call */
+enum { MOST = 512 }; /* columns in one call */
 #define CAPSULE "imulab.unit"
 
 typedef struct {
@@ -188,24 +188,31 @@ static PyObject *centrifuge(PyObject *self, PyObject *args) {
 
 static PyObject *warmup(PyObject *self, PyObject *args) {
     (void)self;
-    PyObject *capsule, *ticks, *outputs, *result = NULL;
+    PyObject *capsule, *ticks, *inputs, *factors, *outputs, *result = NULL;
     double temperature, tick;
     buffers b = {.count = 0};
-    il_real *out[MOST];
-    if (!PyArg_ParseTuple(args, "OddOO", &capsule, &temperature, &tick, &ticks, &outputs)) return NULL;
+    il_real *in[MOST], *out[MOST];
+    const il_real *from[MOST];
+    if (!PyArg_ParseTuple(args, "OddOOOO", &capsule, &temperature, &tick, &ticks, &inputs, &factors, &outputs)) return NULL;
     il_unit *unit = unit_of(capsule, IL_HAS_WARMUP);
     if (unit == NULL) return NULL;
-    if (unit->warmup.axes > MOST - 1) {
+    int axes = unit->warmup.axes;
+    if (axes > (MOST - 2) / 2) {
         PyErr_SetString(PyExc_ValueError, "too many columns");
         return NULL;
     }
     const uint32_t *when = memory_of(&b, ticks, 'I', -1, 0);
     Py_ssize_t n = when != NULL ? items(&b, 0) : 0;
-    if (when != NULL && columns_of(&b, outputs, unit->warmup.axes, &n, 1, 1, out)) {
+    const il_real *factor = when != NULL ? memory_of(&b, factors, 'd', axes, 0) : NULL;
+    if (factor != NULL && columns_of(&b, inputs, axes, &n, 0, 1, in) && columns_of(&b, outputs, axes, &n, 1, 1, out)) {
         il_warmup_state state;
         il_status status = il_warmup_start(&unit->warmup, &state, temperature, tick);
+        for (int i = 0; i < axes; i++) {
+            from[i] = in[i];
+            if (in[i] == NULL) out[i] = NULL;
+        }
         Py_BEGIN_ALLOW_THREADS
-        if (status == IL_OK) il_warmup_block(&unit->warmup, &state, (size_t)n, when, out);
+        if (status == IL_OK) il_warmup_block(&unit->warmup, &state, (size_t)n, when, from, factor, out);
         Py_END_ALLOW_THREADS
         if (status != IL_OK) PyErr_SetString(PyExc_ValueError, il_status_text(status));
         else result = PyBool_FromLong(state.active);
@@ -272,7 +279,7 @@ static PyMethodDef METHODS[] = {
     {"tumble", tumble, METH_VARARGS, "tumble(unit, outputs, forces): flags; tuples of three float64 columns."},
     {"gyro", gyro, METH_VARARGS, "gyro(unit, outputs, forces or None, rates): flags."},
     {"centrifuge", centrifuge, METH_VARARGS, "centrifuge(unit, forces, rates): flags; rates are changed in place."},
-    {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, outputs): whether the table covers it; in place."},
+    {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, inputs, factors, outputs): whether the table covers it."},
     {"array_start", array_start, METH_O, "array_start(unit): the state of a stream, as a bytearray."},
     {"array_block", array_block, METH_VARARGS, "array_block(unit, state, readings, still, rates, flags, weights): flags met."},
     {NULL, NULL, 0, NULL},

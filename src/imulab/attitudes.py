@@ -75,6 +75,9 @@ class Attitudes:
     swing: Array | None = None
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Attitudes({len(self)} of {self.recording.name}, in {self.unit})"
+
     def __len__(self) -> int:
         return len(self.mean)
 

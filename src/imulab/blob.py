@@ -11,8 +11,9 @@ from typing import Any
 
 from imulab.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.errors import RecordError
+from imulab.packing import TEXT, Table, pack
 from imulab.runtime import Unit
-from imulab.tables import TEXT, Table, pack, tables_of
+from imulab.tables import tables_of
 
 FORMAT = "imulab.blob"
 _HEAD = 16

@@ -6,11 +6,10 @@ a SHA-256 of each source file and of its own content, so that an altered record 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -22,9 +21,10 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.errors import RecordError
 from imulab.files import write_text
+from imulab.jsontext import all_floats, content_sha256, sealed_text
+from imulab.jsontext import json_text as json_text
 from imulab.recording import Source
 
-_encode_string = json.encoder.encode_basestring
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
 BLOB_MAGIC = b"\x89IMULAB\n"
@@ -108,6 +108,11 @@ class Calibration:
         RecordError
             A number is not finite.
         """
+        plain = self._plain()
+        return {**plain, "content_sha256": content_sha256(plain)}
+
+    def _plain(self) -> dict[str, Any]:
+        """Return the record as plain JSON values without ``content_sha256``."""
         content: dict[str, Any] = {
             "format": FORMAT,
             "version": self.version,
@@ -115,10 +120,13 @@ class Calibration:
             "sensor": dict(self.sensor),
             "created": self.created,
             "software": self.software,
-            "sources": [asdict(source) for source in self.sources],
+            "sources": [{"file": source.file, "sha256": source.sha256} for source in self.sources],
             "model": self.model,
-            "parameters": {name: asdict(parameter) for name, parameter in self.parameters.items()},
-            "covariance": asdict(self.covariance),
+            "parameters": {
+                name: {"value": p.value, "standard_uncertainty": p.standard_uncertainty, "unit": p.unit}
+                for name, p in self.parameters.items()
+            },
+            "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},
             "options": self.options,
             "fit": self.fit,
             "warnings": list(self.warnings),
@@ -126,11 +134,15 @@ class Calibration:
             "data": self.data,
         }
         plain: dict[str, Any] = plain_values(content, "")
-        return {**plain, "content_sha256": content_sha256(plain)}
+        return plain
+
+    def sealed(self) -> tuple[str, str]:
+        """Return the record's ``content_sha256`` and its JSON text, which ends with it; errors as for `to_dict`."""
+        return sealed_text(self._plain())
 
     def to_json(self) -> str:
         """Return the record as JSON text."""
-        return json_text(self.to_dict())
+        return self.sealed()[1]
 
     def save(self, path: str | Path) -> None:
         """Write the record, whole or not at all.
@@ -152,33 +164,6 @@ class Calibration:
         return "\n".join(lines)
 
 
-def json_text(content: Mapping[str, Any]) -> str:
-    """Return a record's content (`Calibration.to_dict`) as the text of its file.
-
-    The text is that of ``json.dumps(content, indent=1, ensure_ascii=False)``, whose encoder is slow with an indent.
-    """
-    return _text(content, "\n") + "\n"
-
-
-def _text(value: Any, line: str) -> str:
-    """Return plain JSON values as text; `line` is a line break with the indent of what surrounds the value."""
-    inner = line + " "
-    if isinstance(value, dict):
-        if not value:
-            return "{}"
-        items = [f"{_encode_string(key)}: {_text(item, inner)}" for key, item in value.items()]
-        return "{" + inner + ("," + inner).join(items) + line + "}"
-    if isinstance(value, list):
-        if not value:
-            return "[]"
-        if all(type(item) is float for item in value):
-            return "[" + inner + ("," + inner).join(map(float.__repr__, value)) + line + "]"
-        return "[" + inner + ("," + inner).join([_text(item, inner) for item in value]) + line + "]"
-    if type(value) is float:
-        return float.__repr__(value)
-    return json.dumps(value, ensure_ascii=False, allow_nan=False)
-
-
 def load(path: str | Path) -> Calibration:
     """Read a calibration record.
 
@@ -187,17 +172,27 @@ def load(path: str | Path) -> Calibration:
     RecordError
         The file is missing, is no record, is of a newer version, was altered, or lacks something.
     """
+    return load_sealed(path)[0]
+
+
+def load_sealed(path: str | Path) -> tuple[Calibration, str]:
+    """Read a calibration record and its ``content_sha256``; errors as for `load`."""
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:
         raise RecordError(f"{path}: no such file") from None
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
-    return loads(data, str(path))
+    return loads_sealed(data, str(path))
 
 
 def loads(data: bytes, name: str) -> Calibration:
     """Read a calibration record from the bytes of its file; errors as for `load`."""
+    return loads_sealed(data, name)[0]
+
+
+def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
+    """Return a record from the bytes of its file, and its ``content_sha256``; errors as for `load`."""
     if data.startswith(BLOB_MAGIC):
         raise RecordError(
             f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
@@ -207,6 +202,8 @@ def loads(data: bytes, name: str) -> Calibration:
         content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
         reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
+        if not data.lstrip().startswith(b"{"):
+            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
         raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')
@@ -227,19 +224,7 @@ def loads(data: bytes, name: str) -> Calibration:
         raise RecordError(f"{name}: the record was altered after it was written ({error})") from None
     if stated != found:
         raise RecordError(f"{name}: the record was altered after it was written (its content_sha256 does not match)")
-    return _validated(content, name)
-
-
-def content_sha256(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of the record's JSON without ``content_sha256``: keys sorted, no spaces, UTF-8."""
-    text = json.dumps(
-        {key: value for key, value in content.items() if key != "content_sha256"},
-        sort_keys=True,
-        separators=(",", ":"),
-        ensure_ascii=False,
-        allow_nan=False,
-    )
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+    return _validated(content, name), found
 
 
 @cache
@@ -285,17 +270,20 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
 
 def plain_values(value: Any, where: str) -> Any:
     """Return `value` as plain JSON types; refuse numbers that are not finite."""
+    kind = type(value)
+    if kind is str or value is None or (kind is float and math.isfinite(value)):
+        return value  # as most are
     if isinstance(value, np.ndarray):
         value = value.tolist()
     elif isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         raise RecordError(f"record: {where.lstrip('.')} is {value}; a record holds finite numbers only")
-    if isinstance(value, Mapping):
+    if kind is dict or isinstance(value, Mapping):
         return {str(key): plain_values(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        if all(type(item) is float for item in value) and all(map(math.isfinite, value)):
-            return list(value)  # as most are
+        if all_floats(value) and all(map(math.isfinite, value)):
+            return list(value)
         return [plain_values(item, f"{where}[{index}]") for index, item in enumerate(value)]
     return value
 

@@ -33,9 +33,10 @@ def check_clipping(recording: Recording, names: list[str], pieces: NDArray[np.in
     """
     for column in names:
         values = recording.column(column)
-        if values.min() == values.max():
+        smallest, largest = values.min(), values.max()
+        if smallest == largest:
             continue  # not clipped but dead, which is for the procedure to say
-        for extreme, side in ((values.max(), "largest"), (values.min(), "smallest")):
+        for extreme, side in ((largest, "largest"), (smallest, "smallest")):
             ties = values == extreme
             if np.count_nonzero(ties) < _FEWEST_SAMPLES:
                 continue

@@ -1,4 +1,4 @@
-"""The demonstration: the four procedures on simulated instruments, by the commands that a user would type."""
+"""The demonstration: four procedures and a fleet on simulated instruments, by the commands a user would type."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ from imulab.report import Card, render_index
 
 @dataclass(frozen=True)
 class Scenario:
-    """A question, the commands that answer it, and the record that they write."""
+    """A question, the commands that answer it, the record or fleet's folder that they write, and the report."""
 
     name: str
     question: str
     commands: str
     record: str
+    report: str
 
     @property
     def lines(self) -> list[str]:
@@ -45,6 +46,7 @@ imulab tumble fit tumble.csv --gravity 9.81362 --loss huber -o tumble.json --rep
 imulab apply tumble.json tumble.csv -o tumble_corrected.csv
 """,
         "tumble.json",
+        "tumble.html",
     ),
     Scenario(
         "gyro array",
@@ -58,6 +60,7 @@ imulab array fuse array_fault.csv --calibration array_calibration.json -o array_
 imulab array compare array.csv --calibration array_calibration.json -o array.json --report array.html
 """,
         "array.json",
+        "array.html",
     ),
     Scenario(
         "warm-up",
@@ -67,6 +70,7 @@ imulab warmup simulate -o warmup
 imulab warmup fit warmup/*.csv --model auto -o warmup.json --report warmup.html
 """,
         "warmup.json",
+        "warmup.html",
     ),
     Scenario(
         "centrifuge",
@@ -76,6 +80,19 @@ imulab centrifuge simulate --levels 1,5,10,20 --duration "3 min" --both-senses -
 imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report centrifuge.html
 """,
         "centrifuge.json",
+        "centrifuge.html",
+    ),
+    Scenario(
+        "fleet",
+        "Is the production line still making the same thing?",
+        """
+imulab fleet simulate -o line
+imulab fleet run line/first.csv -o line/records --workers 1
+imulab fleet run line/second.csv -o line/records --workers 1
+imulab fleet report line/records --limits line/limits.toml -o fleet.html
+""",
+        "line/records",
+        "fleet.html",
     ),
     Scenario(
         "firmware",
@@ -84,6 +101,7 @@ imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report ce
 imulab export --to c tumble.json -o firmware
 make -C firmware test
 """,
+        "",
         "",
     ),
 )
@@ -115,9 +133,11 @@ def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
                 said = _done(line, main)
             answer, figure = (said, None) if not scenario.record else _found(scenario)
             lines += [f"  {answer}", ""]
-            link = scenario.record.replace(".json", ".html")
-            cards.append(Card(scenario.question, answer, scenario.lines, figure, link))
-        lead = "Four procedures on simulated instruments: the question, the answer, and the commands that found it."
+            cards.append(Card(scenario.question, answer, scenario.lines, figure, scenario.report))
+        lead = (
+            "Four procedures and a production line on simulated instruments: the question, the answer, and the "
+            "commands that found it."
+        )
         write_text("index.html", render_index("imulab demonstration", lead, cards))
     return "\n".join([*lines, f"firmware: {home / 'firmware'}", f"open {home / 'index.html'}"])
 
@@ -158,6 +178,11 @@ def _done(line: str, main: Callable[[list[str]], int]) -> str:
 
 
 def _found(scenario: Scenario) -> tuple[str, Figure | None]:
-    exhibits = exhibits_of(load(scenario.record))
+    if Path(scenario.record).is_dir():
+        from imulab.fleet.report import exhibits_of_folder
+
+        exhibits = exhibits_of_folder(scenario.record, limits="line/limits.toml")
+    else:
+        exhibits = exhibits_of(load(scenario.record))
     figures = [item for item in exhibits.items if isinstance(item, Figure)]
     return exhibits.headline, figures[0] if figures else None

@@ -198,17 +198,19 @@ def observability(jacobian: Array, weights: Array) -> Observability:
     Parameters must be scaled so that the model's second derivatives are of order one.
     """
     used = weights > 0
-    size = jacobian.shape[1]
-    weighted = np.zeros((max(int(used.sum()), size), size))
-    weighted[: int(used.sum())] = jacobian[used] * np.sqrt(weights[used])[:, None]
-    scale = np.linalg.norm(weighted, axis=0)
+    if not used.all():
+        jacobian, weights = jacobian[used], weights[used]
+    count, size = jacobian.shape
+    weighted = np.zeros((max(count, size), size))
+    weighted[:count] = jacobian * np.sqrt(weights)[:, None]
+    scale = np.sqrt(np.einsum("np,np->p", weighted, weighted))
     scale = np.where(scale > _SENSED * scale.max(), scale, scale.max())
     _, values, vectors = np.linalg.svd(weighted / scale, full_matrices=False)
     values = np.maximum(values, np.finfo(float).eps * values[0])
     directions = vectors / scale
-    length = np.linalg.norm(directions, axis=1)
+    length = np.sqrt(np.einsum("ap,ap->a", directions, directions))
     uncertainty = length / values
-    noise = 1 / np.sqrt(np.median(weights[used]))
+    noise = 1 / np.sqrt(np.median(weights))
     determined = (values > values[0] / _WORST_CONDITION) & (uncertainty**2 / 2 < _WORST_CURVATURE * noise)
     return Observability(
         rank=int(determined.sum()),

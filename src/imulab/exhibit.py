@@ -70,4 +70,4 @@ def format_uncertain(value: float, uncertainty: float | None, digits: int = 2) -
         places -= 1
     if places < 0:
         return f"{round(value, places):.0f}", f"{round(uncertainty, places):.0f}"
-    return f"{value:.{places}f}", f"{uncertainty:.{places}f}"
+    return f"{value:z.{places}f}", f"{uncertainty:.{places}f}"

@@ -15,19 +15,22 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.recording import Array, Recording, check_finite, check_time
-from imulab.units import parse_unit
+from imulab.units import from_si, parse_unit
 
 _CHUNK = 1 << 14
 _DENSE_PER_DECADE = 24
 _FEWEST = 3
 _LONGEST = 5  # coefficients are read from averaging times up to this part of the recording
 _GAP = 1.5
+_COARSE = 0.2
 _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
-"""Correlation of estimates an octave apart; measured on white noise and random walk (.45 to .6), falling as its
-power."""
+"""Of estimates an octave apart, measured on white noise and random walk (.45 to .6); falls as its power."""
 _SENSORS = ("gyro", "dtg", "fog", "accel")
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
+_STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
+"""How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
+_NOISE_REACH = 20.0
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,19 @@ def noise_columns(recording: Recording) -> Iterator[str]:
     return (name for name in recording.columns if name.split("_")[0] in _SENSORS)
 
 
+def usual_step(step: Array) -> tuple[float, float]:
+    """Return the usual step of time, s, and the longest that is no gap, from steps of time, shape (n,), n >= 1.
+
+    Beyond 1.5 times the median a step is a gap, unless a fifth of all steps are: then time is written that coarsely
+    (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
+    fifth exceed. The usual step is the mean of those that are no gaps.
+    """
+    longest = _GAP * float(np.median(step))
+    if np.mean(step > longest) > _COARSE:
+        longest = _GAP * float(np.quantile(step, 1 - _COARSE))
+    return float(step[step <= longest].mean()), longest
+
+
 def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     """Return the sampling rate, Hz, of a recording, and what there is to say of gaps in its time.
 
@@ -200,15 +216,14 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     if len(time) < _FEWEST:
         raise DataError(f"{recording.name}: {len(time)} samples are too few; expected at least {_FEWEST}")
     step = np.diff(time)
-    usual = float(np.median(step))
-    wide = np.flatnonzero(step > _GAP * usual)
+    usual, longest = usual_step(step)
+    wide = np.flatnonzero(step > longest)
     if not wide.size:
         return (len(time) - 1) / float(time[-1] - time[0]), []
     worst = int(wide[np.argmax(step[wide])])
     return 1 / usual, [
-        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest "
-        f"{step[worst]:.3g} s after "
-        f"{recording.place(worst)}; the samples on both sides are taken as neighbours"
+        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
+        f"after {recording.place(worst)}; the samples on both sides are taken as neighbours"
     ]
 
 
@@ -227,6 +242,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
             f"{recording.name}: no sensor column (gyro_.. accel_.. dtg_.. fog); found {' '.join(recording.columns)}"
         )
     check_finite(recording, names)
+    notes += _motion_notes(recording, names, rate)
     columns: dict[str, Any] = {}
     for name in names:
         unit = {"rate": "rad/s", "acceleration": "m/s^2"}.get(
@@ -253,6 +269,28 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         "warnings": [*(f"{recording.name}: {note}" for note in recording.notes), *notes],
         "columns": columns,
     }
+
+
+def _motion_notes(recording: Recording, names: list[str], rate: float) -> list[str]:
+    """Say where means over a second range farther than any zero drifts and than noise explains: the unit moved."""
+    size = max(1, round(rate))
+    moved: dict[str, dict[str, float]] = {}
+    for name in names:
+        quantity = parse_unit(recording.units[name]).quantity
+        if quantity not in _STILL:
+            continue
+        samples = recording.si(name)
+        means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
+        reach = float(np.ptp(means)) if means.size else 0.0
+        noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
+        if reach > max(_STILL[quantity][0], _NOISE_REACH * noise):
+            moved.setdefault(quantity, {})[name] = reach
+    return [
+        f"{recording.name}: column{'s' * (len(reaches) > 1)} {' '.join(reaches)}: means over a second range over up to "
+        f"{from_si(max(reaches.values()), _STILL[quantity][1]):.3g} {_STILL[quantity][1]}: did the unit move? Then "
+        "these are the coefficients of its motion, not of its noise"
+        for quantity, reaches in moved.items()
+    ]
 
 
 def coefficients_dict(found: NoiseCoefficients, unit: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -23,6 +24,8 @@ _QUANTITIES = {
     "temperature": ("temperature", "output"),
     "table_angle": ("angle", "output"),
 }
+_CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|min)\)?)?")
+"""What loggers call the time, and the unit in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +86,10 @@ class Recording:
             check_unit(name, self.units.get(name, ""), self.name)
         object.__setattr__(self, "units", {name: self.units.get(name, "1") for name in self.columns})
 
+    def __repr__(self) -> str:
+        titles = ", ".join(f"{name} [{unit}]" for name, unit in self.units.items())
+        return f"Recording({self.name}: {len(self)} samples of {titles})"
+
     def __len__(self) -> int:
         for column in self.columns.values():
             return len(column)
@@ -107,7 +114,9 @@ class Recording:
         try:
             return self.columns[name]
         except KeyError:
-            raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}") from None
+            foreign = all(_expected(other) in (None, ("time",)) for other in self.columns)
+            hint = "; a layout says where columns of other names are (--layout; docs/recordings.md)" if foreign else ""
+            raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
 
     def si(self, name: str) -> Array:
         """Return the samples of a column in SI (counts and volts as they are), shape (n,)."""
@@ -218,15 +227,18 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
 
 def _check_name(name: str, title: str, file: str) -> None:
     """Refuse what is meant as a name of the vocabulary but is not one."""
-    if ";" in title or "\t" in title:
-        mark = "';'" if ";" in title else "a tab"
+    if ";" in title or "\t" in title or title.count("[") > 1:
+        mark = "';'" if ";" in title else "a tab" if "\t" in title else "blanks"
         raise UnitError(
-            f"{file}: titles {title.strip()[:40]!r}: separated by {mark}, expected ','; describe the file with --layout"
+            f"{file}: titles {title.strip()[:40]!r}: separated by {mark}, expected ','; describe the file with "
+            "--layout FILE.toml (imulab show --formats has an example)"
         )
     lower = name.lower()
-    meant = "time" if lower in ("t", "timestamp", "time_s", "seconds") else lower.replace(" ", "_")
+    clock = _CLOCK.fullmatch(lower)
+    meant = "time" if clock else lower.replace(" ", "_")
     if meant != name and _expected(meant) is not None:
-        raise UnitError(f"{file}: column {name!r}: expected the name {meant!r}")
+        example = f", in a title such as 'time [{clock[1]}]'" if clock and clock[1] else ""
+        raise UnitError(f"{file}: column {name!r}: expected the name {meant!r}{example}")
 
 
 def _expected(name: str) -> tuple[str, ...] | None:

@@ -66,16 +66,25 @@ def _padded(steps: Array) -> Array:
 
 def _quaternions(vector: Array) -> Array:
     """Rotation vectors (..., 3) as quaternions (..., 4), scalar first."""
-    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)], axis=-1)
+    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", vector, vector))
+    quaternions = np.empty((*half.shape, 4))
+    quaternions[..., 0] = np.cos(half)
+    # sin(half) / half is 1 to rounding below the least angle that is told from none.
+    least = np.maximum(half, 1e-150)
+    quaternions[..., 1:] = (0.5 * np.sin(least) / least)[..., None] * vector
+    return quaternions
 
 
 def _compose(second: Array, first: Array) -> Array:
     """Quaternion of the rotation `first` followed by `second`."""
-    a, u = second[..., :1], second[..., 1:]
-    b, v = first[..., :1], first[..., 1:]
-    scalar = a * b - np.sum(u * v, axis=-1, keepdims=True)
-    return np.concatenate([scalar, a * v + b * u + np.cross(u, v)], axis=-1)
+    a, p, q, r = np.moveaxis(second, -1, 0)
+    b, x, y, z = np.moveaxis(first, -1, 0)
+    product = np.empty(np.broadcast_shapes(second.shape, first.shape))
+    product[..., 0] = a * b - (p * x + q * y + r * z)
+    product[..., 1] = a * x + b * p + (q * z - r * y)
+    product[..., 2] = a * y + b * q + (r * x - p * z)
+    product[..., 3] = a * z + b * r + (p * y - q * x)
+    return product
 
 
 def _matrices(q: Array) -> Array:

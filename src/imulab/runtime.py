@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab import _runtime
+from imulab.arraytable import ArraySettings, array_table
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.packing import Table, pack
 from imulab.recording import Array
-from imulab.tables import ArraySettings, Table, array_table, pack
 
 NOT_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, BEYOND, ALONE = (1 << bit for bit in range(8))
 _STATE = b"imulab.stream 1\n"
@@ -73,16 +74,21 @@ class Unit:
         ticks: NDArray[np.uint32],
         output: Sequence[Array | None],
         *,
-        in_place: bool = False,
+        factors: Sequence[float] | None = None,
+        into: Sequence[Array | None] | None = None,
     ) -> tuple[list[Array | None], bool]:
         """Return outputs less the warm-up bias, and whether the table covers the power-on temperature, degC.
 
         `ticks` counts time since power-on in ticks of `tick` seconds; None stands for a column that is not there.
-        The columns given are left as they are, unless `in_place`.
+        `factors` turn the table's units into those of the columns. The columns given are left as they are; `into` are
+        columns to fill instead of new ones.
         """
-        out = list(output) if in_place else [None if c is None else np.array(c, dtype=np.float64) for c in output]
+        given = [None if column is None else np.ascontiguousarray(column, dtype=np.float64) for column in output]
+        out = [None if c is None else np.empty_like(c) for c in given] if into is None else list(into)
+        scale = np.ones(len(given)) if factors is None else np.array(factors, dtype=np.float64)
         count = np.ascontiguousarray(ticks, dtype=np.uint32)
-        return out, _runtime.warmup(self._unit, float(temperature), float(tick), count, tuple(out))
+        covered = _runtime.warmup(self._unit, float(temperature), float(tick), count, tuple(given), scale, tuple(out))
+        return out, covered
 
 
 def _columns(columns: Sequence[Array]) -> tuple[Array, ...]:

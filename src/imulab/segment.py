@@ -30,7 +30,10 @@ _CLEAR_DRIFT = 6.0
 _SLOW = 5.0
 _MUCH_LOST = 0.05
 _LONG_TABLE = 1000
-_NO_TIME = "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with motion?"
+_NO_TIME = (
+    "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with "
+    "motion? Then it needs a column time, or a layout with sample_rate"
+)
 _BATCHES = 4
 """Batches per attitude: few, so that they are long against the correlation of the noise, which is pooled."""
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
@@ -40,6 +43,7 @@ shortens the vector by less than 0.5 ug."""
 _POOL_DEGREES = 10.0
 """Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
 _TRACE_POINTS = 4000
+_A_PART = 2000
 
 
 @dataclass(frozen=True)
@@ -131,11 +135,15 @@ def find_attitudes(
         )
     variance = _window_variance(blocks, width)
     finite = variance[np.isfinite(variance) & (variance > 0)]
-    resolution = np.array([_resolution(recording.column(name)) for name in names])
-    quiet = max(float(np.quantile(finite, 0.05)) if finite.size else 0.0, float((resolution**2).sum()) / 12)
+    quietest = float(np.quantile(finite, 0.05)) if finite.size else 0.0
+    # No step within a part is smaller than the smallest of all, which costs a sort: often too small to matter already.
+    resolution = _resolutions(recording, names, _A_PART)
+    if float((resolution**2).sum()) / 12 > quietest:
+        resolution = _resolutions(recording, names)
+    quiet = max(quietest, float((resolution**2).sum()) / 12)
     trim = int(np.ceil(settling / blocks.duration))
     fewest = max(2, int(np.ceil(shortest / blocks.duration)))
-    candidates = [_merge(_stretches(variance <= factor * quiet, width, trim, fewest), blocks) for factor in _THRESHOLDS]
+    candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
     best = _choose(candidates, blocks)
     trace = _trace(variance, time, blocks, width, _THRESHOLDS[best] * quiet, quiet)
     pieces = candidates[best]
@@ -143,7 +151,11 @@ def find_attitudes(
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
     stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
     check_clipping(recording, names, stretches)
-    mean, covariance, samples = _statistics(pieces, blocks, resolution)
+    mean, covariance, samples, noise = _statistics(pieces, blocks)
+    if (noise < resolution / 2).any():
+        resolution = _resolutions(recording, names)
+    # Noise below half a step of the output does not average its rounding away.
+    covariance[:, range(3), range(3)] += np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
     first = np.unique(pieces.attitude, return_index=True)[1]
     last = np.append(first[1:], len(pieces.start)) - 1
     return Attitudes(
@@ -263,6 +275,19 @@ def _stretches(quiet: NDArray[np.bool_], width: int, trim: int, fewest: int) -> 
     return _Pieces(start[keep], stop[keep])
 
 
+def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
+    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches."""
+    found: dict[bytes, _Pieces] = {}
+    candidates = []
+    for factor in _THRESHOLDS:
+        pieces = _stretches(variance <= factor * quiet, width, trim, fewest)
+        key = pieces.start.tobytes() + pieces.stop.tobytes()
+        if key not in found:
+            found[key] = _merge(pieces, blocks)
+        candidates.append(found[key])
+    return candidates
+
+
 def _piece_means(pieces: _Pieces, blocks: _Blocks) -> Array:
     """Mean of the blocks of each stretch, shape (pieces, 3)."""
     bounds = np.column_stack([pieces.start, pieces.stop]).ravel()
@@ -293,10 +318,13 @@ def _choose(candidates: list[_Pieces], blocks: _Blocks) -> int:
     """Index of the threshold whose attitudes predict each other best, among those that find enough."""
     counts = np.array([pieces.attitude[-1] + 1 if pieces.attitude.size else 0 for pieces in candidates])
     enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * np.median(counts[counts > 0])))) if counts.any() else 0)
-    errors = [
-        _ellipsoid_error(_attitude_means(pieces, blocks)) if count >= max(enough, 1) else np.inf
-        for pieces, count in zip(candidates, counts, strict=True)
-    ]
+    known: dict[int, float] = {}
+    errors = []
+    for pieces, count in zip(candidates, counts, strict=True):
+        if id(pieces) not in known:
+            usable = count >= max(enough, 1)
+            known[id(pieces)] = _ellipsoid_error(_attitude_means(pieces, blocks)) if usable else np.inf
+        errors.append(known[id(pieces)])
     if np.isfinite(errors).any():
         return int(np.argmin(errors))
     return int(np.argmax(counts))
@@ -321,8 +349,8 @@ def _ellipsoid_error(mean: Array) -> float:
     return float(np.sqrt(np.mean((residual / np.maximum(1 - leverage, 1e-9)) ** 2)) / 2)
 
 
-def _statistics(pieces: _Pieces, blocks: _Blocks, resolution: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Mean, covariance of the mean by batch means, and number of samples of each attitude."""
+def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray[np.int64], Array]:
+    """Mean, its covariance by batch means, and number of samples of each attitude; noise of each axis, shape (3,)."""
     mean = _attitude_means(pieces, blocks)
     count = len(mean)
     size = pieces.stop - pieces.start
@@ -345,17 +373,22 @@ def _statistics(pieces: _Pieces, blocks: _Blocks, resolution: Array) -> tuple[Ar
     pooled = scatter[usual].sum(axis=0) / max(float((number - 1)[usual].sum()), 1.0)
     shrunk = (scatter + _POOL_DEGREES * pooled) / (freedom + _POOL_DEGREES)
     covariance: Array = shrunk * (per_batch / total)[:, None, None]
-    # Noise below half a step of the output does not average its rounding away.
-    noise = np.sqrt(np.median(blocks.scatter[start], axis=0))
-    coarse = noise < resolution / 2
-    covariance[:, range(3), range(3)] += np.where(coarse, resolution**2 / 12, 0.0)
-    return mean, covariance, (total * blocks.length).astype(np.int64)
+    noise: Array = np.sqrt(np.median(blocks.scatter[start], axis=0))
+    return mean, covariance, (total * blocks.length).astype(np.int64), noise
 
 
-def _resolution(samples: Array) -> float:
-    """Smallest step between the values of a channel."""
-    values = np.unique(samples[:: max(1, len(samples) // 100_000)])
-    return float(np.diff(values).min()) if len(values) > 1 else 0.0
+def _resolutions(recording: Recording, names: list[str], part: int | None = None) -> Array:
+    """Smallest step between the values of each channel, shape (3,), or within the first `part` samples of each.
+
+    0 for a channel of one value, but infinite for a part of one.
+    """
+    found = np.full(len(names), 0.0 if part is None else np.inf)
+    for axis, name in enumerate(names):
+        samples = recording.column(name)
+        values = np.unique(samples[:: max(1, len(samples) // 100_000)][:part])
+        if len(values) > 1:
+            found[axis] = np.diff(values).min()
+    return found
 
 
 def _trace(variance: Array, time: Array, blocks: _Blocks, width: int, threshold: float, quiet: float) -> Trace:

@@ -20,6 +20,8 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     OptionError
         It is no number with a unit of this kind.
     """
+    if re.search(r"\d,\d", text):
+        raise OptionError(f"{option} {text!r}: a decimal comma? expected a point")
     match = _QUANTITY.fullmatch(text)
     expected = f"{option} {text!r}: expected a number, or one with a unit of {kind} such as 1 {default_unit}"
     if match is None:

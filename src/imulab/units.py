@@ -79,7 +79,15 @@ _SPELLINGS = {
     "°C": "degC",
     "°/s": "deg/s",
     "°": "deg",
+    "°/h": "deg/h",
+    "°/hr": "deg/h",
+    "deg/hr": "deg/h",
+    "dps": "deg/s",
+    "µrad": "urad",
+    "μrad": "urad",
     "counts": "count",
+    "LSB": "count",
+    "lsb": "count",
 }
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from imulab.digits import decimal_rows
 from imulab.errors import OptionError
 from imulab.files import replacing
-from imulab.readers import _digits
-from imulab.recording import Array, Recording
-from imulab.tens import powers_of_ten
+from imulab.recording import Recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -77,22 +75,8 @@ def write_csv_to(blocks: Recording | Iterable[Recording], stream: BinaryIO) -> N
             head = False
         columns = list(block.columns.values())
         for start in range(0, len(block), _ROWS_AT_ONCE):
-            stream.write(_rows([column[start : start + _ROWS_AT_ONCE] for column in columns]))
-
-
-def _rows(columns: list[Array]) -> bytes | memoryview:
-    """Return rows of the shortest decimals that read back exactly."""
-    if not columns or not _fast():
-        texts = [map(repr, column.tolist()) for column in columns]
-        return ("\n".join(map(",".join, zip(*texts, strict=True))) + "\n").encode("ascii")
-    table = np.column_stack(columns).astype(np.float64, copy=False)
-    out = bytearray(25 * table.size)
-    return memoryview(out)[: _digits.rows(table, len(columns), out)]
-
-
-@cache
-def _fast() -> bool:
-    return _digits.prepare(powers_of_ten())
+            part = [column[start : start + _ROWS_AT_ONCE] for column in columns]
+            stream.write(decimal_rows(np.column_stack(part)) if part else b"\n")
 
 
 def write_parquet_to(blocks: Recording | Iterable[Recording], stream: BinaryIO) -> None:

@@ -17,7 +17,7 @@ axis and the y input axis lies in the body xy plane.  A parameter set is a dict 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -396,9 +396,7 @@ def to_lower_gauge(upper: Mapping[str, float]) -> Parameters:
     W W' = L R R' L' = L L', so L is the Cholesky factor of W W'.  T has a unit diagonal: S = diag(L) and
     T = S^-1 L.  The zero b, in output units, does not see the rotation; in ours it is S times the bias.
     """
-    t_upper = np.array([[1.0, -upper["yz"], upper["zy"]], [0.0, 1.0, -upper["zx"]], [0.0, 0.0, 1.0]])
-    inverse_k = np.diag([upper[f"inverse_k_{axis}"] for axis in AXES])
-    w = inverse_k @ np.linalg.inv(t_upper)
+    w = _w(upper)
     lower = np.linalg.cholesky(w @ w.T)
     scale = np.diag(lower)
     t_lower = np.diag(1.0 / scale) @ lower
@@ -411,6 +409,69 @@ def to_lower_gauge(upper: Mapping[str, float]) -> Parameters:
     result["misalignment_zx"] = float(t_lower[2, 0])
     result["misalignment_zy"] = float(t_lower[2, 1])
     return result
+
+
+def gyro_inverse_k(accelerometers: Mapping[str, float], s: ArrayLike, t: ArrayLike) -> Vector:
+    r"""Return 1/K [output/(rad/s)] of w = T K (M - b) in the upper gauge from M = S (T w + b) in the lower one.
+
+    f = R a between the frames of `to_lower_gauge`, with R = L^-1 W.  The body rate turns with it, so M = S T R w + ..,
+    and T K = (S T R)^-1 with T's diagonal 1.
+    """
+    lower = to_lower_gauge(accelerometers)
+    t_lower = np.eye(3)
+    t_lower[1, 0], t_lower[2, 0], t_lower[2, 1] = (lower[f"misalignment_{pair}"] for pair in ("yx", "zx", "zy"))
+    rotation = np.linalg.inv(np.diag([lower[f"scale_factor_{axis}"] for axis in AXES]) @ t_lower) @ _w(accelerometers)
+    return 1.0 / np.diag(np.linalg.inv(np.diag(np.asarray(s)) @ np.asarray(t) @ rotation))
+
+
+def _w(upper: Mapping[str, float]) -> Matrix:
+    t_upper = np.array([[1.0, -upper["yz"], upper["zy"]], [0.0, 1.0, -upper["zx"]], [0.0, 0.0, 1.0]])
+    return np.diag([upper[f"inverse_k_{axis}"] for axis in AXES]) @ np.linalg.inv(t_upper)
+
+
+def directions(upper: Mapping[str, float], outputs: ArrayLike) -> Matrix:
+    """Return the unit vectors of a = T K (x - b) of rows of outputs."""
+    zero = np.array([upper[f"zero_{axis}"] for axis in AXES])
+    found = (np.asarray(outputs) - zero) @ np.linalg.inv(_w(upper)).T
+    return found / np.linalg.norm(found, axis=1)[:, None]
+
+
+def gyro_turns_fit(
+    time: ArrayLike,
+    outputs: ArrayLike,
+    turns: Sequence[tuple[int, int]],
+    up: ArrayLike,
+    zero: ArrayLike,
+    fit_bias: bool,
+) -> tuple[Vector, float]:
+    r"""Fit w = T K (M - b) to the turns of gravity's direction; no sensitivity to acceleration.
+
+    Tedaldi, Pretto, Menegatti (2014), eq. (11) to (13): minimise the sum of |u_after - C u_before|^2 over the turns,
+    C composed of Rodrigues rotations about the mean of two neighbouring samples.  Returned are 1/K and *half* the sum,
+    which is what Ceres and scipy call the cost.
+    """
+    t, m, u, b = np.asarray(time), np.asarray(outputs), np.asarray(up), np.asarray(zero)
+    longest = max(stop - start for start, stop in turns)
+    mean, step = np.zeros((longest, len(turns), 3)), np.zeros((longest, len(turns)))
+    for k, (start, stop) in enumerate(turns):
+        mean[: stop - start, k] = (m[start:stop] + m[start + 1 : stop + 1]) / 2 - b
+        step[: stop - start, k] = np.diff(t[start : stop + 1])
+    typical = 4800.0
+
+    def misfit(p: Vector) -> Vector:
+        tk = np.array([[1, p[3], p[4]], [p[5], 1, p[6]], [p[7], p[8], 1]]) @ np.diag((1 + p[:3]) / typical)
+        shift = p[9:12] * typical if fit_bias else np.zeros(3)
+        angles = (mean - shift) @ tk.T * step[:, :, None]
+        moved = u[:-1].copy()
+        for angle in angles:  # the body turns by +angle, so what is fixed in space turns by -angle in the body
+            size = np.linalg.norm(angle, axis=1)[:, None]
+            axis = angle / np.maximum(size, 1e-300)
+            along = np.sum(axis * moved, axis=1)[:, None] * axis
+            moved = along + np.cos(size) * (moved - along) - np.sin(size) * np.cross(axis, moved)
+        return np.asarray((moved - u[1:]).ravel())
+
+    solution = least_squares(misfit, np.zeros(12 if fit_bias else 9), xtol=1e-10)
+    return typical / (1 + solution.x[:3]), float(np.sum(solution.fun**2) / 2)
 
 
 # ---------------------------------------------------------------------------------------------------------

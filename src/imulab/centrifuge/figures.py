@@ -16,6 +16,7 @@ from imulab.units import STANDARD_GRAVITY, from_si
 
 _POINTS = 121
 _SHOWN_SPECTRA = 3
+_DECADES = [10.0**n for n in range(-6, 7)]
 _SPECTRUM_CAPTION = (
     "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left of "
     "X without it is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further lines "
@@ -28,8 +29,10 @@ _CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
 def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
     sets = prefixes(record)
-    items: list[Figure | Table] = [_zeta(record, sets), _polar(record, sets), _repeatability(record, sets)]
-    items += _spectra(record)
+    items: list[Figure | Table] = [_zeta(record, sets)]
+    if any(f"{p}direction" in record.parameters for p in sets):
+        items.append(_polar(record, [p for p in sets if f"{p}direction" in record.parameters]))
+    items += [_repeatability(record, sets), *_spectra(record)]
     items += [
         level_table(record, sets),
         curve_table(record, sets),
@@ -60,25 +63,37 @@ def _label(prefix: str) -> str:
 
 
 def _headline(record: Calibration, prefix: str) -> str:
+    """Return the g-sensitivity in one sentence, and by how much it departs from the linear."""
     levels = numbers(record, prefix)
     last = levels[-1]
-    K1 = record.parameters[f"{prefix}K_1"]
-    value, u = format_uncertain(K1.value * PER_G, (K1.standard_uncertainty or 0.0) * PER_G)
-    text = f"{_label(prefix)} drifts by {value} ± {u} deg/h per g at {_g(_force(record, 1))}"
-    if last != 1:
-        zeta = record.parameters[f"{prefix}zeta_{last}"]
-        change, spread = format_uncertain(100 * zeta.value, 100 * (zeta.standard_uncertainty or 0.0))
-        top, _ = curve_at(record, prefix, np.array([_force(record, last)]))
-        start = record.value(f"{prefix}K0")
-        fitted, width = format_uncertain(
-            100 * (float(top[0]) / start - 1), 100 * _curve_change(record, prefix, _force(record, last))
+    first, top = _g(_force(record, levels[0])), _g(_force(record, last))
+    if last == levels[0]:
+        return f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{last}')} at {first}."
+    zeta = record.parameters[f"{prefix}zeta_{last}"]
+    measured = _change(zeta.value, zeta.standard_uncertainty)
+    curved = _curve_change(record, prefix, _force(record, last))
+    if not curved:
+        return (
+            f"{_label(prefix)} drifts linearly with g, by {_per_g(record, f'{prefix}K0')} from {first} to {top}; the "
+            f"factor at {top} is {measured} than that at {first}."
         )
-        text += (
-            f"; at {_g(_force(record, last))} the factor is {change} ± {spread} % larger measured against K_1, and "
-            f"{fitted} ± {width} % "
-            "by the fitted curve"
-        )
-    return text + "."
+    K, _ = curve_at(record, prefix, np.array([_force(record, last)]))
+    fitted = _change(float(K[0]) / record.value(f"{prefix}K0") - 1, curved)
+    return (
+        f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}; at {top} the factor is "
+        f"{measured} measured against K_{levels[0]}, and {fitted} by the fitted curve."
+    )
+
+
+def _per_g(record: Calibration, name: str) -> str:
+    K = record.parameters[name]
+    value, u = format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
+    return f"{value} ± {u} deg/h per g"
+
+
+def _change(share: float, uncertainty: float | None) -> str:
+    change, u = format_uncertain(100 * abs(share), 100 * (uncertainty or 0.0))
+    return f"{change} ± {u} % {'smaller' if share < 0 else 'larger'}"
 
 
 def _curve_change(record: Calibration, prefix: str, force: float) -> float:
@@ -226,13 +241,11 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
     traces: list[dict[str, Any]] = []
     shown = [p for p in sets if "down" not in p] or sets
     annotations = []
-    directed = True
     for number, prefix in enumerate(shown):
         mark = "" if number == 0 else str(number + 1)
         where = {"xaxis": f"x{mark}", "yaxis": f"y{mark}"}
         key = prefix[0] if "down" not in prefix else f"{prefix[0]}_down"
         rows = [row for row in record.sections["levels"] if key in row]
-        directed = directed and all(row[key]["directed"] for row in rows)
         z = np.array([complex(row[key]["A"], row[key]["B"]) for row in rows]) * PER_G
         force = [from_si(row["specific_force"]["value"], "g") for row in rows]
         angle = np.linspace(0, 2 * np.pi, 49)
@@ -271,11 +284,8 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
     caption = (
         "Where in the gyroscope's frame the drift per g is largest, and how large: points in a line outward are "
         "nonlinearity in size, across it a turning of the drift, which the magnitude does not show. The largest ring "
-        "is "
-        "that of the lowest level."
+        "is that of the lowest level."
     )
-    if not directed:
-        caption = "Without table_angle the direction of the drift is not known: magnitudes are drawn along X."
     return Figure("Complex drift factor of each level", caption, traces, layout, height=440)
 
 
@@ -338,7 +348,6 @@ def _spectra(record: Calibration) -> list[Figure]:
     found = [s for s in record.data["spectra"] if s["spin_axis"] == record.data["spectra"][0]["spin_axis"]]
     picked = sorted({0, len(found) // 2, len(found) - 1})[:_SHOWN_SPECTRA]
     by_level = {row["level"]: row for row in record.sections["levels"]}
-    figures = []
     traces: list[dict[str, Any]] = []
     titles, annotations = [], []
     for number, index in enumerate(picked):
@@ -365,21 +374,16 @@ def _spectra(record: Calibration) -> list[Figure]:
         )  # fmt: skip
         titles.append("height, deg/h" if number == 0 else "")
         annotations.append(
-            {"xref": f"x{mark} domain", "yref": f"y{mark} domain", "x": 0.03, "y": 0.99, "showarrow": False,
-             "xanchor": "left", "yanchor": "top", "align": "left",
-             "text": f"<b>{from_si(a, 'g'):.3g} g</b><br>K a = {line:.3g} deg/h"}
+            {"xref": f"x{mark} domain", "yref": f"y{mark} domain", "x": 0.0, "y": 1.01, "showarrow": False,
+             "xanchor": "left", "yanchor": "bottom",
+             "text": f"<b>{from_si(a, 'g'):.3g} g</b>: K a = {line:.3g} deg/h"}
         )  # fmt: skip
     layout = _panels(titles, "rate, deg/s", gap=0.07)
     layout["annotations"] = annotations
+    layout["legend"]["y"] = 1.24
+    layout["margin"]["t"] = 75
     for number in range(len(picked)):
         mark = "" if number == 0 else str(number + 1)
-        layout[f"yaxis{mark}"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
+        layout[f"yaxis{mark}"] |= {"type": "log", "tickvals": _DECADES, "ticktext": [f"{v:g}" for v in _DECADES]}
         layout[f"xaxis{mark}"] |= {"nticks": 5}
-    figures.append(
-        Figure(
-            "Spectrum around the table rate",
-            _SPECTRUM_CAPTION,
-            traces, layout, height=400,
-        )
-    )  # fmt: skip
-    return figures
+    return [Figure("Spectrum around the table rate", _SPECTRUM_CAPTION, traces, layout, height=425)]

@@ -104,6 +104,8 @@ def load_manifest(path: str | Path, name: str | None = None) -> Manifest:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ReadError(f"{name}: no such manifest") from None
+    except IsADirectoryError:
+        raise ReadError(f"{name}: expected a manifest, found a folder") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ReadError(f"{name}: the manifest cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:

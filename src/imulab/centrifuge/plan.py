@@ -149,7 +149,7 @@ def _check(
         ("radius", radius, 0.05, 100.0, "m"),
         ("net rate", net_rate, 1e-4, _HIGHEST_RATE, "rad/s"),
         ("duration", duration, 10.0, 1e6, "s"),
-        ("uncertainty", uncertainty, 1e-7, 1.0, "of K"),
+        ("uncertainty", uncertainty, 1e-7, 1.0, "of K (or percent, such as 0.8 %)"),
         ("cycles", float(cycles), 1.0, 100.0, ""),
     ):
         if not low <= value <= high:

@@ -132,43 +132,41 @@ def _share(value: float) -> str:
 
 
 def run_table(record: Calibration) -> Table:
-    """Return the runs with their rates and lines."""
-    axes = [axis for axis in "xy" if any(axis in row for row in record.sections["runs"])]
-    columns = [
-        "run",
-        "file",
-        "cycle",
-        "sense",
-        "spin axis",
-        "a, g",
-        "table rate, deg/s",
-        "from",
-        "net rate, deg/s",
-        "periods",
-        "FOG line, deg/h",
-    ]
-    columns += [f"{axis.upper()} line, deg/h" for axis in axes]
+    """Return what was measured in each run; a column that says the same of all runs goes to the caption."""
+    runs = record.sections["runs"]
+    axes = [axis for axis in "xy" if any(axis in run for run in runs)]
+    origins = list(dict.fromkeys(run["table_rate_from"] for run in runs if run["role"] == "loaded"))
+    said = ["cycle"] * (len({run["power_cycle"] for run in runs}) > 1)
+    said += ["spin axis"] * (len({run["spin_axis"] for run in runs}) > 1)
+    columns = ["run", "file", *said, "g", "sense", "table rate, deg/s"]
+    columns += ["from"] * (len(origins) > 1)
+    columns += ["periods"]
+    columns += [*(f"{axis.upper()} drift ± u, deg/h" for axis in axes), "FOG line, deg/h"]
     rows = []
-    for index, run in enumerate(record.sections["runs"]):
-        row = [str(index), run["file"], str(run["power_cycle"]), f"{run['sense']:+d}", run["spin_axis"]]
+    for index, run in enumerate(runs):
+        row = [str(index + 1), run["file"]]
+        row += [str(run["power_cycle"] if name == "cycle" else run["spin_axis"]) for name in said]
         if run["role"] == "static":
-            rows.append([*row, "static", *["–"] * (5 + len(axes))])
+            rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])
             continue
-        net = run["net_rate"]
         row += [
             f"{from_si(run['specific_force']['value'], 'g'):.4g}",
+            f"{run['sense']:+d}",
             f"{from_si(run['table_rate_used']['value'], 'deg/s'):.5f}",
-            run["table_rate_from"],
-            "–" if net is None else f"{from_si(net['value'], 'deg/s'):.4f}",
-            f"{run['periods']:.0f}",
-            _line(run["fog"]),
-            *(_line(run[axis]) for axis in axes),
         ]
-        rows.append(row)
-    return Table("Runs", "Lines at the table rate: of the FOG, and of X and Y without it.", columns, rows)
+        row += [run["table_rate_from"]] * (len(origins) > 1)
+        row += [f"{run['periods']:.0f}"]
+        row += [" ± ".join(_line(run[axis])) for axis in axes]
+        rows.append([*row, _line(run["fog"])[0]])
+    source = f" Table rates from: {origins[0]}." if len(origins) == 1 else ""
+    caption = (
+        "Drift: what X and Y show at the table rate, less what the FOG shows there (rotation), with its standard "
+        f"uncertainty u. Sense −1: both rates reversed.{source}"
+    )
+    return Table("Runs", caption, columns, rows)
 
 
-def _line(entry: dict[str, Any]) -> str:
+def _line(entry: dict[str, Any]) -> tuple[str, str]:
     size = from_si(float(np.hypot(entry["A"], entry["B"])), "deg/h")
     u = from_si(float(np.sqrt(np.trace(np.array(entry["covariance"])) / 2)), "deg/h")
-    return format_uncertain(size, u)[0]
+    return format_uncertain(size, u)

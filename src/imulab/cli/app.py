@@ -14,6 +14,35 @@ _SETTINGS: dict[str, Any] = {
     "rich_markup_mode": None,
     "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100},
 }
+_SUMMARIES = {
+    "apply": "Correct a recording by records.",
+    "show": "Say what is in a record or recording, or what changed.",
+    "report": "Draw the report of a record.",
+    "demo": "Run all procedures on simulated instruments.",
+    "convert": "Write a recording of any kind as CSV or Parquet.",
+    "export": "Write firmware, a blob, or another program's files.",
+    "allan": "Print Allan deviation and noise coefficients.",
+    "tumble plan": "Choose the attitudes to measure.",
+    "tumble simulate": "Simulate a recording of a tumble test.",
+    "tumble fit": "Calibrate an accelerometer triad.",
+    "tumble gyro": "Calibrate the gyroscope triad on top of that.",
+    "tumble check": "Hold fresh attitudes against a record.",
+    "array simulate": "Simulate a recording of an array.",
+    "array calibrate": "Find bias, noise and alignment of every element.",
+    "array fuse": "Fuse a file or a live stream into one rate.",
+    "array compare": "Run every method over one recording.",
+    "warmup plan": "Write the chamber programme of a test.",
+    "warmup simulate": "Simulate the power cycles of a test.",
+    "warmup fit": "Fit the table of a unit to its power cycles.",
+    "warmup table": "Write the table as CSV, or a record from that CSV.",
+    "centrifuge plan": "List the runs of a test, with what they will give.",
+    "centrifuge simulate": "Simulate the runs of a test.",
+    "centrifuge reduce": "Reduce a test to K at every g and to its curve.",
+    "fleet run": "Calibrate every unit of a manifest that has no record.",
+    "fleet status": "Say what is done, failed and missing.",
+    "fleet report": "Draw the statistics of the line.",
+}
+"""What the lists of commands say, each a line; the commands' own help says more."""
 
 
 def command() -> Any:
@@ -35,7 +64,13 @@ def command() -> Any:
     app.command("convert")(convert.convert)
     app.command("export")(export.export)
     app.command("allan")(allan.allan)
-    return typer.main.get_command(app)
+    root: Any = typer.main.get_command(app)
+    for path, summary in _SUMMARIES.items():
+        found = root
+        for name in path.split():
+            found = found.commands[name]
+        found.short_help = summary
+    return root
 
 
 def _version(wanted: bool) -> None:

@@ -1,4 +1,4 @@
-"""``imulab fleet``: run, status and report."""
+"""``imulab fleet``: run, status, report and simulate."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from imulab.cli.options import AsJson, check_outputs, progress_bar, warn, whole_number
+from imulab.errors import OptionError
 
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
@@ -24,7 +25,7 @@ _FEW = 3
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    for function in (run, status, report):
+    for function in (run, status, report, simulate):
         group.command(function.__name__)(function)
     return group
 
@@ -79,7 +80,8 @@ def run(
     else:
         made = state.count("done") - state.kept
         kept = f", {state.kept} were there already" if state.kept else ""
-        print(f"{len(state.rows)} units: {made} done{kept}, {state.count('failed')} failed, {state.seconds:.1f} s")
+        units = "1 unit" if len(state.rows) == 1 else f"{len(state.rows)} units"
+        print(f"{units}: {made} done{kept}, {state.count('failed')} failed, {state.seconds:.1f} s")
         print("\n".join([*_failures(state), f"records: {output}", f"table: {table or f'{output}/parameters.csv'}"]))
         warned = sum(bool(row.summary and row.summary.warnings) for row in state.rows)
         if warned:
@@ -119,6 +121,24 @@ def report(
     check_outputs([output], [limits] if limits else [])
     write_fleet_report(folder, output, limits=limits, history=history)
     print(f"report: {output}")
+
+
+def simulate(
+    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
+    units: Annotated[str, typer.Option("--units", metavar="N", help="Number of units, 8 or more.")] = "12",
+    seed: Annotated[str, typer.Option("--seed", metavar="N", help="Of the random numbers.")] = "1",
+) -> None:
+    """Simulate a line of accelerometers.
+
+    Recordings of two calibrations of each unit, two manifests and limits.
+    """
+    from imulab.fleet.simulate import simulate_line
+
+    if not output:
+        raise OptionError("output '': expected the name of a folder to write to")
+    first, second = simulate_line(output, units=whole_number(units, "--units"), seed=whole_number(seed, "--seed"))
+    print(f"manifests: {first} {second}")
+    print(f"limits: {first.parent / 'limits.toml'}")
 
 
 def _failures(state: FleetState) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 
@@ -78,6 +79,10 @@ def _candidates(source: str) -> Array | None:
     if colon and kind in ("fixture", "head"):
         angle = quantity(step, f"--from {kind}", "angle", "deg")
         return fixture_candidates(angle) if kind == "fixture" else head_candidates(angle)
+    if colon and not Path(source).exists():
+        raise OptionError(
+            f"--from {source!r}: expected sphere, fixture:15, head:15 (steps in deg) or a file of directions"
+        )
     found = directions_of(read(source))
     if found is None:
         raise OptionError(f"{source}: expected columns up_x up_y up_z, or roll [deg] and pitch [deg]")

@@ -24,7 +24,7 @@ from imulab.cli.options import (
     naming,
     warn,
 )
-from imulab.errors import ImulabError, OptionError
+from imulab.errors import ImulabError, OptionError, RecordError
 
 if TYPE_CHECKING:
     from imulab.blob import Blob
@@ -56,7 +56,14 @@ def apply(
     *names, file = files
     check_outputs([output], files)
     part = chosen(topic, instance, window)
-    records = [load_any(name) for name in names]
+    try:
+        records = [load_any(name) for name in names]
+    except RecordError:
+        if file != "-" and is_json(file):
+            raise OptionError(
+                f"{file}: expected a recording as the last file, found a record: records go first"
+            ) from None
+        raise
     for name, record in zip(names, records, strict=True):
         with naming(name):
             loaded(record)
@@ -103,8 +110,9 @@ def show(
     if formats:
         from imulab.cli.show import aligned
         from imulab.readers.formats import table
+        from imulab.readers.layout import EXAMPLE
 
-        print("\n".join(aligned(*table())))
+        print("\n".join([*aligned(*table()), "", "A layout (--layout FILE.toml):", "", EXAMPLE.rstrip("\n")]))
         return
     if not files:
         raise OptionError("show: expected a FILE, two records, or --formats")

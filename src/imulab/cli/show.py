@@ -141,9 +141,10 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
         raise ReadError("the recording is empty")
     lines = [f"{block.name}: {samples} samples"]
     lines += clock.text() if "time" in block else ["no time column: a table of attitudes, a row each"]
-    lines += [f"{key}: {value}" for key, value in block.metadata.items()]
     rows = [[name, block.units[name], *column.texts()] for name, column in columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
+    if block.metadata:
+        lines += ["", *(f"{key}: {value}" for key, value in block.metadata.items())]
     lines += [f"{'warning' if note.startswith('truncated') else 'note'}: {note}" for note in notes]
     return "\n".join(lines)
 

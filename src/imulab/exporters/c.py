@@ -17,9 +17,9 @@ from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.golden import golden_of
 from imulab.files import replacing
-from imulab.tables import KINDS, Field, Table
+from imulab.packing import KINDS, Field, Table
 
-_CORE = ("tumble.c", "centrifuge.c", "warmup.c", "array.c", "robust.c", "table.c")
+_CORE = ("tumble.c", "centrifuge.c", "warmup.c", "array.c", "robust.c", "robust_well.c", "table.c")
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
 _OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust)\.h"\n', re.MULTILINE)
 

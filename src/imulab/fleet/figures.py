@@ -32,8 +32,10 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Tabl
         factor = abs(shown.factor)
         robust = item.robust_deviation * factor
         median = shown.of(item.median)
-        places = _places(robust if robust > 0 else abs(median))
         stated = item.uncertainties[np.isfinite(item.uncertainties)]
+        typical = float(np.median(stated)) * factor if stated.size else 0.0
+        places = _places(robust or typical or abs(median))
+        several = len(item.values) > 1
         drift = "–"
         if item.drift is not None:
             slope, error = format_uncertain(item.drift.per_day * factor, item.drift.standard_uncertainty * factor)
@@ -48,9 +50,9 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Tabl
                 shown.unit,
                 str(len(item.values)),
                 f"{median:.{places}f}",
-                number(robust, 3),
-                number(item.deviation * factor, 3),
-                number(float(np.median(stated)) * factor, 3) if stated.size else "–",
+                number(robust, 3) if several else "–",
+                number(item.deviation * factor, 3) if several else "–",
+                number(typical, 3) if stated.size else "–",
                 str(int(item.outliers.sum())),
                 drift,
                 capable,
@@ -191,7 +193,7 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> Figure:
                 }
             )
         small.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
-        layout[small.axis_key(x)] |= {"type": "date", "nticks": 4} if dated else {"nticks": 5}
+        layout[small.axis_key(x)] |= small.date_axis(places) if dated else {"nticks": 5}
     return Figure(
         f"{title}: over the {'date' if dated else 'units in the order of the manifest'}",
         small.some(statistics, panels)

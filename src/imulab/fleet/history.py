@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from imulab.calibration import Parameter
@@ -157,8 +158,10 @@ class History:
 
 
 @contextmanager
-def open_history(url: str) -> Iterator[History]:
+def open_history(url: str, *, there: bool = False) -> Iterator[History]:
     """Open a history by its SQLAlchemy URL (``sqlite:///FILE``, ``postgresql://USER@HOST/DATABASE``); make its tables.
+
+    With `there`, a SQLite file that is not there is refused, not made.
 
     Raises
     ------
@@ -179,6 +182,8 @@ def open_history(url: str) -> Iterator[History]:
     kind = address.get_backend_name()
     if kind not in ("sqlite", "postgresql"):
         raise OptionError(f"history {name}: {expected}")
+    if there and kind == "sqlite" and not Path(address.database or "").is_file():
+        raise OptionError(f"history {name}: no such file")
     if address.drivername == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
     try:

@@ -59,6 +59,8 @@ def load_fleet(path: str) -> FleetManifest:
     with local_file(path, path) as local:
         try:
             data = local.read_bytes()
+        except FileNotFoundError:
+            raise ReadError(f"{path}: no such file") from None
         except OSError as error:
             raise ReadError(f"{path}: cannot be read: {error.strerror}") from None
     rows = _parquet(data, path) if data.startswith(b"PAR1") else _csv(data, path)

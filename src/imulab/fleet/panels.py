@@ -16,6 +16,8 @@ from imulab.recording import Array
 COLUMNS = 3
 _GAP_ACROSS = 0.075
 _ROW_HEIGHT = 215
+_DAYS = 4.0
+"""Dates that span no more than so many days are told apart by their time."""
 
 
 def names(index: int) -> tuple[str, str]:
@@ -116,6 +118,20 @@ def plain(values: Array) -> list[float]:
 def date(day: float) -> str:
     """Return days since 1970 as Plotly's dates."""
     return datetime.fromtimestamp(day * 86400.0, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def date_axis(days: Array) -> dict[str, Any]:
+    """Return an axis of dates with three ticks, whatever it spans: the first date, the middle and the last."""
+    first, last = float(np.nanmin(days)), float(np.nanmax(days))
+    margin = 0.04 * max(last - first, 1 / 24)
+    form = "%Y-%m-%d" if last - first > _DAYS else "%m-%d %H:%M"
+    ticks = [datetime.fromtimestamp(86400.0 * day, UTC) for day in (first, (first + last) / 2, last)]
+    return {
+        "type": "date",
+        "range": [date(first - margin), date(last + margin)],
+        "tickvals": [date(first), date((first + last) / 2), date(last)],
+        "ticktext": [tick.strftime(form) for tick in ticks],
+    }
 
 
 def some(statistics: Sequence[ParameterStatistics], panels: Sequence[ParameterStatistics]) -> str:

@@ -12,7 +12,7 @@ from imulab.files import write_text
 from imulab.fleet import figures
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
-from imulab.fleet.run import FleetState, default_history, fleet_state
+from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_state, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
     Change,
     ParameterStatistics,
@@ -21,8 +21,12 @@ from imulab.fleet.statistics import (
     line_statistics,
     parameter_units,
 )
+from imulab.fleet.store import Store
+from imulab.fleet.work import Summary
 from imulab.report import render_page
 
+_FEWEST_TO_DRAW = 4
+"""Fewer units have no distribution: the table says all there is."""
 _TITLES = {"tumble": "Tumble", "array": "Gyro array", "warmup": "Warm-up", "centrifuge": "Centrifuge"}
 
 
@@ -44,15 +48,8 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
         The folder, the limits or the history cannot be used, or there is no record yet.
     """
     state = fleet_state(folder)
-    found = [row.summary for row in state.rows if row.summary is not None]
-    if not found:
-        raise OptionError(f"{folder}: no records yet: {state.count('failed')} units failed, the others are missing")
-    known = {} if limits is None else load_limits(limits, parameter_units(found))
-    statistics = line_statistics(found, known)
-    with ExitStack() as stack:
-        past = _history(folder, history, stack)
-        changes = [] if past is None else changes_since(found, past.of([summary.serial for summary in found]))
-    exhibits = fleet_exhibits(state, statistics, changes)
+    refuse_overwriting([Path(output)], {**own_files(Store(Path(folder)), state.manifest), **read_by(state.manifest)})
+    exhibits, found = _exhibits(state, limits, history)
     provenance = [
         ("folder", folder),
         ("manifest", state.manifest.name),
@@ -64,6 +61,26 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
     write_text(
         output, render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, warnings=_warnings(state))
     )
+
+
+def exhibits_of_folder(folder: str, *, limits: str | None = None, history: str | None = None) -> Exhibits:
+    """Return what the report of a fleet's folder shows; options and errors as for `write_fleet_report`."""
+    return _exhibits(fleet_state(folder), limits, history)[0]
+
+
+def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tuple[Exhibits, list[Summary]]:
+    """Return what the report shows, and the summaries that it is made of."""
+    found = [row.summary for row in state.rows if row.summary is not None]
+    if not found:
+        raise OptionError(
+            f"{state.folder}: no records yet: {state.count('failed')} units failed, the others are missing"
+        )
+    known = {} if limits is None else load_limits(limits, parameter_units(found))
+    statistics = line_statistics(found, known)
+    with ExitStack() as stack:
+        past = _history(state.folder, history, stack)
+        changes = [] if past is None else changes_since(found, past.of([summary.serial for summary in found]))
+    return fleet_exhibits(state, statistics, changes), found
 
 
 def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics], changes: Sequence[Change]) -> Exhibits:
@@ -82,10 +99,9 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
     said = [f"{state.count('done')} of {len(state.rows)} units have their record"]
     if state.failures:
         said.append(f"{len(state.failures)} failed")
-    said.append(f"{len(out)} stand out in some parameter" if out else "none stands out")
+    said.append(f"{_named(sorted(out))} {'stands' if len(out) == 1 else 'stand'} out" if out else "none stands out")
     if drifting:
-        some = ", ".join(drifting[:4]) + (" and others" if len(drifting) > 4 else "")
-        said.append(f"{some} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
+        said.append(f"{_named(drifting)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
     if capable:
         worst = min(capable, key=lambda item: item.capability.cpk if item.capability else 0.0)
         if worst.capability is not None:
@@ -93,28 +109,35 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
             said.append(f"the smallest Cpk is {worst.capability.cpk:.2f} ({worst.name})")
     if fresh:
         facts.append(("changed since last", str(len(moved))))
+    if moved:
+        said.append(f"{_named(sorted(moved))} changed since the last calibration")
     items: list[Figure | Table | None] = [figures.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = _TITLES.get(procedure, procedure)
         mine = [item for item in statistics if item.procedure == procedure]
+        enough = max(len(item.values) for item in mine) >= _FEWEST_TO_DRAW
         items += [
-            figures.distributions(title, mine),
+            figures.distributions(title, mine) if enough else None,
             figures.summary_table(title, mine),
-            figures.over_date(title, mine),
+            figures.over_date(title, mine) if enough else None,
             figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
         ]
     items += [figures.outlier_table(statistics), figures.change_table(changes)]
     return Exhibits("; ".join(said) + ".", facts, [item for item in items if item is not None])
 
 
+def _named(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
 def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
     if url == "none":
         return None
     if url is None:
-        if not (Path(folder) / "history.sqlite").is_file():
+        if not (Path(folder) / HISTORY).is_file():
             return None
         url = default_history(folder)
-    return stack.enter_context(open_history(url))
+    return stack.enter_context(open_history(url, there=True))
 
 
 def _warnings(state: FleetState) -> list[str]:

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
+from imulab._version import VERSION
 from imulab.errors import OptionError
 from imulab.files import write_text
 from imulab.fleet.engine import Engine, WorkersLostError, open_engine
 from imulab.fleet.history import History, open_history
 from imulab.fleet.manifest import FleetManifest, Unit, load_fleet
+from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
 from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, summarise
+from imulab.tasks import TASKS
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""
 _FLUSH = 2.0
+TABLE, HISTORY = "parameters.csv", "history.sqlite"
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class FleetState:
 
 def default_history(folder: str | Path) -> str:
     """Return the URL of the history that a fleet has where no other is named."""
-    return f"sqlite:///{Path(folder).resolve() / 'history.sqlite'}"
+    return f"sqlite:///{Path(folder).resolve() / HISTORY}"
 
 
 def run_fleet(
@@ -106,10 +112,16 @@ def run_fleet(
     begin = time.monotonic()
     fleet = load_fleet(manifest)
     store = Store(Path(folder).resolve())
+    if not folder:
+        raise OptionError("output '': expected the name of a folder to write to")
     if store.folder.exists() and not store.folder.is_dir():
         raise OptionError(f"{folder}: expected a folder to write to, found a file")
     if table is not None:
         check_table(table)
+    table_file = Path(table) if table is not None else store.folder / TABLE
+    refuse_overwriting([table_file, *(store.record(unit.serial) for unit in fleet.units)], read_by(fleet))
+    if table is not None:
+        refuse_overwriting([table_file], own_files(store, fleet, table=False))
     with ExitStack() as stack:
         notes: list[str] = []
         past = _open_history(history, stack) if history else None
@@ -125,11 +137,57 @@ def run_fleet(
         keeper = _Keeper(store, fleet, past, progress)
         _work_through(machine, Job(str(store.folder), fleet.base, token), keeper)
         keeper.flush()
+        store.tidy()
         rows = keeper.rows()
-        write_table(rows, table or store.folder / "parameters.csv")
+        write_table(rows, table_file)
     return FleetState(
-        folder, fleet, rows, kept=keeper.kept, seconds=time.monotonic() - begin, notes=(*notes, *keeper.notes)
+        folder, fleet, rows, kept=keeper.kept, seconds=time.monotonic() - begin,
+        notes=(*notes, *keeper.notes, *_said_of(rows)),
     )  # fmt: skip
+
+
+def read_by(fleet: FleetManifest) -> dict[str, str]:
+    """Return the files here that a fleet reads, full name to name: manifest, recordings, layouts, priors."""
+    if is_url(fleet.base):
+        return {}
+    found = {_full(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
+    for unit in fleet.units:
+        paths = [unit.options[key] for key in TASKS[unit.procedure].paths if key in unit.options]
+        for name in (*unit.files, *paths):
+            if not is_url(name):
+                found[_full(os.path.join(fleet.base, name))] = name  # noqa: PTH118
+    return found
+
+
+def own_files(store: Store, fleet: FleetManifest, *, table: bool = True) -> dict[str, str]:
+    """Return the files that a fleet's folder holds, full name to name."""
+    names = [HISTORY, TABLE] if table else [HISTORY]
+    mine = [*(store.record(unit.serial) for unit in fleet.units), *(store.folder / name for name in names)]
+    return {_full(path): str(path) for path in mine}
+
+
+def _full(path: str | Path) -> str:
+    folder, name = os.path.split(os.path.abspath(path))  # noqa: PTH100
+    return os.path.join(_real(folder), name)  # noqa: PTH118
+
+
+@lru_cache(maxsize=64)
+def _real(folder: str) -> str:
+    return os.path.realpath(folder)
+
+
+def refuse_overwriting(outputs: Iterable[Path], kept: Mapping[str, str]) -> None:
+    """Check that no output takes the place of a file that is to be kept.
+
+    Raises
+    ------
+    OptionError
+        One does.
+    """
+    for path in outputs:
+        taken = kept.get(_full(path))
+        if taken is not None:
+            raise OptionError(f"{path}: would overwrite {taken}; expected another name or folder")
 
 
 def _open_history(url: str, stack: ExitStack) -> History | None:
@@ -196,6 +254,32 @@ class _Keeper:
         )
 
 
+def _said_of(rows: Sequence[Row]) -> Iterator[str]:
+    """Say what a person must know of the records as a whole, and no record can say by itself."""
+    made = [row.summary for row in rows if row.summary is not None]
+    others = [summary.software for summary in made if summary.software != f"imulab {VERSION}"]
+    if others:
+        yield (
+            f"{_counted(len(others), 'record')} of another version ({', '.join(sorted(set(others)))}) kept: "
+            f"to fit again with imulab {VERSION}, use another folder"
+        )
+    owners: dict[object, list[str]] = {}
+    for row in rows:
+        if row.summary is not None:  # one log may hold several sensors: options tell them apart
+            key = row.unit.procedure, row.summary.inputs, tuple(row.unit.options.items())
+            owners.setdefault(key, []).append(row.unit.serial)
+    shared = [serials for serials in owners.values() if len(serials) > 1]
+    if shared:
+        more = f" (and {_counted(len(shared) - 1, 'more set')} like these)" if len(shared) > 1 else ""
+        first = shared[0]
+        shown = ", ".join(first[:3]) + (f" and {len(first) - 3} more" if len(first) > 3 else "")
+        yield f"serials {shown} were made from files of the same content{more}: is a file named twice?"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def _work_through(engine: Engine, job: Job, keeper: _Keeper) -> None:
     """Work until every unit is over; processes may end under it."""
     fruitless = 0
@@ -244,7 +328,5 @@ def _row(store: Store, unit: Unit) -> Row:
     reason = store.reason(unit.serial)
     if reason is not None:
         return Row(unit, FAILED, reason, None)
-    record = store.made_for(unit)
-    if record is None:
-        return Row(unit, "missing", "", None)
-    return Row(unit, DONE, "", summarise(record, record.to_dict()))
+    there = store.made_for(unit)
+    return Row(unit, "missing", "", None) if there is None else Row(unit, DONE, "", summarise(*there))

@@ -17,6 +17,7 @@ from imulab.fleet.work import Summary
 from imulab.recording import Array
 
 _MAD_TO_SIGMA = 1.482602218505602
+_MEAN_TO_SIGMA = 1.2533141373155001
 _FEWEST_FOR_OUTLIERS = 8
 _SIZES = (8, 10, 12, 15, 20, 30, 50, 100, 300, 1000, 10000)
 _BEYOND = (7.90, 6.90, 6.29, 5.92, 5.24, 4.80, 4.46, 4.31, 4.34, 4.52, 4.84)
@@ -63,7 +64,7 @@ class ParameterStatistics:
     mean, deviation
         Sample mean and standard deviation (0 for one unit).
     median, robust_deviation
-        Median, and 1.4826 times the median absolute deviation from it.
+        Median, and 1.4826 times the median absolute deviation from it (`robust_deviation`).
     z
         Robust z of each unit, shape (n,): its distance from the median in robust deviations.
     outlier_limit
@@ -187,7 +188,7 @@ def _statistics(
 ) -> ParameterStatistics:
     count = len(values)
     median = float(np.median(values))
-    robust = _MAD_TO_SIGMA * float(np.median(np.abs(values - median)))
+    robust = robust_deviation(values, median)
     z = (values - median) / robust if robust > 0 else np.zeros(count)
     limit = outlier_limit(count)
     mean = float(values.mean())
@@ -209,6 +210,16 @@ def _statistics(
         drift=line_drift(days, values, np.abs(z) <= limit),
         capability=None if limits is None else capability(values, serials, limits),
     )
+
+
+def robust_deviation(values: Array, median: float) -> float:
+    """Return 1.4826 times the median distance from the median, or where more than half are equal 1.2533 times the mean.
+
+    Source: Iglewicz and Hoaglin (1993), who replace a median distance of zero by the mean one; each factor makes it the
+    standard deviation of a normal population.
+    """
+    distance = np.abs(values - median)
+    return _MAD_TO_SIGMA * float(np.median(distance)) or _MEAN_TO_SIGMA * float(distance.mean())
 
 
 def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | None:

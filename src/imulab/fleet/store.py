@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from imulab.calibration import Calibration, load
+from imulab.calibration import Calibration, load_sealed
 from imulab.errors import OptionError, RecordError
 from imulab.files import write_text
 from imulab.fleet.manifest import FleetManifest, Unit
@@ -135,11 +135,20 @@ class Store:
 
     def clear(self) -> None:
         """Remove what a killed run has left: half-written files, marks, and reasons of units that are tried again."""
-        for part in (*self.folder.glob(".imulab.*.part"), *self.hidden.rglob(".imulab.*.part")):
-            part.unlink(missing_ok=True)
+        self._clear_parts()
         for name in ("failed", "active"):
             for path in (self.hidden / name).iterdir():
                 path.unlink(missing_ok=True)
+
+    def tidy(self) -> None:
+        """Remove what workers that were killed under this run have half written, if nobody is at a unit any more."""
+        with (self.hidden / "turn").open("a") as stream:
+            if _lock(stream.fileno(), exclusive=True):
+                self._clear_parts()
+
+    def _clear_parts(self) -> None:
+        for part in (*self.folder.glob(".imulab.*.part"), *self.hidden.rglob(".imulab.*.part")):
+            part.unlink(missing_ok=True)
 
     def begin(self, serial: str) -> int:
         """Mark a unit as under work, and return how often this was begun and not ended before."""
@@ -176,17 +185,17 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
-    def made_for(self, unit: Unit) -> Calibration | None:
-        """Return the unit's record if it is whole and was made by this procedure from files and options of this name.
+    def made_for(self, unit: Unit) -> tuple[Calibration, str] | None:
+        """Return the unit's record and its hash if it is whole and was made from files and options of this name.
 
         That the files still hold the same is for the caller to see.
         """
         try:
-            record = load(self.record(unit.serial))
+            record, sha256 = load_sealed(self.record(unit.serial))
         except RecordError:
             return None
         made = record.sections.get("fleet")
-        return record if isinstance(made, Mapping) and _asked(made) == asked_of(unit) else None
+        return (record, sha256) if isinstance(made, Mapping) and _asked(made) == asked_of(unit) else None
 
     # --- what was asked --------------------------------------------------------------------------------------------
 

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
-from imulab.calibration import Calibration, Parameter, json_text
+from imulab.calibration import Calibration, Parameter
 from imulab.errors import ImulabError
 from imulab.files import write_text
 from imulab.fleet.manifest import Unit
@@ -113,14 +112,14 @@ def _fit(unit: Unit, job: Job, store: Store | None) -> Outcome:
         with UnitFiles(job.base) as files:
             if store is not None:
                 there = store.made_for(unit)
-                if there is not None and files.unchanged(there.sections["fleet"].get("inputs", ())):
-                    return Outcome(unit.serial, KEPT, summary=summarise(there, there.to_dict()))
+                if there is not None and files.unchanged(there[0].sections["fleet"].get("inputs", ())):
+                    return Outcome(unit.serial, KEPT, summary=summarise(*there))
             record = make_record(unit, files)
-        content = record.to_dict()
-        text = json_text(content)
+        content_sha256, text = record.sealed()
         if store is not None:
             write_text(store.record(unit.serial), text)
-        return Outcome(unit.serial, DONE, summary=summarise(record, content), text=None if store is not None else text)
+        summary = summarise(record, content_sha256)
+        return Outcome(unit.serial, DONE, summary=summary, text=None if store is not None else text)
     except ImulabError as error:
         return Outcome(unit.serial, FAILED, _one_line(str(error)))
     except Exception as error:
@@ -149,8 +148,8 @@ def make_record(unit: Unit, files: UnitFiles) -> Calibration:
     )
 
 
-def summarise(record: Calibration, content: Mapping[str, Any]) -> Summary:
-    """Return what table and history need of a record that `make_record` has made; `content` is its `to_dict`."""
+def summarise(record: Calibration, content_sha256: str) -> Summary:
+    """Return what table and history need of a record that `make_record` has made."""
     made = record.sections["fleet"]
     return Summary(
         serial=record.sensor["serial"],
@@ -158,7 +157,7 @@ def summarise(record: Calibration, content: Mapping[str, Any]) -> Summary:
         created=record.created,
         date=made.get("date"),
         software=record.software,
-        content_sha256=str(content["content_sha256"]),
+        content_sha256=content_sha256,
         inputs=tuple(item["sha256"] for item in made["inputs"]),
         parameters=dict(record.parameters),
         warnings=record.warnings,

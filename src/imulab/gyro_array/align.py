@@ -1,8 +1,7 @@
 """Alignment of an array's elements against their consensus, from a recording in motion.
 
-All readings are one motion seen n times. The largest eigenvectors of their covariance, whitened by the noise at
-rest, span
-what the elements sense of it (maximum likelihood of the factor model); the frame within is fixed by a convention.
+All readings are one motion seen n times. The largest eigenvectors of their covariance, whitened by the noise at rest,
+span what the elements sense of it (maximum likelihood of the factor model); the frame within is fixed by a convention.
 """
 
 from __future__ import annotations
@@ -46,8 +45,7 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
 
     Without `truth`, element 1 in its nominal orientation gives the directions and the mean over all elements of
     ``P_i' A_i`` is the unit matrix, P_i the nominal orientation of element i (a signed permutation where it is near
-    one).
-    With `truth`, A_i is the regression on it. Uncertainties: jackknife over 20 stretches of the recording.
+    one). With `truth`, A_i is the regression on it. Uncertainties: jackknife over 20 stretches of the recording.
 
     Parameters
     ----------

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imulab.errors import DataError
+from imulab.noise import usual_step
 from imulab.recording import Array, Recording, check_finite, check_time
 
 _GAP = 1.5
@@ -43,16 +44,15 @@ class Clock:
         if self.last is not None and not time[0] > self.last:
             raise DataError(
                 f"{block.name}: {block.place(0)}, column time: time runs backwards: expected more than "
-                f"{self.last:.15g} s, "
-                f"found {time[0]:.15g} s"
+                f"{self.last:.15g} s, found {time[0]:.15g} s"
             )
         known = time if self.last is None else np.concatenate([[self.last], time])
         step = np.diff(known)
         if len(self.steps) < _TO_ESTIMATE:
             self.steps += step[: _TO_ESTIMATE - len(self.steps)].tolist()
         if self.steps:
-            usual = 1 / self.rate
-            wide = np.flatnonzero(step > _GAP * usual)
+            longest = usual_step(np.array(self.steps))[1] if self.nominal is None else _GAP / self.nominal
+            wide = np.flatnonzero(step > longest)
             for index in wide.tolist():
                 self.count += 1
                 self.total += float(step[index])
@@ -68,7 +68,7 @@ class Clock:
         """Sampling rate, Hz: as given, or from the first steps of time; 100 while there are none."""
         if self.nominal is not None:
             return self.nominal
-        return 1 / float(np.median(self.steps)) if self.steps else 100.0
+        return 1 / usual_step(np.array(self.steps))[0] if self.steps else 100.0
 
     @property
     def settled(self) -> bool:
@@ -158,8 +158,8 @@ def _own_times(recording: Recording, clocks: dict[int, str]) -> dict[int, Array]
             index = int(np.argmax(apart))
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: the clocks disagree: "
-                f"{own[number][index]:.9g} s "
-                f"where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s apart"
+                f"{own[number][index]:.9g} s where time is {time[index]:.9g} s; expected less than {_MOST_OFFSET} s "
+                "apart"
             )
     return own
 

@@ -128,8 +128,7 @@ def _allan_methods(record: Calibration, a: int) -> Figure:
     return Figure(
         title=f"Allan deviation of each method{of_axis(record.model['axes'][a])}",
         caption="On the left, how quiet a sample is: a curve that bends down there is low-pass filtered. On the "
-        "right, what the "
-        "angle drifts by: no weighting changes the bias that all gyros share.",
+        "right, what the angle drifts by: no weighting changes the bias that all gyros share.",
         traces=traces,
         layout={
             "xaxis": log_axis("averaging time, s"),
@@ -158,9 +157,8 @@ def _angles(record: Calibration, a: int) -> Figure:
     ]
     return Figure(
         title=f"Angle error over time{of_axis(record.model['axes'][a])}",
-        caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in "
-        "nothing that "
-        "counts for an attitude.",
+        caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in nothing "
+        "that counts for an attitude.",
         traces=traces,
         layout={
             "xaxis": axis("time, s"),
@@ -210,9 +208,8 @@ def _health(record: Calibration, a: int) -> Figure:
             )
     return Figure(
         title=f"Weight and health of each gyro under robust{of_axis(record.model['axes'][a])}",
-        caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and "
-        "is being "
-        "estimated again.",
+        caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and is "
+        "being estimated again.",
         traces=traces,
         layout={
             "xaxis": axis("time, s"),

@@ -86,11 +86,9 @@ def _elements_table(record: Calibration) -> Table:
     scaled = one and record.model["aligned"]
     return Table(
         title="Elements",
-        caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth "
-        "rate too) "
-        "included. Angle random walk (ARW), bias instability and rate random walk (RRW) are read from the Allan curves "
-        "below; 0 ± u means that the recording is too short or the "
-        "effect too small to be seen.",
+        caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth rate "
+        "too) included. Angle random walk (ARW), bias instability and rate random walk (RRW) are read from the Allan "
+        "curves below; 0 ± u means that the recording is too short or the effect too small to be seen.",
         columns=[
             "gyro",
             "bias, deg/s",
@@ -112,10 +110,9 @@ def _matrix_table(record: Calibration) -> Table:
         rows.append([element["name"], *cells, f"{1e6 * np.max(u):.0f}", plain_number(residual, 3)])
     return Table(
         title="Alignment",
-        caption=f"Rate = matrix (reading − bias); rows of the matrix are x, y, z. Gauge: {record.model['gauge']}. "
-        "u: largest standard uncertainty of an entry. A residual far above the noise means errors that a matrix "
-        "cannot hold "
-        "(nonlinearity, timing, g-sensitivity).",
+        caption=f"Rate = matrix (reading − bias); rows of the matrix are x, y, z. Gauge: {record.model['gauge']}. u: "
+        "largest standard uncertainty of an entry. A residual far above the noise means errors that a matrix cannot "
+        "hold (nonlinearity, timing, g-sensitivity).",
         columns=["element", "x", "y", "z", "u, 10⁻⁶", "residual, deg/s"],
         rows=rows,
     )
@@ -129,9 +126,8 @@ def _allan_elements(record: Calibration, a: int) -> Figure:
         )
     return Figure(
         title=f"Allan deviation of each gyro{of_axis(record.model['axes'][a])}",
-        caption="Slope −1/2: angle random walk. Flat: bias instability. Slope +1/2: rate random walk. A curve "
-        "apart from the "
-        "others is a gyro apart from the others; the last points on the right are few averages.",
+        caption="Slope −1/2: angle random walk. Flat: bias instability. Slope +1/2: rate random walk. A curve apart "
+        "from the others is a gyro apart from the others; the last points on the right are few averages.",
         traces=traces,
         layout={
             "xaxis": log_axis("averaging time, s"),
@@ -151,9 +147,8 @@ def _correlation(record: Calibration, a: int) -> Figure:
     noise = float(np.median(shared["standard_uncertainty"][a]))
     return Figure(
         title=f"Correlation of the noise{of_axis(record.model['axes'][a])}",
-        caption=f"At {shared['averaging_time']['value']:g} s, ± {noise:.2f} each. What all share, no weights "
-        f"remove; a pair "
-        "that goes together counts for less than two.",
+        caption=f"At {shared['averaging_time']['value']:g} s, ± {noise:.2f} each. What all share, no weights remove; "
+        "a pair that goes together counts for less than two.",
         traces=[
             {
                 "type": "heatmap",

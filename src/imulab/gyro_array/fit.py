@@ -94,9 +94,8 @@ def calibrate_array(
     covariance, used, count = _covariance(readings, rest.rate, averaging_time)
     if used < averaging_time * 0.999:
         warnings.append(
-            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} "
-            f"s: taken at "
-            f"{used:.3g} s"
+            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
+            f"taken at {used:.3g} s"
         )
     _check_at_rest(still, readings, rest, elements)
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)

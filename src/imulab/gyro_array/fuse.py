@@ -28,6 +28,8 @@ from imulab.units import conversion_factor, from_si, parse_unit
 
 _NEED_THREE = ("robust", "support", "least-squares")
 _FOR_NOISE = 10_000
+MOST_COUNT = 1_000_000_000
+"""Largest starting count of the growing memory."""
 _WITHOUT_UNIT = 16.0
 
 
@@ -73,8 +75,8 @@ class FuseOptions:
                 raise OptionError(f"memory {self.memory!r}: expected growing, growing:COUNT, or a gain between 0 and 1")
         elif not 0 < self.memory < 1:
             raise OptionError(f"memory {self.memory:g}: expected growing, growing:COUNT, or a gain between 0 and 1")
-        if self.start < 1:
-            raise OptionError(f"memory growing:{self.start}: expected a count from 1")
+        if not 1 <= self.start <= MOST_COUNT:
+            raise OptionError(f"memory growing:{self.start}: expected a count from 1 to {MOST_COUNT}")
         if isinstance(self.initial_bias, str) and self.initial_bias not in ("first", "zero"):
             raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record")
         if self.method == "covariance" and self.calibration is None:
@@ -134,7 +136,7 @@ def parse_memory(text: str) -> tuple[str | float, int]:
         It is none of these.
     """
     kind, colon, count = text.partition(":")
-    if kind == "growing" and (not colon or (count.isascii() and count.isdecimal() and int(count) > 0)):
+    if kind == "growing" and (not colon or (count.isascii() and count.isdecimal() and 0 < int(count) <= MOST_COUNT)):
         return "growing", int(count) if colon else 1
     try:
         gain = float(text)
@@ -332,8 +334,8 @@ class _InUnits:
 
 def _blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
     """Return the stream of an exported blob."""
+    from imulab.arraytable import ArraySettings
     from imulab.runtime import Stream
-    from imulab.tables import ArraySettings
 
     section = next((s for s in blob.text["sections"] if s["kind"] == "array"), None)
     if section is None:

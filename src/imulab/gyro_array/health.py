@@ -66,18 +66,22 @@ class Health:
         gyros = sorted({(a, i) for a, i, _ in self.events})
         for a, i in gyros:
             parts = [
-                f"{kind} {self.events[a, i, kind].samples} samples from {self.events[a, i, kind].first:.6g} s"
+                f"{kind} {_samples(event.samples)} from {event.first:.6g} s"
                 for _, kind in _KINDS
-                if (a, i, kind) in self.events
+                if (event := self.events.get((a, i, kind))) is not None
             ]
-            found.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {self.total} samples)")
+            found.append(f"{self.names[a][i]}: {'; '.join(parts)} (of {_samples(self.total)})")
         if self.few > 0:
             found.append(
-                f"fewer than three gyros left in {self.few} samples: nothing to compare with, equal weights there"
+                f"fewer than three gyros left in {_samples(self.few)}: nothing to compare with, equal weights there"
             )
         if self.lost:
-            found.append(f"no gyro left in {self.lost} samples: the output is nan there")
+            found.append(f"no gyro left in {_samples(self.lost)}: the output is nan there")
         return found
+
+
+def _samples(count: int) -> str:
+    return f"{count} sample{'' if count == 1 else 's'}"
 
 
 @dataclass

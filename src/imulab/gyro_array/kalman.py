@@ -13,8 +13,7 @@ import numpy as np
 from imulab.recording import Array
 
 RATE_WALK = math.radians(1.4)
-"""Default process noise, rad/s/sqrt(s): enough to follow 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible
-lag."""
+"""Default process noise, rad/s/sqrt(s): follows 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible lag."""
 _BIAS_WALK = 0.004
 _LOWEST = 0.05
 _TO_SIGMA = 1.4826

@@ -1,15 +1,4 @@
-r"""Layout files: where the columns of a foreign file are, and in which units.
-
-delimiter = "whitespace"            # or "," ";" "\t"
-header = false                      # true: the first line names the columns
-skip_lines = 0                      # lines above the header or the data
-sample_rate = { value = 100, unit = "Hz" }      # only where no column holds time
-[columns]
-time = { from = 0, unit = "s" }     # 0-based number, or name in the header; "variable" or "group/dataset" elsewhere
-accel_x = { from = 1, unit = "count" }
-[metadata]
-serial = "SN42"
-"""
+"""Layout files: where the columns of a foreign file are, and in which units; `EXAMPLE` has every key."""
 
 from __future__ import annotations
 
@@ -23,8 +12,22 @@ from imulab.errors import ReadError, UnitError
 from imulab.recording import check_unit
 from imulab.units import parse_unit, to_si
 
+EXAMPLE = """\
+delimiter = "whitespace"                        # or "," ";" "\\t"
+decimal = "."                                   # or "," where numbers are written 9,81
+header = false                                  # true: the first line names the columns
+skip_lines = 0                                  # lines above the header or the data
+# sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
+[columns]
+time = { from = 0, unit = "s" }                 # 0-based number, or a name in the header
+accel_x = { from = 1, unit = "count" }
+accel_y = { from = 2, unit = "count" }
+accel_z = { from = 3, unit = "count" }
+[metadata]
+serial = "SN42"
+"""
 _DELIMITERS = {"whitespace": " ", " ": " ", ",": ",", ";": ";", "\t": "\t"}
-_KEYS = {"delimiter", "header", "skip_lines", "sample_rate", "columns", "metadata"}
+_KEYS = ("columns", "delimiter", "header", "metadata", "sample_rate", "skip_lines", "decimal")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +42,8 @@ class LayoutColumn:
 class Layout:
     """Where the columns of a foreign file are.
 
-    ``delimiter`` is one character, a blank meaning any run of blanks; ``sample_rate`` in Hz or None; ``text`` says that
-    the file is delimited text whatever it looks like (the layout file names a delimiter).
+    ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
+    in Hz or None; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter).
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -51,6 +54,7 @@ class Layout:
     metadata: Mapping[str, str] | None = None
     name: str = "layout"
     text: bool = False
+    decimal: str = "."
 
 
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
@@ -68,6 +72,8 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ReadError(f"{name}: no such layout file") from None
+    except IsADirectoryError:
+        raise ReadError(f"{name}: expected a layout file, found a folder") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ReadError(f"{name}: the layout cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
@@ -76,12 +82,15 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
 
 
 def _layout(table: dict[str, Any], path: str) -> Layout:
-    unknown = sorted(set(table) - _KEYS)
+    unknown = sorted(set(table) - set(_KEYS))
     if unknown:
-        raise ReadError(f"{path}: unknown key {unknown[0]!r}; known keys: {' '.join(sorted(_KEYS))}")
+        raise ReadError(f"{path}: unknown key {unknown[0]!r}; known keys: {' '.join(_KEYS)}")
     delimiter = table.get("delimiter", "whitespace")
     if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:
         raise ReadError(f"{path}: delimiter {delimiter!r}; expected 'whitespace' ',' ';' or a tab")
+    decimal = table.get("decimal", ".")
+    if decimal not in (".", ",") or decimal == delimiter:
+        raise ReadError(f"{path}: decimal {decimal!r}; expected '.' or ',', and another sign than the delimiter")
     columns = table.get("columns")
     if not isinstance(columns, dict) or not columns:
         raise ReadError(f'{path}: no [columns]; expected lines such as accel_x = {{ from = 1, unit = "count" }}')
@@ -106,6 +115,7 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
         metadata={key: str(value) for key, value in metadata.items()},
         name=path,
         text="delimiter" in table,
+        decimal=decimal,
     )
 
 

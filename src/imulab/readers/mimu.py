@@ -48,7 +48,8 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
 def read_mimu(stream: BinaryIO, name: str) -> Recording:
     """Read a MIMU4444 log: ``time [s]`` from 0 and unwrapped, ``gyro_x_1 .. gyro_z_8 [deg/s]``, ``accel_..`` [m/s^2].
 
-    Axes are as logged. Damaged bytes between frames are skipped, and a note says where.
+    Axes are as logged. Damaged bytes between frames are skipped, and a log that ends in the middle of a frame is read
+    up to there; notes say so.
 
     Raises
     ------
@@ -56,7 +57,7 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
         No frame was found.
     """
     data = stream.read()
-    frames, skipped = _frames(data)
+    frames, skipped, cut = _frames(data)
     if not len(frames):
         raise ReadError(f"{name}: no whole MIMU4444 frame of {_FRAME.itemsize} bytes was found")
     stamp: NDArray[np.int64] = frames["stamp"].astype(np.int64)
@@ -72,6 +73,8 @@ def read_mimu(stream: BinaryIO, name: str) -> Recording:
                 columns[title] = step * frames["data"][:, element, first + axis].astype(np.float64)
                 units[title] = unit
     notes = []
+    if cut is not None:
+        notes.append(f"truncated: the last frame, at byte {cut}, is cut; read up to there")
     if skipped:
         notes.append(f"{skipped} bytes between frames were skipped as damaged")
     if lost.any():
@@ -116,9 +119,9 @@ def _good(data: bytes) -> np.ndarray:
     return good
 
 
-def _frames(data: bytes) -> tuple[np.ndarray, int]:
-    """Return the good frames and the number of bytes skipped after the first of them."""
-    found, skipped, size = [], 0, _FRAME.itemsize
+def _frames(data: bytes) -> tuple[np.ndarray, int, int | None]:
+    """Return the good frames, the number of bytes skipped after the first of them, and where a last, cut one begins."""
+    found, skipped, size, cut = [], 0, _FRAME.itemsize, None
     place = _first_frame(data)
     while place is not None:
         count = (len(data) - place) // size
@@ -128,9 +131,17 @@ def _frames(data: bytes) -> tuple[np.ndarray, int]:
         found.append(np.frombuffer(run[: length * size], dtype=_FRAME))
         place += length * size
         step = _first_frame(data[place:], len(data))
-        if step is None:  # less than a frame at the end is where the log was stopped
-            skipped += len(data) - place if len(data) - place >= size else 0
+        if step is None:
+            if _begins_frame(data[place:]):
+                cut = place
+            else:
+                skipped += len(data) - place
             break
         skipped += step
         place += step
-    return (np.concatenate(found) if found else np.empty(0, dtype=_FRAME)), skipped
+    return (np.concatenate(found) if found else np.empty(0, dtype=_FRAME)), skipped, cut
+
+
+def _begins_frame(rest: bytes) -> bool:
+    """Return whether the last bytes of a log are the beginning of a frame, which was being written as the log ended."""
+    return 0 < len(rest) < _FRAME.itemsize and rest[0] == _HEAD and rest[3:4] in (b"", bytes([_SIZE]))

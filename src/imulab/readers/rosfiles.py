@@ -330,7 +330,11 @@ def files_of(folder: Path, name: str) -> list[Path]:
     if listed:
         return [folder / Path(entry).name for entry in listed]
     if not found:
-        raise ReadError(f"{name}: expected a file, found a folder that is no ROS 2 bag (no .mcap or .db3 in it)")
+        common = next((ending for ending in (".csv", ".parquet") if any(folder.glob(f"*{ending}"))), "")
+        raise ReadError(
+            f"{name}: expected a file, found a folder that is no ROS 2 bag (no .mcap or .db3 in it)"
+            + (f"; name the files in it: {name}/*{common}" if common else "")
+        )
     return found
 
 

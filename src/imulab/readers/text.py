@@ -10,7 +10,7 @@ import hashlib
 import os
 import re
 import stat
-from codecs import BOM_UTF8
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -108,7 +108,8 @@ class TextFile:
         if not self._rest.strip():
             raise ReadError(f"{name}: the file is empty")
         if b"\0" in self._rest[:4096]:
-            raise ReadError(f"{name}: expected text, found binary data")
+            wide = " (UTF-16? expected UTF-8)" if self._rest.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ""
+            raise ReadError(f"{name}: expected text, found binary data{wide}")
         self._delimiter = layout.delimiter if layout else ","
         self._blanks = b" \r\n" if self._delimiter == "\t" else b" \t\r\n"
         self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
@@ -214,12 +215,16 @@ class TextFile:
         """Take the comment lines and return the first line that is none."""
         while (line := self._line()) is not None:
             if line.startswith("#"):
-                key, colon, value = line.lstrip("# ").partition(":")
-                if colon and key.strip():
-                    self._metadata[key.strip()] = value.strip()
+                self._note(line)
             elif line.strip():
                 return line
         return None
+
+    def _note(self, comment: str) -> None:
+        """Keep a comment ``# key: value``; what a layout says goes before."""
+        key, colon, value = comment.lstrip("# ").partition(":")
+        if colon and key.strip() and not (self._layout and key.strip() in (self._layout.metadata or {})):
+            self._metadata[key.strip()] = value.strip()
 
     def _native_head(self) -> tuple[list[str], dict[str, str], np.ndarray]:
         line = self._comments()
@@ -232,13 +237,14 @@ class TextFile:
         if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
             raise ReadError(
                 f"{self._name}: line {self._lines_before}: expected titles such as 'time [s],accel_x [m/s^2]', "
-                "found numbers; describe a foreign file with --layout FILE.toml"
+                "found numbers; describe a foreign file with --layout FILE.toml (imulab show --formats has an example)"
             )
         titles, units = [], {}
         for title in line.split(","):
             name, unit = parse_column_title(title, self._name)
             if not name:
-                raise ReadError(f"{self._name}: line {self._lines_before}: a column without a name")
+                at_end = " (a comma at the end of the line?)" if line.rstrip().endswith(",") else ""
+                raise ReadError(f"{self._name}: line {self._lines_before}: a column without a name{at_end}")
             if name in units:
                 raise ReadError(f"{self._name}: line {self._lines_before}: column {name} appears twice")
             titles.append(name)
@@ -247,14 +253,15 @@ class TextFile:
 
     def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
         for _ in range(layout.skip_lines):
-            self._line()
+            line = self._line() or ""
+            if line.startswith("#"):
+                self._note(line)
         if layout.header:
-            header = self._line() or ""
-            present = [title.strip().strip('"') for title in _fields(header.lstrip("# "), layout.delimiter)]
+            present = self._layout_titles(layout)
         else:
             self._fill_line()
             while self._rest.startswith(b"#"):
-                self._line()
+                self._note(self._line() or "")
                 self._fill_line()
             first = self._rest.partition(b"\n")[0].decode("utf-8", "replace")
             present = [str(number) for number in range(len(_fields(first, layout.delimiter)))]
@@ -278,10 +285,22 @@ class TextFile:
             slots[index] = slot
         return list(layout.columns), {name: c.unit for name, c in layout.columns.items()}, slots
 
+    def _layout_titles(self, layout: Layout) -> list[str]:
+        """Take the line of titles, which may itself begin with #; comments above it are kept."""
+        wanted = {column.origin for column in layout.columns.values() if isinstance(column.origin, str)}
+        while True:
+            line = self._line() or ""
+            titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), layout.delimiter)]
+            if not (wanted and line.startswith("#") and wanted.isdisjoint(titles)):
+                return titles
+            self._note(line)
+
     # --- rows --------------------------------------------------------------------------------------------------
 
     def _begin(self, block: bytes, crew: _Crew) -> tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]:
         """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
+        if self._layout and self._layout.decimal == ",":
+            block = block.replace(b",", b".")
         capacity = block.count(b"\n") + 1
         room, first = self._place_for(capacity, len(block))
         job = partial(_text.parse, block, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
@@ -332,6 +351,8 @@ class TextFile:
         slot = int(self._slots[field])
         shown = found if len(found) <= 40 else found[:37] + "..."
         comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", found) else ""
+        if comma and self._layout:
+            comma += '; decimal = "," in the layout reads it'
         raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}{comma}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from imulab.calibration import Calibration
-from imulab.exhibit import Exhibits, Figure
+from imulab.exhibit import Exhibits, Figure, Table
 from imulab.files import write_text
 
 _TITLES = {
@@ -20,6 +21,7 @@ _TITLES = {
     "warmup": "Warm-up table",
     "centrifuge": "Centrifuge test",
 }
+_NUMBER = re.compile(r"[<>±+−-]?\s?\d[\d.,]*(?:e[-+]?\d+)?(?![\w.-])|nan\b")
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
@@ -50,11 +52,22 @@ def render_page(
             warnings=warnings,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
+            column_kinds=_column_kinds,
             plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
             plotly=_plotly(),
             provenance=provenance,
         )
     )
+
+
+def _column_kinds(table: Table) -> list[str]:
+    """Return ``unit`` or ``text`` for the columns that hold no number; the first stands at the left anyway."""
+    found = [""] * len(table.columns)
+    for number, title in enumerate(table.columns[1:], start=1):
+        cells = [row[number] for row in table.rows if row[number] not in ("", "–")]
+        if cells and not any(_NUMBER.match(cell) for cell in cells):
+            found[number] = "unit" if title == "unit" else "text"
+    return found
 
 
 def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicted: list[tuple[str, str, str]]) -> str:
@@ -138,4 +151,8 @@ def _plain(value: Any) -> str:
             origin = f" ({value['from']})" if "from" in value else ""
             return f"{value['value']:.9g} {value['unit']}{origin}"
         return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
-    return str(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(item) for item in value if item != "") or "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "–" if value is None else str(value)

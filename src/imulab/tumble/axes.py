@@ -44,8 +44,8 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
         return
     if any(parse_unit(recording.units[name]).quantity != "rate" for name in names):
         return
-    rate = np.column_stack([recording.si(name) for name in names])
-    if not np.isfinite(rate).all():
+    columns = [recording.si(name) for name in names]
+    if not all(np.isfinite(column).all() for column in columns):
         return
     first = np.unique(pieces[:, 2], return_index=True)[1]
     last = np.append(first[1:], len(pieces)) - 1
@@ -53,11 +53,21 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
     short = time[stop] - time[start] <= _LONGEST_TURN
     if np.count_nonzero(short) < _FEWEST_TURNS:
         return
-    bias = np.mean([rate[a:b].mean(axis=0) for a, b, _ in pieces], axis=0)
-    turn = frame_rotations(rate - bias, time, start[short], stop[short])
-    mirrored = frame_rotations(bias - rate, time, start[short], stop[short])
+    edges, samples = pieces[:, :2].ravel(), pieces[:, 1] - pieces[:, 0]
+    bias = np.array([np.mean(np.add.reduceat(c[: edges[-1]], edges[:-1])[::2] / samples) for c in columns])
+    start, stop = start[short], stop[short]
+    # Only the samples of the turns, one turn behind the other.
+    size = stop - start + 1
+    begin = np.cumsum(size) - size
+    samples = np.arange(size.sum()) + np.repeat(start - begin, size)
+    rate, when = np.column_stack([column[samples] for column in columns]) - bias, time[samples]
+    start, stop = begin, begin + size - 1
+    turn = frame_rotations(rate, when, start, stop)
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     before, after = up[:-1][short], up[1:][short]
+    if not _median_miss(turn, before, after) > _WRONG:
+        return
+    mirrored = frame_rotations(-rate, when, start, stop)
     miss = {name: _median_miss(turn, before @ m.T, after @ m.T) for name, m in _signed_permutations().items()}
     miss |= {
         f"{name} and the gyroscopes all reversed": _median_miss(mirrored, before @ m.T, after @ m.T)
@@ -65,7 +75,7 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
     }
     # Reversing all three axes of gravity changes nothing: of two equals, the one with fewer reversals is meant.
     best = min(miss, key=lambda name: (round(miss[name], 9), name.count("-")))
-    if miss["x y z"] > _WRONG and miss[best] < _RIGHT:
+    if miss[best] < _RIGHT:
         raise DataError(
             f"{recording.name}: columns accel_x accel_y accel_z: axes swapped or reversed: between attitudes the "
             f"direction of gravity misses the turn of gyro_x gyro_y gyro_z by {np.degrees(miss['x y z']):.0f} deg "

@@ -12,6 +12,7 @@ from imulab.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
 from imulab.tumble.solve import Solution
 from imulab.units import from_si, parse_unit, to_si
 
+_MANY_ROWS = 200
 _ENOUGH_TO_TELL = 5
 _DEAD_SPAN = 0.02
 _GYRO_SPAN = 0.05
@@ -87,8 +88,15 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
         raise DataError(
             f"{attitudes.recording.name}: {attitudes.label(index)}, columns accel_x accel_y accel_z: "
             f"the specific force is {from_si(magnitude[index] * gravity, unit.symbol):.4g} {unit.symbol}, expected "
-            f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}"
+            f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}{_untimed(attitudes)}"
         )
+
+
+def _untimed(attitudes: Attitudes) -> str:
+    """Return what to say of a table that may be a recording whose time was left out."""
+    if attitudes.trace is not None or len(attitudes) <= _MANY_ROWS:
+        return ""
+    return "; without a column time every row is an attitude: a recording needs one, or a layout with sample_rate"
 
 
 def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) -> None:

@@ -239,11 +239,12 @@ def _orders(record: Calibration) -> Table:
                 "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
             ]
         )
+    huber = " Rms of all attitudes, a down-weighted one by its weight." if record.fit["loss"] == "huber" else ""
     return Table(
         title="Choice of the order",
         caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
         "attitudes it has not seen (leave-one-out), if the F-test finds the gain significant, and if the attitudes can "
-        "observe it.",
+        f"observe it.{huber}",
         columns=[
             "order",
             "parameters",

@@ -46,7 +46,7 @@ class TumbleFit:
     orders
         The table of orders, where the order was chosen from the data; empty otherwise.
     residuals
-        |f| - g of each attitude, m/s^2, shape (n,).
+        ``|f| - g`` of each attitude, m/s^2, shape (n,).
     down_weights
         Factors of Huber's loss, shape (n,); ones without it.
     """

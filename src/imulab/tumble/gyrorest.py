@@ -147,7 +147,7 @@ def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest
     costs = float((_left(drift, mean) ** 2).sum()), float((left**2).sum())
     shown = n > 7 and f_test(costs[0], 6, costs[1], 15, 3 * n) < _SIGNIFICANT
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
-        scatter: Array = np.sqrt((flat**2).sum(axis=0) / (n - 1) / n)
+        scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
         return Rest(mean.mean(axis=0), None, scatter, None)
     solution = np.asarray(np.linalg.lstsq(whole, mean, rcond=None)[0], dtype=np.float64)
     root = np.sqrt(np.diag(np.linalg.inv(whole.T @ whole)))

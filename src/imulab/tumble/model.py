@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.estimate import Fit
 from imulab.recording import Array
+from imulab.tumble import _model
 
 AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
 HIGHEST_ORDER = 5
 GAUGE = "x input axis along body x, y input axis in the body xy plane"
-_NEWTON_STEPS = 12
-_CLOSE = 1e-15
 
 
 def parameter_count(order: int) -> int:
@@ -47,14 +47,9 @@ def parameter_units(order: int, output: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Inversion:
-    """Specific force of a batch of outputs, and what its derivatives need.
-
-    All of shape (..., 3): `force` f, `sensed` s along the input axes, `slope` dA/ds.
-    """
+    """Specific force of a batch of outputs, shape (..., 3); NaN where no specific force gives this output."""
 
     force: Array
-    sensed: Array
-    slope: Array
 
 
 def invert(reading: Array, misalignment: Array, nonlinearity: Array) -> Inversion:
@@ -71,55 +66,20 @@ def invert(reading: Array, misalignment: Array, nonlinearity: Array) -> Inversio
     nonlinearity
         k2 ... ke, shape (..., e - 1, 3), in the inverse powers of the unit of `reading`.
     """
-    sensed, slope = _solve_polynomial(reading, nonlinearity)
-    with np.errstate(over="ignore", invalid="ignore"):
-        x = sensed[..., 0]
-        y = sensed[..., 1] - misalignment[..., 0] * x
-        z = sensed[..., 2] - misalignment[..., 1] * x - misalignment[..., 2] * y
-    return Inversion(np.stack([x, y, z], axis=-1), sensed, slope)
+    order = nonlinearity.shape[-2] + 1
+    powers = nonlinearity.reshape(*nonlinearity.shape[:-2], 3 * (order - 1))
+    shape = np.broadcast_shapes(reading.shape[:-1], misalignment.shape[:-1], powers.shape[:-1])
+    theta = np.zeros((*shape, parameter_count(order)))
+    theta[..., 3:6], theta[..., 6:9], theta[..., 9:] = 1.0, misalignment, powers
+    each = np.broadcast_to(reading, (*shape, 3)).reshape(-1, 1, 3)
+    return Inversion(norm_and_jacobian(theta.reshape(len(each), -1), each, order)[2].reshape(*shape, 3))
 
 
-def _solve_polynomial(reading: Array, nonlinearity: Array) -> tuple[Array, Array]:
-    """Solve ``s + k2 s^2 + ... = A`` for s; return s and the slope there."""
-    powers = nonlinearity.shape[-2]
-    if powers == 0:
-        return reading, np.ones_like(reading)
-    s = reading
-    size = _CLOSE * np.maximum(np.abs(reading), 1.0)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for _ in range(_NEWTON_STEPS):
-            value, slope = _polynomial(s, nonlinearity)
-            step = (value - reading) / slope
-            # Each element stops by itself, so that its result does not depend on its neighbours.
-            moving = np.abs(step) > size
-            s = np.where(moving | np.isnan(step), s - step, s)
-            if not moving.any():
-                break  # and the slope is that at s
-        else:
-            slope = _polynomial(s, nonlinearity)[1]
-        # Where the polynomial turns back there is no specific force that gives this output.
-        solved = (slope > 0) & ~moving
-        return np.where(solved, s, np.nan), np.where(solved, slope, np.nan)
-
-
-def _polynomial(s: Array, nonlinearity: Array) -> tuple[Array, Array]:
-    """Value and slope of ``s + k2 s^2 + ... + ke s^e`` by Horner's scheme."""
-    # value = k2 + k3 s + ..., so that the polynomial is s (1 + s value); Horner's first two rows are written out.
-    count = nonlinearity.shape[-2]
-    value = nonlinearity[..., count - 1, :]
-    if count == 1:
-        scaled = s * value
-        return s * (1 + scaled), 1 + (scaled + scaled)
-    slope = value
-    value = value * s + nonlinearity[..., count - 2, :]
-    for index in reversed(range(count - 2)):
-        slope = slope * s + value
-        value = value * s + nonlinearity[..., index, :]
-    return s * (1 + s * value), 1 + s * (2 * value + s * slope)
-
-
-def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, Array, Inversion, Array]:
+def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, Array, Array, Array]:
     """Return |f| and its derivatives for a batch of parameter vectors.
+
+    With ``T' v = f / |f|`` it is ``d|f| = v . (ds - dT f)``, and ``ds = (dA - sum dk_j s^j) / A'(s)``. The loop over
+    problems and attitudes is in C (`_model`).
 
     Parameters
     ----------
@@ -127,38 +87,45 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
         Scaled parameters, shape (b, p): zero (in the unit of `reading`), relative scale factor, misalignment,
         nonlinearity.
     reading
-        Outputs, shape (b, n, 3), already divided by a nominal scale factor.
+        Outputs, shape (b, n, 3), or (1, n, 3) for all problems alike, already divided by a nominal scale factor.
     order
         Order e of the model.
 
     Returns
     -------
     tuple
-        |f| (b, n); its derivatives with respect to theta (b, n, p); the inversion; ``q = d|f|/d reading`` (b, n, 3).
+        |f| (b, n); its derivatives with respect to theta (b, n, p); f (b, n, 3); ``q = d|f|/d reading`` (b, n, 3).
     """
-    scale = theta[:, None, 3:6]
-    misalignment = theta[:, None, 6:9]
-    nonlinearity = theta[:, None, 9:].reshape(len(theta), 1, order - 1, 3)
-    a = (reading - theta[:, None, 0:3]) / scale
-    inversion = invert(a, misalignment, nonlinearity)
-    f, s = inversion.force, inversion.sensed
-    norm = np.maximum(np.sqrt(np.einsum("bni,bni->bn", f, f)), np.finfo(float).tiny)
-    u = f / norm[:, :, None]
-    # v solves T' v = u, so that d|f| = v . (ds - dT f)
-    v = np.empty_like(u)
-    v[..., 2] = u[..., 2]
-    v[..., 1] = u[..., 1] - misalignment[..., 2] * v[..., 2]
-    v[..., 0] = u[..., 0] - misalignment[..., 0] * v[..., 1] - misalignment[..., 1] * v[..., 2]
-    per_reading = v / inversion.slope
-    q = per_reading / scale
-    jacobian = np.empty((*norm.shape, theta.shape[1]))
-    jacobian[..., 0:3] = -q
-    jacobian[..., 3:6] = -q * a
-    jacobian[..., 6] = -v[..., 1] * f[..., 0]
-    jacobian[..., 7] = -v[..., 2] * f[..., 0]
-    jacobian[..., 8] = -v[..., 2] * f[..., 1]
-    power = s
-    for j in range(order - 1):
-        power = power * s
-        jacobian[..., 9 + 3 * j : 12 + 3 * j] = -per_reading * power
-    return norm, jacobian, inversion, q
+    problems, n = len(theta), reading.shape[1]
+    norm, force = np.empty((problems, n)), np.empty((problems, n, 3))
+    jacobian = np.empty((problems, n, theta.shape[1]))
+    _model.lengths(
+        np.ascontiguousarray(theta, dtype=np.float64), np.ascontiguousarray(reading, dtype=np.float64), order,
+        norm, jacobian, force,
+    )  # fmt: skip
+    return norm, jacobian, force, -jacobian[:, :, 0:3]
+
+
+def fit_lengths(
+    start: Array, reading: Array, weights: Array, lengthening: Array, order: int, *, tolerance: float, most: int
+) -> Fit:
+    """Minimise ``sum w (|f| - 1 - lengthening)^2`` of each problem, by the steps of `levenberg_marquardt` in C.
+
+    Parameters
+    ----------
+    start, reading, order
+        As for `norm_and_jacobian`.
+    weights, lengthening
+        Shape (b, n).
+    tolerance, most
+        Largest step that counts as converged, and how many steps are tried.
+    """
+    count, n = weights.shape
+    theta = np.array(start, dtype=np.float64)
+    residuals, jacobian = np.empty((count, n)), np.empty((count, n, theta.shape[1]))
+    iterations, converged = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.bool_)
+    _model.fit(
+        theta, np.ascontiguousarray(reading), np.ascontiguousarray(weights), np.ascontiguousarray(lengthening), order,
+        tolerance, most, residuals, jacobian, iterations, converged,
+    )  # fmt: skip
+    return Fit(theta, residuals, jacobian, weights, iterations, converged)

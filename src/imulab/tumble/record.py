@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import RecordError
+from imulab.errors import OptionError, RecordError
 from imulab.estimate import Observability, coverage_factor, leverage
-from imulab.recording import Array
+from imulab.recording import Array, Recording
+from imulab.texts import quantity
 from imulab.tumble.checks import check_prior
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
@@ -24,6 +25,8 @@ _STANDS_OUT = 5.0
 _MOST_NAMED = 8
 _ENOUGH_DEGREES = 9
 _ON_EARTH = (9.76, 9.84)
+_SAME_GRAVITY = 3e-6
+"""Far below any scale factor's uncertainty; a height of 10 m."""
 _WORST_SCALE = 0.1
 _WORST_MISALIGNMENT = 0.1
 _DOWN_WEIGHTED = 0.5
@@ -111,7 +114,7 @@ def make_record(
             "rank": observability.rank,
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
-            "orders": [asdict(row) for row in orders],
+            "orders": [dict(vars(row)) for row in orders],
             **_propagated(monte_carlo, scaling, g, order),
             **_prior_shares(prior, names, matrix),
         },
@@ -294,14 +297,20 @@ def _warnings(
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
-        *_gravity_warnings(gravity),
+        *_gravity_warnings(gravity, attitudes.recording),
         *_attitude_warnings(attitudes, problem, solution, reduced_chi_square),
         *_freedom_warnings(problem, solution, observability),
         *_size_warnings(attitudes, solution),
     ]
 
 
-def _gravity_warnings(gravity: Gravity) -> list[str]:
+def _gravity_warnings(gravity: Gravity, recording: Recording) -> list[str]:
+    stated = _stated_gravity(recording)
+    if stated is not None and abs(gravity.value - stated) > _SAME_GRAVITY * stated:
+        return [
+            f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says {stated:.6g} "
+            f"m/s^2: scale factors differ by {_TO_MICRO * (stated / gravity.value - 1):+.0f} ppm between the two"
+        ]
     if gravity.origin.startswith("standard"):
         return [
             f"no local gravity was given: standard gravity {gravity.value} m/s^2 was used, and every scale factor "
@@ -311,6 +320,15 @@ def _gravity_warnings(gravity: Gravity) -> list[str]:
     if not low <= gravity.value <= high:
         return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
     return []
+
+
+def _stated_gravity(recording: Recording) -> float | None:
+    """Return what a comment ``# gravity: 9.81362 m/s^2`` of the recording says, m/s^2."""
+    text = recording.metadata.get("gravity")
+    try:
+        return None if text is None else quantity(text, "gravity", "acceleration", "m/s^2")
+    except OptionError:
+        return None
 
 
 def _attitude_warnings(

@@ -23,7 +23,7 @@ from imulab.estimate import (
     robust_scale,
 )
 from imulab.recording import Array
-from imulab.tumble.model import norm_and_jacobian, parameter_count
+from imulab.tumble.model import fit_lengths, norm_and_jacobian, parameter_count
 
 _SCALE_CHANGE = 5e-6
 _BIAS_CHANGE = 2e-6
@@ -205,14 +205,16 @@ def _least_squares(
     tolerance: float = 1e-9,
     max_iterations: int = 40,
 ) -> Fit:
+    prior = problem.prior
+    if prior is None:
+        return fit_lengths(
+            theta, problem.reading, weights, lengthening, problem.order, tolerance=tolerance, most=max_iterations
+        )
+
     def model(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         reading = problem.reading if len(index) == len(problem.reading) else problem.reading[index]
         norm, jacobian, _, _ = norm_and_jacobian(parameters, reading, problem.order)
         return norm - 1 - lengthening[index], jacobian
-
-    prior = problem.prior
-    if prior is None:
-        return levenberg_marquardt(model, theta, weights, tolerance=tolerance, max_iterations=max_iterations)
 
     def informed(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         residuals, jacobian = model(parameters, index)
@@ -261,7 +263,9 @@ def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tup
     if jacobian is None:
         jacobian = norm_and_jacobian(theta, problem.reading, problem.order)[1]
     q = -jacobian[:, :, 0:3]
-    covariance = np.broadcast_to(problem.covariance, (count, n, 3, 3))
+    covariance = problem.covariance
+    if len(covariance) != count:
+        covariance = np.broadcast_to(covariance, (count, n, 3, 3))
     along = np.einsum("bni,bnij,bnj->bn", q, covariance, q)
     # df/dM = T^-1 diag(1 / (slope S)); the nonlinearity's slope is 1 to the order that matters here
     carried = _unalign(theta[:, 6:9]) / theta[:, None, 3:6]
@@ -272,7 +276,7 @@ def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tup
 def _unalign(misalignment: Array) -> Array:
     """T^-1 of each problem, shape (b, 3, 3)."""
     inverse = np.zeros((len(misalignment), 3, 3))
-    inverse[:, range(3), range(3)] = 1.0
+    inverse[:, 0, 0] = inverse[:, 1, 1] = inverse[:, 2, 2] = 1.0
     yx, zx, zy = misalignment.T
     inverse[:, 1, 0] = -yx
     inverse[:, 2, 0] = zy * yx - zx
@@ -282,7 +286,7 @@ def _unalign(misalignment: Array) -> Array:
 
 def forces(problem: Problem, solution: Solution) -> Array:
     """Return the specific force in each attitude, units of g, shape (b, n, 3)."""
-    return norm_and_jacobian(solution.theta, problem.reading, problem.order)[2].force
+    return norm_and_jacobian(solution.theta, problem.reading, problem.order)[2]
 
 
 def leave_one_out(problem: Problem, solution: Solution) -> Array:
@@ -295,11 +299,10 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     if n > _REFIT_AT_MOST:
         errors: Array = (solution.residuals / (1 - leverage(solution.jacobian, solution.weights)))[0]
         return errors
-    repeated = replace(problem, reading=np.broadcast_to(problem.reading[0], (n, n, 3)))
     weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
     lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
     start = np.repeat(solution.theta, n, axis=0)
-    fit = _least_squares(repeated, start, weights, lengthening, max_iterations=_REFIT_STEPS)
+    fit = _least_squares(problem, start, weights, lengthening, max_iterations=_REFIT_STEPS)
     return np.diagonal(fit.residuals)
 
 

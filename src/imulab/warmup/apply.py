@@ -18,7 +18,7 @@ from imulab.warmup.poweron import power_on_temperature
 
 _TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
 _LAST_TICK = 2**32 - 1
-_PIECE = 8192  # samples at a time: what is between input and output stays in the cache
+_PIECE = 32768  # samples at a time: their ticks stay in the cache
 
 
 def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -51,29 +51,28 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
         return recording
     tick = _TICK if columns["end"] < _LONG else _LONG_TICK
     axes = list(columns["axes"])
-    corrected = {axis: np.empty(len(recording)) for axis in axes}
+    given = [recording.columns[axis] for axis in axes]
+    corrected = [np.empty(len(recording)) for _ in axes]
+    buffer = np.empty(min(_PIECE, len(recording)))
     for start in range(0, len(recording), _PIECE):
         piece = slice(start, start + _PIECE)
-        ticks, unknown = _ticks(time[piece], tick)
-        for axis, factor in zip(axes, factors, strict=True):
-            # In the unit of the table the core subtracts at once; in another one its curve is scaled first.
-            corrected[axis][piece] = recording.columns[axis][piece] if factor == 1.0 else 0.0
-        given = [corrected[axis][piece] for axis in axes]
-        _, active = unit.warmup(temperature, tick, ticks, given, in_place=True)
+        ticks, unknown = _ticks(time[piece], tick, buffer)
+        into = [column[piece] for column in corrected]
+        _, active = unit.warmup(
+            temperature, tick, ticks, [column[piece] for column in given], factors=factors, into=into
+        )
         if not active:
             return recording
-        for axis, factor, values in zip(axes, factors, given, strict=True):
-            if factor != 1.0:
-                values *= factor
-                values += recording.columns[axis][piece]
-            if unknown is not None:
+        if unknown is not None:
+            for values in into:
                 values[unknown] = np.nan
-    return recording.with_columns(corrected, {})
+    return recording.with_columns(dict(zip(axes, corrected, strict=True)), {})
 
 
-def _ticks(time: Array, tick: float) -> tuple[NDArray[np.uint32], NDArray[np.bool_] | None]:
-    """Return times in whole ticks, and which of them are no numbers, if any."""
-    count = np.rint(time / tick)
+def _ticks(time: Array, tick: float, buffer: Array) -> tuple[NDArray[np.uint32], NDArray[np.bool_] | None]:
+    """Return times in whole ticks, and which of them are no numbers, if any; `buffer` has room for them."""
+    count = np.divide(time, tick, out=buffer[: len(time)])
+    np.rint(count, out=count)
     if count.min() >= 0 and count.max() <= _LAST_TICK:  # also False where a time is NaN
         return count.astype(np.uint32), None
     unknown = ~np.isfinite(time)

@@ -92,7 +92,7 @@ def fit_warmup(
     settling_time
         T_M, s; chosen from the data if not given.
     settling_limit
-        Kind (``gyro``, ``accel``) to the |Z|, SI, below which a curve counts as settled; without it 5 % of the largest.
+        Kind (``gyro``, ``accel``) to the size of Z, SI, that counts as settled; 5 % of the largest if not given.
     exit_rule, taper_time
         What the unit does from T_M on, and how long a taper takes, s.
     pool

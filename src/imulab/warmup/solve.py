@@ -22,6 +22,7 @@ _START = {1: (20.0,), 2: (0.1, 0.4), 3: (0.06, 0.2, 0.6)}
 _CLOSEST = 1.6
 """Neighbouring time constants differ by this factor at least: closer ones cannot be told apart."""
 _PASSES = 3
+_WORST_CONDITION = 1e8
 _SHRINK = 2.0
 """Degrees of freedom with which the scatter of all temperatures counts at each one."""
 
@@ -133,7 +134,7 @@ def solve(
     if model == "interval-cubic":
         c = _intervals(sums, membership(curves, kept) * used[:, None])
     elif model == "exponential":
-        c, slopes = _amplitudes(curves, sums, used, kept)
+        c, slopes = _amplitudes(curves, sums, used, kept, scales)
     else:
         c = _knots(sums, hats(curves, kept), used)
     table = Table(
@@ -171,7 +172,9 @@ def knot_normal(sums: Statistics, hat: Array, used: Array) -> Array:
     return found
 
 
-def _amplitudes(curves: Curves, sums: Statistics, used: Array, kept: Index) -> tuple[Array, Array]:
+def _amplitudes(
+    curves: Curves, sums: Statistics, used: Array, kept: Index, constants: Sequence[float]
+) -> tuple[Array, Array]:
     """Amplitudes and slopes at the knots; each cycle is carried from its own temperature to its knot by the slopes."""
     member = (curves.group[:, None] == kept).astype(np.float64) * used[:, None]
     normal = np.einsum("ck,cpq->kpq", member, sums.normal)
@@ -181,14 +184,29 @@ def _amplitudes(curves: Curves, sums: Statistics, used: Array, kept: Index) -> t
     moment = sums.moment
     for _ in range(_PASSES):
         amplitude = np.linalg.solve(normal, np.einsum("ck,cpa->kpa", member, moment)).transpose(0, 2, 1)
-        slopes = pchip_slopes(at, amplitude)
+        slopes = amplitude_slopes(at, amplitude, constants)
         shift = apart[:, None, None] * slopes[position]
         moment = sums.moment - np.einsum("cpq,caq->cpa", sums.normal, shift)
     return amplitude, slopes
 
 
-def pchip_slopes(knots: Array, values: Array) -> Array:
-    """Return the slopes of the monotone piecewise cubic through `values` (k, ...) at `knots` (Fritsch and Butland)."""
+def amplitude_slopes(knots: Array, amplitudes: Array, constants: Sequence[float]) -> Array:
+    """Return the derivatives by temperature, 1/K, of amplitudes (k, axes, p) at knots (k,), degC, shape (k, axes, p).
+
+    Those of the monotone piecewise cubics (Fritsch and Butland) through the values that the curve itself takes at the p
+    time constants. Neighbouring amplitudes err in opposite ways and their errors nearly cancel in the curve; monotone
+    cubics through each amplitude alone are not linear in it and would undo that between the knots.
+    """
+    values = np.ascontiguousarray(amplitudes, dtype=np.float64)
+    at = np.asarray(constants, dtype=np.float64)
+    curve = np.exp(-at[:, None] / at)
+    if not np.linalg.cond(curve) < _WORST_CONDITION:  # constants that coincide, in a table edited by hand
+        return _pchip_slopes(knots, values)
+    slopes = np.linalg.solve(curve, _pchip_slopes(knots, values @ curve.T).swapaxes(1, 2))
+    return np.asarray(slopes.swapaxes(1, 2), dtype=np.float64)
+
+
+def _pchip_slopes(knots: Array, values: Array) -> Array:
     if len(knots) == 2:
         secant = (values[1] - values[0]) / (knots[1] - knots[0])
         return np.stack([secant, secant])

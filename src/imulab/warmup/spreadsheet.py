@@ -15,7 +15,7 @@ from imulab.errors import ReadError, RecordError, UnitError
 from imulab.units import conversion_factor, parse_unit
 from imulab.warmup.apply import record_table
 from imulab.warmup.model import MODELS, Table, check_table
-from imulab.warmup.solve import pchip_slopes
+from imulab.warmup.solve import amplitude_slopes
 
 _KEYS = ("model", "settling_time", "exit", "taper_time", "time_scale", "time_constants", "serial")
 _SI = {"rate": "rad/s", "acceleration": "m/s^2"}
@@ -145,7 +145,7 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     values = np.array([[found[at][axis] for axis in units] for at in order])
     slopes = None
     if model == "exponential" and len(temperatures) > 1:
-        slopes = pchip_slopes(temperatures, values)
+        slopes = amplitude_slopes(temperatures, values, constants)
     return Table(
         model=model,
         temperatures=temperatures,

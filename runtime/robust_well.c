@@ -1,0 +1,162 @@
+/* Gyro array, the robust method: a sample in which all is well, which is nearly every one.
+ *
+ * The same as robust.c computes, without its questions. The loops take two gyros at a time, each with sums of its own:
+ * compilers make one instruction of both. Of an odd number, the last one's partner has an infinite variance.
+ */
+#include "robust.h"
+
+/* Gains, and how far variances are drawn to the mean, with one residual more than so far. */
+static void experience(const il_array *a, const il_array_axis *s, sample *p) {
+    const int32_t n = a->elements;
+    if (s->well == ALIKE) {
+        const uint32_t seen = il_counted(s->seen[0], s->clean);
+        const il_real pull = pull_of(a, seen), gain = learning_gain(a, il_counted(seen, 1));
+        for (int32_t i = 0; i < n; i += 2) {
+            p->pull[i] = p->pull[i + 1] = pull;
+            p->gain[i] = p->gain[i + 1] = gain;
+        }
+        return;
+    }
+    p->pull[n] = IL_C(1.0);
+    p->gain[n] = IL_C(0.0);
+    for (int32_t i = 0; i < n; i++) {
+        const uint32_t seen = il_counted(s->seen[i], s->clean);
+        p->pull[i] = pull_of(a, seen);
+        p->gain[i] = learning_gain(a, il_counted(seen, 1));
+    }
+}
+
+/* Readings less biases; sums of these and of the variances, and the smallest change of a reading. */
+static void compensate(int32_t n, const il_real *restrict z, const il_real *restrict bias,
+                       const il_real *restrict variance, const il_real *restrict reading,
+                       const il_real *restrict last, il_real *restrict r, sample *restrict p) {
+    il_real sum[2] = {IL_C(0.0), IL_C(0.0)}, variances[2] = {IL_C(0.0), IL_C(0.0)};
+    il_real least[2] = {(il_real)INFINITY, (il_real)INFINITY};
+    int32_t i;
+    for (i = 0; i + 1 < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) {
+            r[i + j] = z[i + j] - bias[i + j];
+            sum[j] += r[i + j];
+            variances[j] += variance[i + j];
+            least[j] = smaller(il_fabs(reading[i + j] - last[i + j]), least[j]);
+        }
+    }
+    if (i < n) {
+        r[i] = z[i] - bias[i];
+        sum[0] += r[i];
+        variances[0] += variance[i];
+        least[0] = smaller(il_fabs(reading[i] - last[i]), least[0]);
+    }
+    p->middle = sum[0] + sum[1];
+    p->mean_variance = variances[0] + variances[1];
+    p->change = smaller(least[0], least[1]);
+}
+
+/* Weights, their sums, and the two margins of `il_robust_all_well`. */
+static void compare(int32_t n, il_real gate, il_real floor, const il_real *restrict r, const il_real *restrict variance,
+                    const il_real *restrict ratio, const il_real *restrict pull, il_real *restrict trusted,
+                    il_real *restrict weight, sample *restrict p) {
+    const il_real middle = p->middle, usual = p->mean_variance;
+    il_real squares[2] = {IL_C(0.0), IL_C(0.0)}, total[2] = {IL_C(0.0), IL_C(0.0)}, rate[2] = {IL_C(0.0), IL_C(0.0)};
+    il_real top[2] = {IL_C(0.0), IL_C(0.0)}, outside[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
+    il_real bent[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
+    for (int32_t i = 0; i < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) {
+            il_real e = r[i + j] - middle, square = e * e;
+            il_real v = larger(drawn(variance[i + j], pull[i + j], usual * ratio[i + j]), floor), w = IL_C(1.0) / v;
+            trusted[i + j] = v;
+            weight[i + j] = w;
+            squares[j] += square;
+            total[j] += w;
+            rate[j] += w * r[i + j];
+            top[j] = larger(w, top[j]);
+            outside[j] = larger(square - gate * v, outside[j]);
+            bent[j] = larger(IL_C(1.25) * square - MOST * MOST * larger(v, usual), bent[j]);
+        }
+    }
+    p->squares = squares[0] + squares[1];
+    p->total = total[0] + total[1];
+    p->rate = (rate[0] + rate[1]) / p->total;
+    p->top = larger(top[0], top[1]);
+    p->outside = larger(outside[0], outside[1]);
+    p->bent = larger(bent[0], bent[1]);
+}
+
+/* Hold the largest weight to the cap. */
+static void hold(const il_array *a, il_real *weight, sample *p) {
+    il_real others = IL_C(0.0), rate = IL_C(0.0);
+    int32_t top = 0;
+    while (weight[top] < p->top) top++;
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (i == top) continue;
+        others += weight[i];
+        rate += weight[i] * p->r[i];
+    }
+    weight[top] = a->weight_cap / (IL_C(1.0) - a->weight_cap) * others;
+    p->total = others + weight[top];
+    p->rate = (rate + weight[top] * p->r[top]) / p->total;
+}
+
+/* Biases, variances, means of a second. Returns by how much one of these is beyond what shows that none has jumped. */
+static il_real teach(int32_t n, const il_robust_terms *restrict t, const sample *restrict p, const il_real *restrict r,
+                     const il_real *restrict gain, const il_real *restrict trusted, il_real *restrict bias,
+                     il_real *restrict variance, il_real *restrict fast) {
+    const il_real middle = p->middle, rate = p->rate, level = t->cross * p->squares, hat = t->hat, keep = t->keep;
+    const il_real recent = t->recent, jump = t->jump;
+    il_real sum[2] = {IL_C(0.0), IL_C(0.0)}, far[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
+    for (int32_t i = 0; i < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) {
+            il_real e = r[i + j] - middle, mean = keep * fast[i + j] + recent * (r[i + j] - rate), square = mean * mean;
+            bias[i + j] += gain[i + j] * e;
+            variance[i + j] = (IL_C(1.0) - gain[i + j]) * (variance[i + j] + gain[i + j] * (hat * (e * e) - level));
+            fast[i + j] = mean;
+            sum[j] += square;
+            far[j] = larger(square - jump * trusted[i + j], far[j]);
+        }
+    }
+    return larger(far[0], far[1]) + IL_C(2.0) * t->share * (sum[0] + sum[1]);
+}
+
+/* Whether all readings lie well inside the gate, with residuals that teach in full. Fuses them, and changes no state
+ * but the weights. Of any numbers, the median is no further from the mean than the root mean square deviation, so that
+ * |r - median|^2 <= 2 (e^2 + mean e^2); and with the fused rate d away from the mean,
+ * |r - rate|^2 <= 5/4 e^2 + 5 d^2. */
+int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
+                       const il_real *reading, sample *p) {
+    const int32_t n = a->elements;
+    compensate(n, z, s->bias, s->variance, reading, s->last, p->r, p);
+    p->middle *= t->share; /* stands for the median where only its size matters */
+    p->mean_variance *= t->share;
+    p->r[n] = p->middle;
+    if (!(p->mean_variance > IL_C(0.0))) return 0;
+    experience(a, s, p);
+    const il_real floor = larger(a->weight_floor * p->mean_variance, IL_TINY);
+    compare(n, t->gate, floor, p->r, s->variance, s->ratio, p->pull, p->trust, s->weight, p);
+    if (p->top > a->weight_cap * p->total) hold(a, s->weight, p);
+    const il_real apart = p->middle - p->rate, room = IL_C(2.0) * t->gate * p->mean_variance - p->squares;
+    return (p->outside <= room * t->share) & (p->bent + IL_C(5.0) * apart * apart <= IL_C(0.0));
+}
+
+/* What `learn` does in robust.c. */
+void il_robust_learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, sample *p) {
+    /* The median of the means of a second is no further from 0 than sqrt(2) times their root mean square. */
+    if (teach(a->elements, t, p, p->r, p->gain, p->trust, s->bias, s->variance, s->fast) <= IL_C(0.0)) return;
+    il_robust_settle(a, s);
+    p->learnt = most_seen(a, s) - 1;
+    memset(p->learns, 1, sizeof p->learns);
+    il_robust_find_small_jumps(a, s, p);
+    il_robust_muster(a, s);
+}
+
+il_robust_terms il_robust_prepare(const il_array *a) {
+    il_real n = (il_real)a->elements;
+    il_robust_terms t;
+    t.share = IL_C(1.0) / n;
+    t.hat = n / (n - IL_C(2.0));
+    t.cross = IL_C(1.0) / ((n - IL_C(1.0)) * (n - IL_C(2.0)));
+    t.recent = IL_C(1.0) / (il_real)a->quiet;
+    t.keep = IL_C(1.0) - t.recent;
+    t.gate = a->gate * a->gate * IL_C(0.5);
+    t.jump = larger(IL_C(32.0) * t.recent, IL_C(1.0)) * IL_C(0.25);
+    return t;
+}

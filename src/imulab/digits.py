@@ -1,0 +1,24 @@
+"""Doubles as the shortest decimals that read back exactly, as Python writes them, many at once."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from imulab import _digits
+from imulab.recording import Array
+from imulab.tens import powers_of_ten
+
+
+def decimal_rows(table: Array) -> bytes | memoryview:
+    """Return a table, shape (rows, columns), as lines of decimals with commas between them."""
+    if not table.size or not _fast():
+        return "".join(",".join(map(repr, row)) + "\n" for row in table.tolist()).encode("ascii")
+    out = bytearray(25 * table.size)
+    return memoryview(out)[: _digits.rows(np.ascontiguousarray(table, dtype=np.float64), table.shape[1], out)]
+
+
+@cache
+def _fast() -> bool:
+    return _digits.prepare(powers_of_ten())
