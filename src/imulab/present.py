@@ -1,4 +1,4 @@
-"""Records to reports: picks the procedure's exhibits and hands them to the layout."""
+"""Records to reports: picks the procedure's exhibits and hands them to the layout; units in which changes are read."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from pathlib import Path
 from imulab import report
 from imulab.calibration import Calibration
 from imulab.centrifuge import figures as centrifuge
+from imulab.changes import Change
 from imulab.errors import RecordError
 from imulab.exhibit import Exhibits
 from imulab.gyro_array import figures as gyro_array
+from imulab.tumble import engineering
 from imulab.tumble import figures as tumble
+from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.warmup import figures as warmup
 
 _EXHIBITS = {
@@ -35,6 +38,21 @@ def exhibits_of(record: Calibration) -> Exhibits:
         return _EXHIBITS[record.procedure](record)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise RecordError(f"the record lacks data that its report needs ({error!r})") from None
+
+
+_READ = {
+    "rad/s": (from_si(1.0, "deg/h"), "deg/h"),
+    "m/s^2": (from_si(1.0, "ug"), "µg"),
+    "rad": (1e3, "mrad"),
+    "rad/s/(m/s^2)": (from_si(STANDARD_GRAVITY, "deg/h"), "deg/h/g"),
+}
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which people read the change of a parameter."""
+    if record.procedure == "tumble":
+        return engineering.change_unit(change, record)
+    return _READ.get(change.unit, (1.0, change.unit))
 
 
 def write_report(record: Calibration, path: str | Path) -> None:

@@ -142,8 +142,8 @@ def show(
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:
     from imulab.calibration import load
+    from imulab.changes import compare_records
     from imulab.cli.show import describe_changes
-    from imulab.tumble.compare import compare_records
 
     records = [load(first), load(second)]
     comparison = compare_records(*records)
@@ -155,7 +155,7 @@ def _show_changes(first: str, second: str, *, json: bool) -> None:
     serials = [record.sensor.get("serial") for record in records]
     if all(serials) and serials[0] != serials[1]:
         warn(f"records of different units: {serials[0]} and {serials[1]}")
-    print(describe_changes(first, second, comparison, str(records[0].model["output_unit"])))
+    print(describe_changes(first, second, comparison, records[0]))
 
 
 def report(

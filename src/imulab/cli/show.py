@@ -9,12 +9,11 @@ import numpy as np
 
 from imulab.blob import Blob
 from imulab.calibration import Calibration
+from imulab.changes import Comparison
 from imulab.errors import ReadError
-from imulab.exhibit import Table
-from imulab.present import exhibits_of
+from imulab.exhibit import Table, format_uncertain, plain_number
+from imulab.present import change_unit, exhibits_of
 from imulab.recording import Array, Recording
-from imulab.tumble.compare import Comparison
-from imulab.tumble.engineering import change_rows
 
 _GAP = 1.5
 
@@ -51,17 +50,29 @@ def _joined(value: object) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def describe_changes(first: str, second: str, comparison: Comparison, output: str) -> str:
-    """Return what changed from one record to the other."""
-    rows = change_rows(comparison, output)
-    changed = [row[0] for row in rows if row[-1]]
+def describe_changes(first: str, second: str, comparison: Comparison, record: Calibration) -> str:
+    """Return what changed from one record to the other, which is of the procedure and units of `record`."""
+    rows = []
+    for change in comparison.changes:
+        factor, unit = change_unit(change, record)
+        u = change.standard_uncertainty
+        texts = (plain_number(change.difference * factor, 3), "not stated")
+        difference, uncertainty = texts if u is None else format_uncertain(change.difference * factor, u * abs(factor))
+        deviations = "–" if change.deviations is None else f"{change.deviations:+.1f}"
+        rows.append([change.name, difference, uncertainty, deviations, unit, "changed" if change.significant else ""])
+    changed = [change.name for change in comparison.changes if change.significant]
+    judged = sum(change.standard_uncertainty is not None for change in comparison.changes)
     verdict = (
-        f"{len(changed)} of {len(rows)} parameters changed: {' '.join(changed)}" if changed else "no significant change"
+        f"{len(changed)} of {judged} parameters changed: {' '.join(changed)}" if changed else "no significant change"
     )
     titles = ["parameter", "change", "u", "change / u", "unit", ""]
     lines = [f"{second} less {first}: {verdict}", "", *aligned(titles, rows)]
     if comparison.probability is not None:
         lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
+    if comparison.left_out:
+        lines += ["", f"not in both, or of other levels: {' '.join(comparison.left_out)}"]
+    if "table" in record.sections:
+        lines += ["", "the tables themselves are not compared"]
     return "\n".join(lines)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from imulab.calibration import Calibration
+from imulab.changes import Change
 from imulab.exhibit import format_uncertain, plain_number
-from imulab.tumble.compare import Comparison
 from imulab.tumble.record import zero_outputs
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
@@ -25,18 +25,11 @@ class EngineeringRow:
         return format_uncertain(self.value, self.standard_uncertainty)
 
 
-def change_rows(comparison: Comparison, output: str) -> list[list[str]]:
-    """Return the changes between two records as name, difference, uncertainty, deviations, unit and verdict."""
-    physical = parse_unit(output).quantity == "acceleration"
-    rows = []
-    for change in comparison.changes:
-        factor, _, unit = _converted(change.name, change.unit, output, physical)
-        difference, uncertainty = format_uncertain(
-            change.difference * factor, change.standard_uncertainty * abs(factor)
-        )
-        verdict = "changed" if change.significant else ""
-        rows.append([change.name, difference, uncertainty, f"{change.deviations:+.1f}", unit, verdict])
-    return rows
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor and the unit in which the change of a parameter is read."""
+    output = str(record.model["output_unit"])
+    factor, _, unit = _converted(change.name, change.unit, output, parse_unit(output).quantity == "acceleration")
+    return factor, unit
 
 
 def propagated_rows(record: Calibration) -> list[list[str]]:
