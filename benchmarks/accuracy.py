@@ -12,10 +12,10 @@ import numpy as np
 from timing import Row
 
 import imulab as il
+from imulab.changes import compare_records
 from imulab.gyro_array.fuse import FuseOptions, open_stream
 from imulab.gyro_array.model import find_elements
 from imulab.recording import Recording
-from imulab.tumble.compare import compare_records
 from imulab.tumble.gyro import fit_gyro
 from imulab.tumble.plan import plan_tumble
 
