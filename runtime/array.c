@@ -127,28 +127,39 @@ static il_real start_bias(const il_array *a, il_array_axis *s, const il_real *z,
 }
 
 /* The recursion of CN109443333B, to the letter: it has no defence against readings that are no numbers.
- *   b = (1-g) b + g (Z - Zr'),  Y = Z - b,  D = (1-g) D + g (Y - Zr')^2,  Zr = sum Y/D / sum 1/D,  Zr' one sample old */
-static inline il_real feedback_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
-    int32_t n = a->elements;
+ *   b = (1-g) b + g (Z - Zr'),  Y = Z - b,  D = (1-g) D + g (Y - Zr')^2,  Zr = sum Y/D / sum 1/D,  Zr' one sample old
+ * Two gyros at a time, each with sums of its own: compilers make one instruction of both. Of an odd number the last
+ * one's partner has an infinite variance. */
+il_real il_feedback_loop(int32_t n, il_real gain, il_real before, il_real least, const il_real *restrict z,
+                         il_real *restrict bias, il_real *restrict variance, il_real *restrict weight) {
+    const il_real keep = IL_C(1.0) - gain;
+    il_real total[2] = {IL_C(0.0), IL_C(0.0)}, sum[2] = {IL_C(0.0), IL_C(0.0)};
+    for (int32_t i = 0; i < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) {
+            /* Written as a step: (1-g) and g as rounded do not add up to one, which would let the common bias leak. */
+            const il_real b = bias[i + j] + gain * (z[i + j] - bias[i + j] - before), y = z[i + j] - b;
+            const il_real error = y - before, d = keep * variance[i + j] + gain * (error * error);
+            const il_real share = IL_C(1.0) / (least > d ? least : d);
+            bias[i + j] = b;
+            variance[i + j] = d;
+            weight[i + j] = share;
+            total[j] += share;
+            sum[j] += share * y;
+        }
+    }
+    return (sum[0] + sum[1]) / (total[0] + total[1]);
+}
+
+static il_real feedback_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+    const int32_t n = a->elements;
+    il_real even[IL_ARRAY_ROOM];
     if (s->count == a->start) return start_bias(a, s, z, axis);
-    il_real gain = il_array_gain(a, s->count), keep = IL_C(1.0) - gain, before = s->rate;
-    il_real total = IL_C(0.0), sum = IL_C(0.0), part[IL_ARRAY_ELEMENTS];
-    /* What does not depend on the other gyros first: compilers divide two or four at once here. */
-    for (int32_t i = 0; i < n; i++) {
-        /* Written as a step: (1-g) and g as rounded do not add up to one, which would let the common bias leak away. */
-        il_real b = s->bias[i] + gain * (z[i] - s->bias[i] - before), y = z[i] - b, error = y - before;
-        il_real d = keep * s->variance[i] + gain * (error * error);
-        il_real share = IL_C(1.0) / (d < IL_TINY ? IL_TINY : d);
-        s->bias[i] = b;
-        s->variance[i] = d;
-        s->weight[i] = share;
-        part[i] = share * y;
+    if (n % 2) {
+        memcpy(even, z, (size_t)n * sizeof *z);
+        even[n] = s->rate;
+        z = even;
     }
-    for (int32_t i = 0; i < n; i++) {
-        total += s->weight[i];
-        sum += part[i];
-    }
-    return sum / total;
+    return il_feedback_loop(n, il_array_gain(a, s->count), s->rate, IL_TINY, z, s->bias, s->variance, s->weight);
 }
 
 /* Virtual gyro: state (rate, bias_1 .. bias_n), a random walk each, with the steady-state gain. */
@@ -263,7 +274,9 @@ il_status il_array_start(const il_array *settings, il_array_state *state) {
             sum += s->ratio[i] / (il_real)n;
         }
         for (int32_t i = 0; i < n; i++) s->ratio[i] /= sum;
-        s->ratio[n] = (il_real)INFINITY; /* robust: of the last one's partner, where n is odd */
+        /* of the last one's partner, where n is odd */
+        if (settings->method == IL_ROBUST) s->ratio[n] = (il_real)INFINITY;
+        if (settings->method == IL_FEEDBACK) s->variance[n] = (il_real)INFINITY;
     }
     return IL_OK;
 }

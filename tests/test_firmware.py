@@ -245,6 +245,14 @@ def test_the_self_test_notices_a_wrong_number(exported, tmp_path, compiler):
     assert worst(line) > 1e-6
 
 
+def test_the_readme_speaks_of_flags_only_where_there_are_some(exported, tmp_path):
+    export("c", [madeup.warmup()], tmp_path)
+    alone, all_of_them = ((folder / "README.md").read_text(encoding="utf-8") for folder in (tmp_path, exported))
+    assert "returns flags" not in alone
+    assert "Each call but that for the warm-up returns flags" in all_of_them
+    assert all("stop at `UINT32_MAX`" in text for text in (alone, all_of_them))
+
+
 @pytest.mark.parametrize("define", [[], ["-DIMULAB_REAL=float"]])
 def test_the_code_in_the_readme_compiles_and_runs(define, exported, tmp_path, compiler):
     blocks = (exported / "README.md").read_text(encoding="utf-8").split("```")[1::2]

@@ -388,3 +388,30 @@ def test_a_refusal_stays_one_line_where_there_is_also_something_to_warn_of(file,
         assert ("outputs in count" in done.stderr) == (done.returncode == 2) == (unit == "count")
     assert "truncated" in done.stderr
     assert "K away" in done.stderr
+
+
+@pytest.fixture
+def cut(file, streams, imulab):
+    """A cut log, and records of an accelerometer triad and of a warm-up table, beside it."""
+    assert imulab("tumble", "simulate", "-o", "t.csv").returncode == 0
+    assert imulab("tumble", "fit", "t.csv", "--gravity", 9.81, "-o", "t.json").returncode == 0
+    return file(px4_log(*streams)[:-5], "cut.ulg").name
+
+
+REFUSED = {
+    "tumble fit": "tumble fit cut.ulg --gravity 9.81 -o r.json",
+    "tumble gyro": "tumble gyro cut.ulg --accel t.json -o r.json",
+    "array calibrate": "array calibrate cut.ulg -o r.json",
+    "warmup fit": "warmup fit cut.ulg --temperature-column --latest-start 10 -o r.json",
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_procedure_refuses_a_cut_log_in_one_line_that_says_so(case, cut, imulab, tmp_path):
+    done = imulab(*REFUSED[case].split())
+    print(done.stderr, done.stdout)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "cut.ulg" in done.stderr
+    assert "truncated: the last message, at byte" in done.stderr
+    assert not (tmp_path / "r.json").exists()

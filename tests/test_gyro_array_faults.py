@@ -9,6 +9,8 @@ import pytest
 
 from imulab.gyro_array.fuse import Fused, FuseOptions, fuse
 from imulab.gyro_array.health import EXCLUDED, JUMPED, NON_FINITE, STUCK
+from imulab.runtime import array_stream
+from reference import gyro_array as reference
 from test_gyro_array_fuse import array_recording, dynamic
 
 SEEDS = (1, 2, 3, 4)
@@ -229,3 +231,48 @@ def test_a_coarse_array_at_rest_is_not_called_stuck():
     coarse = np.round(0.4 * rng.standard_normal((20_000, 6)) + rng.uniform(-0.2, 0.2, 6))
     fused = run(coarse)
     assert not (fused.flags & STUCK).any()
+
+
+# ---- any mixture of faults, sample by sample against the transcription -----------------------------------------------
+
+
+def _mixture(rng: np.random.Generator, count: int, elements: int, rate: float) -> np.ndarray:
+    """Gyros of unequal noise, in motion or at rest, coarse or not, with up to six faults of any kind."""
+    sigma = 0.05 * np.exp(rng.normal(0, 0.7, elements))
+    readings = sigma * rng.standard_normal((count, elements)) + 0.02 * rng.standard_normal(elements)
+    if rng.random() < 0.5:
+        motion = 5 * np.sin(np.arange(count) / rate)
+        readings += motion[:, None] * (1 + 0.003 * rng.standard_normal(elements))
+    if rng.random() < 0.3:
+        readings = np.round(readings / 0.05) * 0.05
+    for kind in rng.integers(0, 6, rng.integers(0, 7)):
+        i, k = rng.integers(elements), rng.integers(count)
+        there = slice(k, k + rng.integers(1, 120))
+        if kind == 0:
+            readings[k:, i] += sigma[i] * rng.uniform(0.5, 8)
+        elif kind == 1:
+            readings[there, i] = np.nan
+        elif kind == 2:
+            readings[there, i] = readings[k, i]
+        elif kind == 3:
+            readings[k, i] += rng.uniform(0.1, 10)
+        elif kind == 4:
+            readings[there, i] *= 5
+        else:
+            readings[there, i] = np.inf
+    return readings
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_any_mixture_of_faults_gives_the_flags_and_rates_of_the_transcription(seed):
+    rng = np.random.default_rng(seed)
+    elements, rate, memory = 3 + seed % 7, (25.0, 50.0, 100.0)[seed % 3], (None, None, 0.02, 0.3)[seed % 4]
+    readings = _mixture(rng, 800, elements, rate)
+    known = None if seed % 5 else rng.uniform(0.2, 5, elements)
+    weights = {} if known is None else {"weights": known[None]}
+    ours = array_stream("robust", elements, rate=rate, memory=memory, **weights).process(readings)
+    recursion = reference.Robust(elements, rate=rate, memory=memory, reliability=known)
+    for k, row in enumerate(readings.tolist()):
+        expected = recursion.step(row)
+        assert (ours.flags[k, 0] & 63).tolist() == recursion.flags, k
+        assert ours.rate[k, 0] == pytest.approx(expected, abs=1e-11, nan_ok=True), k

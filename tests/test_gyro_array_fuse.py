@@ -67,8 +67,9 @@ def transcribed(method: str, readings: np.ndarray, **settings: object) -> np.nda
 
 @pytest.mark.parametrize("method", ["mean", "support", "least-squares", "feedback", "robust"])
 @pytest.mark.parametrize("memory", [None, 0.02])
-def test_each_method_agrees_with_its_transcription(method, memory):
-    readings = dynamic(count=1500)[0]
+@pytest.mark.parametrize("elements", [3, 6, 9])
+def test_each_method_agrees_with_its_transcription(method, memory, elements):
+    readings = dynamic(count=1500, elements=elements)[0]
     settings = {} if method == "mean" else {"memory": memory}
     ours = fuse(array_recording(readings), FuseOptions(method=method, memory="growing" if memory is None else memory))
     np.testing.assert_allclose(ours.rate[:, 0], transcribed(method, readings, **settings), rtol=0, atol=12.5e-12)

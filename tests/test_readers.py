@@ -356,7 +356,10 @@ def test_a_field_with_an_odd_blank_in_it_is_refused_as_it_stands(file, field):
 
 FOG = '[columns]\nfog = { from = 0, unit = "V" }\n'
 LAYOUTS = {
-    "unknown key": ('delimeter = ","\n' + COLUMNS, "unknown key 'delimeter'; known keys: columns delimiter header"),
+    "unknown key": (
+        'delimeter = ","\n' + COLUMNS,
+        "unknown key 'delimeter'; known keys: columns delimiter header",
+    ),
     "delimiter": ('delimiter = "|"\n' + COLUMNS, "delimiter '|'; expected 'whitespace' ',' ';' or a tab"),
     "delimiters": ('delimiter = [","]\n' + COLUMNS, "delimiter [',']; expected 'whitespace' ',' ';' or a tab"),
     "no columns": ('delimiter = ","\n', "no [columns]; expected lines such as accel_x = { from = 1"),

@@ -123,3 +123,26 @@ def test_the_commands(imulab, tmp_path):
     assert len(json.loads(imulab("show", "a.json", "b.json", "--json").stdout)["changes"]) == 9
     assert imulab("show", "a.json", "b.csv").returncode == 2
     assert imulab("show", "a.json", "b.json", "a.json").returncode == 2
+
+
+def test_a_check_refuses_what_it_cannot_judge_and_names_another_unit(imulab, tmp_path):
+    for seed in ("1", "2"):
+        imulab("tumble", "simulate", "-o", f"{seed}.csv", "--order", "1", "--attitudes", "12", "--seed", seed)
+    imulab("tumble", "fit", "1.csv", "--gravity", "9.80665", "--order", "1", "-o", "1.json")
+    text = (tmp_path / "1.csv").read_text()
+    (tmp_path / "wrong.csv").write_text(re.sub(r"(accel_[xyz]) \[m/s\^2\]", r"\1 [g]", text))
+    for arguments, fragment in (
+        (["1.csv", "--limit", "-1mg"], "limit -0.00980665 m/s^2: expected more than 0"),
+        (["1.csv", "--limit", "0"], "limit 0 m/s^2: expected more than 0"),
+        (["1.csv", "--gravity", "981"], "gravity 981: expected the local value in m/s^2"),
+        (["1.csv", "--gravity", "-9.8"], "gravity -9.8: expected the local value in m/s^2"),
+        (["wrong.csv"], "wrong.csv: columns accel_x accel_y accel_z: the specific force at rest is about 9"),
+    ):
+        refused = imulab("tumble", "check", "1.json", *arguments)
+        assert refused.returncode == 2, (arguments, refused.stdout)
+        assert refused.stderr.startswith(f"imulab: {fragment}")
+        assert refused.stderr.count("\n") == 1
+        assert not refused.stdout
+    other = imulab("tumble", "check", "1.json", "2.csv")
+    assert other.returncode == 1
+    assert "2.csv: serial SIM-0002, but the record was made for SIM-0001" in other.stderr

@@ -1,12 +1,15 @@
 """Plans: as good as the published table, allowed by the fixture, and predicting what the bound says."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import imulab as il
+from imulab.calibration import Calibration, Covariance
 from imulab.errors import ObservabilityError, OptionError
-from imulab.tumble.plan import fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
+from imulab.tumble.plan import fixture_candidates, head_candidates, information_rows, plan_tumble, roll_pitch, turning
 from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
 from reference import tumble as reference
 
@@ -87,6 +90,23 @@ def test_a_head_with_steps_of_90_degrees_is_blind():
         )
 
 
+def test_no_plan_repeats_an_attitude_for_want_of_others():
+    """24 candidates of which two are a degree apart, and candidates that have all been measured."""
+    candidates = reference.random_attitudes(np.random.default_rng(3), 200)
+    apart = [candidates[0]]
+    for up in candidates:
+        if (np.array(apart) @ up).max() < np.cos(np.radians(10)):
+            apart.append(up)
+    apart = np.array(apart[:24])
+    twin = apart[0] + np.radians(1) * np.cross(apart[0], [1.0, 0, 0])
+    listed = np.vstack([apart[:23], twin / np.linalg.norm(twin)])
+    assert len(plan_tumble(order=2, attitudes=23, candidates=listed).directions) == 23
+    with pytest.raises(OptionError, match=r"list\.csv: no 24 of the 24 candidate attitudes are 3 deg apart from each"):
+        plan_tumble(order=2, attitudes=24, candidates=listed, source="list.csv")
+    with pytest.raises(OptionError, match="and from the 24 already there"):
+        plan_tumble(order=2, attitudes=6, candidates=apart, already=apart)
+
+
 def test_attitudes_already_there_are_taken_into_account():
     faces = np.vstack([np.eye(3), -np.eye(3)])
     more = plan_tumble(order=1, attitudes=6, already=faces)
@@ -127,6 +147,33 @@ def test_a_plan_reads_back_and_feeds_the_simulator_and_the_fit(tmp_path):
     for name, predicted in plan.uncertainties(noise).items():
         if name.startswith("k2"):
             assert record.parameters[name].standard_uncertainty * G == pytest.approx(predicted, rel=0.2), name
+
+
+def test_letters_fit_on_their_faces():
+    """No face is lettered larger than it is wide, and every picture has at least one letter."""
+    for up in reference.random_attitudes(np.random.default_rng(7), 200):
+        parts = re.findall(
+            r'<polygon points="([^"]*)"[^>]*/>(?:<text [^>]*font-size="([\d.]+)")?', attitude_picture(up)
+        )
+        for outline, size in parts:
+            corners = np.array([[float(c) for c in corner.split(",")] for corner in outline.split()])
+            sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)[:2]
+            area = abs(np.cross(np.append(corners[1] - corners[0], 0), np.append(corners[2] - corners[1], 0))[2])
+            assert not size or float(size) < area / sides.max()
+        assert any(size for _, size in parts)
+
+
+def test_three_degrees_off_cost_a_tenth():
+    """As the sheet says."""
+    rng = np.random.default_rng(8)
+    for order, count in ((1, 12), (2, 24), (4, 24)):
+        plan = plan_tumble(order=order, attitudes=count)
+        planned, worst = np.sqrt(np.diag(plan.covariance)), []
+        for _ in range(100):
+            off = plan.directions + np.radians(3) / np.sqrt(2) * rng.standard_normal((count, 3))
+            rows = information_rows(off / np.linalg.norm(off, axis=1, keepdims=True), order)
+            worst.append((np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) / planned).max())
+        assert np.median(worst) < 1.1
 
 
 def test_pictures_show_the_face_that_is_up():
@@ -183,3 +230,37 @@ def test_add_takes_a_recording_and_a_record(imulab):
     for done in found:
         assert done.returncode == 0, done.stderr
         assert "3 attitudes with the 16 already there" in done.stdout
+
+
+def test_lists_and_records_that_are_none_are_refused_by_name(imulab, tmp_path):
+    up = reference.random_attitudes(np.random.default_rng(5), 30)
+    rows = [[repr(float(value)) for value in direction] for direction in up]
+
+    def write(name, head, lines):
+        (tmp_path / name).write_text("\n".join([head, *(",".join(line) for line in lines)]) + "\n")
+
+    head = "up_x [1],up_y [1],up_z [1]"
+    write("good.csv", head, rows)
+    write("few.csv", head, rows[:5])
+    write("inf.csv", head, [*rows[:6], ["1.0", "inf", "0.0"], *rows[6:]])
+    angles = [[str(30 * i), str(30 * j)] for i in range(12) for j in range(-2, 3)]
+    write("bare.csv", "roll,pitch", angles)
+    write("metre.csv", "roll [deg],pitch [m]", angles)
+    other = Calibration("warmup", {}, Covariance((), ()), {}, {})
+    other.save(tmp_path / "other.json")
+    for arguments, fragment in (
+        (["--from", "inf.csv"], "inf.csv: row 7 (line 8), column up_y: expected a finite number, found inf"),
+        (["--from", "bare.csv"], "bare.csv: column roll: expected an angle, as in roll [deg]; found the unit 1"),
+        (["--from", "metre.csv"], "metre.csv: column pitch: expected an angle, as in pitch [deg]; found the unit m"),
+        (["--from", "few.csv"], "few.csv: 5 different candidate attitudes; expected at least 14"),
+        (["--from", "good.csv", "-o", "good.csv"], "good.csv: would overwrite good.csv"),
+        (["--add", "other.json"], "other.json: a warmup record holds no attitudes; expected a tumble record"),
+        (["--attitudes", "301"], "301 attitudes: expected 1 to 300"),
+        (["--attitudes", "0", "--add", "good.csv"], "0 attitudes: expected 1 to 300"),
+    ):
+        refused = imulab("tumble", "plan", "--order", "2", "--attitudes", "14", *arguments)
+        assert refused.returncode == 2, (arguments, refused.stderr)
+        assert refused.stderr == f"imulab: {fragment}\n" or refused.stderr.startswith(f"imulab: {fragment}; "), (
+            refused.stderr
+        )
+    assert (tmp_path / "good.csv").read_text().startswith(head)

@@ -116,6 +116,9 @@ def test_a_prior_of_a_unit_that_changed_shows():
     moved = truth | {"bias_x": truth["bias_x"] + 0.05}
     updated = fit(attitudes_of(moved, 1, 8, 2), prior=record)
     assert any("scatter more than their own noise" in w for w in updated.warnings)
+    assert any(w.startswith("prior and attitudes contradict each other") for w in updated.warnings)
+    same = fit(attitudes_of(truth, 1, 8, 2), prior=record)
+    assert not any("contradict" in w for w in same.warnings)
 
 
 def test_the_order_is_that_of_the_prior():
@@ -194,6 +197,10 @@ def test_the_same_recording_does_not_count_twice_and_another_unit_is_named(imula
     twice = imulab("tumble", "fit", "3.csv", "--gravity", str(G), "--prior", "3.json")
     assert twice.returncode == 2
     assert "3.csv: the prior 3.json was made from this recording, which would count twice" in twice.stderr
+    imulab("tumble", "simulate", "-o", "v.csv", "--order", "1", "--unit", "V")
+    volts = imulab("tumble", "fit", "v.csv", "--gravity", str(G), "--prior", "3.json")
+    assert volts.returncode == 2
+    assert volts.stderr == "imulab: 3.json: the prior has outputs in m/s^2, v.csv in V\n"
     other = imulab("tumble", "fit", "3.csv", "--gravity", str(G), "--prior", "4.json")
     assert other.returncode == 0, other.stderr
     assert "the prior is a record of SIM-0004, the recording one of SIM-0003" in other.stderr

@@ -26,11 +26,11 @@ _COARSE = 0.2
 _FLICKER = 2 * math.log(2) / math.pi
 _OCTAVE_CORRELATION = 0.5
 """Of estimates an octave apart, measured on white noise and random walk (.45 to .6); falls as its power."""
+_SENSORS = ("gyro", "dtg", "fog", "accel")
+COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
 _NOISE_REACH = 20.0
-_SENSORS = ("gyro", "dtg", "fog", "accel")
-COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk")
 
 
 @dataclass(frozen=True)
@@ -242,9 +242,9 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
             f"{recording.name}: no sensor column (gyro_.. accel_.. dtg_.. fog); found {' '.join(recording.columns)}"
         )
     check_finite(recording, names)
+    notes += _motion_notes(recording, names, rate)
     columns: dict[str, Any] = {}
     for name in names:
-        notes += _motion_notes(recording, name, rate)
         unit = {"rate": "rad/s", "acceleration": "m/s^2"}.get(
             parse_unit(recording.units[name]).quantity, recording.units[name]
         )
@@ -271,22 +271,25 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     }
 
 
-def _motion_notes(recording: Recording, name: str, rate: float) -> list[str]:
+def _motion_notes(recording: Recording, names: list[str], rate: float) -> list[str]:
     """Say where means over a second range farther than any zero drifts and than noise explains: the unit moved."""
-    quantity = parse_unit(recording.units[name]).quantity
-    if quantity not in _STILL:
-        return []
     size = max(1, round(rate))
-    samples = recording.si(name)
-    means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
-    reach = float(np.ptp(means)) if means.size else 0.0
-    noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
-    limit, unit = _STILL[quantity]
-    if reach <= max(limit, _NOISE_REACH * noise):
-        return []
+    moved: dict[str, dict[str, float]] = {}
+    for name in names:
+        quantity = parse_unit(recording.units[name]).quantity
+        if quantity not in _STILL:
+            continue
+        samples = recording.si(name)
+        means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
+        reach = float(np.ptp(means)) if means.size else 0.0
+        noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
+        if reach > max(_STILL[quantity][0], _NOISE_REACH * noise):
+            moved.setdefault(quantity, {})[name] = reach
     return [
-        f"{recording.name}: column {name}: its means over a second range over {from_si(reach, unit):.3g} {unit}: did "
-        "the unit move? Then these are the coefficients of its motion, not of its noise"
+        f"{recording.name}: column{'s' * (len(reaches) > 1)} {' '.join(reaches)}: means over a second range over up to "
+        f"{from_si(max(reaches.values()), _STILL[quantity][1]):.3g} {_STILL[quantity][1]}: did the unit move? Then "
+        "these are the coefficients of its motion, not of its noise"
+        for quantity, reaches in moved.items()
     ]
 
 

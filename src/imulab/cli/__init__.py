@@ -16,16 +16,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from typer.exceptions import TyperException
 
     from imulab.cli.app import command
+    from imulab.cli.options import explained, forget, release
     from imulab.errors import ImulabError
 
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a terminal without µ gets a question mark, not a fault
             stream.reconfigure(errors="replace")
+    forget()
     try:
         status = command().main(args=arguments, prog_name="imulab", standalone_mode=False)
         sys.stdout.flush()
+        release()
     except ImulabError as error:
-        return _refuse(str(error))
+        return _refuse(explained(str(error)))
     except TyperException as error:
         return _refuse(_usage(error))
     except (BrokenPipeError, SystemExit):

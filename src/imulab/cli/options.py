@@ -40,26 +40,36 @@ _PAPER = (".pdf", ".png", ".svg", ".docx")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
-def heard(blocks: Iterable[Recording], *, notes: bool = True) -> Iterator[Recording]:
-    """Pass blocks on, and say on standard error what the reader did to the data, each thing once."""
+_held: dict[str, str] = {}
+"""Warnings that wait for what becomes of their file: its name to the warning."""
+_released: set[str] = set()
+
+
+def heard(
+    blocks: Iterable[Recording], *, notes: bool = True, tell: Callable[[str, str], object] | None = None
+) -> Iterator[Recording]:
+    """Pass blocks on, and say on standard error what the reader did to the data, each thing once.
+
+    `tell` takes a file's name and what is wrong with it; a warning at once if not given.
+    """
     said: set[str] = set()
     for block in blocks:
         yield block  # first: where the data are refused, the refusal is the one line there is
         for note in block.notes:
             kind = note.partition(":")[0]
             if kind not in said and note.startswith("truncated"):
-                warn(f"{block.name}: {note}")
+                tell(block.name, note) if tell else warn(f"{block.name}: {note}")
             elif note not in said and notes and not note.startswith("truncated"):
                 print(f"imulab: note: {block.name}: {note}", file=sys.stderr)
             said |= {kind, note}
 
 
 def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recording:
-    """Read a recording as a whole, and warn where it was cut."""
+    """Read a recording as a whole, and warn where it was cut, in the line of a refusal if there is one."""
     from imulab.readers import read
 
     recording = read(file, layout, **part)
-    list(heard([recording], notes=False))
+    list(heard([recording], notes=False, tell=_held.setdefault))
     return recording
 
 
@@ -80,7 +90,7 @@ class GivenFiles:
         """Read a recording in blocks, and warn where it was cut."""
         from imulab.readers import read_blocks
 
-        return heard(read_blocks(name, layout, **part), notes=False)
+        return heard(read_blocks(name, layout, **part), notes=False, tell=_held.setdefault)
 
     def path(self, name: str) -> Path:
         """Return the path of a file."""
@@ -153,5 +163,29 @@ def progress_bar(title: str, total: int | None) -> Iterator[Callable[[int], None
 
 
 def warn(message: str) -> None:
-    """Print one line on standard error."""
-    print(f"imulab: warning: {message}", file=sys.stderr)
+    """Print one line on standard error, after what was held."""
+    release()
+    if message not in _released:
+        print(f"imulab: warning: {message}", file=sys.stderr)
+
+
+def release() -> None:
+    """Print the warnings held so far: the work went on."""
+    for name in list(_held):
+        message = f"{name}: {_held.pop(name)}"
+        _released.add(message)
+        print(f"imulab: warning: {message}", file=sys.stderr)
+
+
+def forget() -> None:
+    """Begin a command: nothing has been said."""
+    _held.clear()
+    _released.clear()
+
+
+def explained(message: str) -> str:
+    """Return a refusal with what is held about the file that it speaks of, so that one mistake makes one line."""
+    about = [name for name in _held if name in message] or (list(_held) if len(_held) == 1 else [])
+    found = "; ".join(_held[name] if name in message else f"{name}: {_held[name]}" for name in about)
+    forget()
+    return f"{message} ({found})" if found else message

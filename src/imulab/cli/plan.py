@@ -10,7 +10,7 @@ import numpy as np
 from imulab.calibration import load
 from imulab.cli.options import check_outputs, is_json, quantity, whole_number
 from imulab.cli.show import aligned
-from imulab.errors import ImulabError, OptionError
+from imulab.errors import ImulabError, OptionError, RecordError
 from imulab.files import replacing
 from imulab.readers import read
 from imulab.recording import Array
@@ -36,7 +36,7 @@ def run(
     report: str | None,
 ) -> None:
     """Plan, print the prediction, and write what was asked for."""
-    check_outputs([output, report], [name for name in (add,) if name])
+    check_outputs([output, report], [name for name in (add, source) if name])
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
     sigma = from_si(quantity(noise, "--noise", "acceleration", "ug"), "g")
@@ -48,6 +48,7 @@ def run(
         criterion=criterion,
         candidates=_candidates(source),
         already=None if add is None else _already(add),
+        source=source,
     )
     predicted = predicted_rows(plan.uncertainties(sigma))
     there = f" with the {plan.already} already there" if plan.already else ""
@@ -91,7 +92,10 @@ def _candidates(source: str) -> Array | None:
 def _already(file: str) -> Array:
     """Upward directions of a plan, of a record's attitudes, or of a recording's under an order-1 fit."""
     if is_json(file):
-        force = np.array(load(file).data["attitudes"]["force"])
+        record = load(file)
+        if record.procedure != "tumble":
+            raise RecordError(f"{file}: a {record.procedure} record holds no attitudes; expected a tumble record")
+        force = np.array(record.data["attitudes"]["force"])
     else:
         recording = read(file)
         listed = directions_of(recording)

@@ -231,18 +231,20 @@ def check(
     gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2; that of the record if not given.")] = None,
 ) -> int:
     """Hold fresh attitudes against a record, without refitting; exit status 0 if all pass, 1 if not."""
+    from imulab.applying import warnings_of
     from imulab.calibration import load
     from imulab.segment import find_attitudes
+    from imulab.tumble.checks import check_fresh
     from imulab.tumble.compare import check_tumble
     from imulab.tumble.figures import small_g
 
+    held = load(record)
     attitudes = find_attitudes(read_recording(file, layout, chosen(topic, instance, window)))
-    result = check_tumble(
-        load(record),
-        attitudes,
-        limit=quantity(limit, "--limit", "acceleration", "mg"),
-        gravity=None if gravity is None else quantity(gravity, "--gravity", "acceleration", "m/s^2"),
-    )
+    local = None if gravity is None else quantity(gravity, "--gravity", "acceleration", "m/s^2")
+    result = check_tumble(held, attitudes, limit=quantity(limit, "--limit", "acceleration", "mg"), gravity=local)
+    check_fresh(held, result.residuals, result.limit, local, attitudes.recording.name)
+    for message in warnings_of(held, attitudes.recording):
+        warn(message)
     for index, value in enumerate(result.residuals.tolist()):
         print(
             f"{attitudes.label(index)}: {small_g(value)}" + ("" if abs(value) <= result.limit else "  beyond the limit")

@@ -14,6 +14,7 @@ from imulab.units import parse_unit, to_si
 
 EXAMPLE = """\
 delimiter = "whitespace"                        # or "," ";" "\\t"
+decimal = "."                                   # or "," where numbers are written 9,81
 header = false                                  # true: the first line names the columns
 skip_lines = 0                                  # lines above the header or the data
 # sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
@@ -26,7 +27,7 @@ accel_z = { from = 3, unit = "count" }
 serial = "SN42"
 """
 _DELIMITERS = {"whitespace": " ", " ": " ", ",": ",", ";": ";", "\t": "\t"}
-_KEYS = {"delimiter", "header", "skip_lines", "sample_rate", "columns", "metadata"}
+_KEYS = ("columns", "delimiter", "header", "metadata", "sample_rate", "skip_lines", "decimal")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +42,8 @@ class LayoutColumn:
 class Layout:
     """Where the columns of a foreign file are.
 
-    ``delimiter`` is one character, a blank meaning any run of blanks; ``sample_rate`` in Hz or None; ``text`` says that
-    the file is delimited text whatever it looks like (the layout file names a delimiter).
+    ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
+    in Hz or None; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter).
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -53,6 +54,7 @@ class Layout:
     metadata: Mapping[str, str] | None = None
     name: str = "layout"
     text: bool = False
+    decimal: str = "."
 
 
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
@@ -80,12 +82,15 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
 
 
 def _layout(table: dict[str, Any], path: str) -> Layout:
-    unknown = sorted(set(table) - _KEYS)
+    unknown = sorted(set(table) - set(_KEYS))
     if unknown:
-        raise ReadError(f"{path}: unknown key {unknown[0]!r}; known keys: {' '.join(sorted(_KEYS))}")
+        raise ReadError(f"{path}: unknown key {unknown[0]!r}; known keys: {' '.join(_KEYS)}")
     delimiter = table.get("delimiter", "whitespace")
     if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:
         raise ReadError(f"{path}: delimiter {delimiter!r}; expected 'whitespace' ',' ';' or a tab")
+    decimal = table.get("decimal", ".")
+    if decimal not in (".", ",") or decimal == delimiter:
+        raise ReadError(f"{path}: decimal {decimal!r}; expected '.' or ',', and another sign than the delimiter")
     columns = table.get("columns")
     if not isinstance(columns, dict) or not columns:
         raise ReadError(f'{path}: no [columns]; expected lines such as accel_x = {{ from = 1, unit = "count" }}')
@@ -110,6 +115,7 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
         metadata={key: str(value) for key, value in metadata.items()},
         name=path,
         text="delimiter" in table,
+        decimal=decimal,
     )
 
 

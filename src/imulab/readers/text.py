@@ -299,6 +299,8 @@ class TextFile:
 
     def _begin(self, block: bytes, crew: _Crew) -> tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]:
         """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
+        if self._layout and self._layout.decimal == ",":
+            block = block.replace(b",", b".")
         capacity = block.count(b"\n") + 1
         room, first = self._place_for(capacity, len(block))
         job = partial(_text.parse, block, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
@@ -349,6 +351,8 @@ class TextFile:
         slot = int(self._slots[field])
         shown = found if len(found) <= 40 else found[:37] + "..."
         comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", found) else ""
+        if comma and self._layout:
+            comma += '; decimal = "," in the layout reads it'
         raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}{comma}")
 
 

@@ -21,8 +21,7 @@ _TITLES = {
     "warmup": "Warm-up table",
     "centrifuge": "Centrifuge test",
 }
-_LONG = 60
-_NUMBER = re.compile(r"[<>±+−-]?\s?[\d.]+(?![\w.-])|nan")
+_NUMBER = re.compile(r"[<>±+−-]?\s?\d[\d.,]*(?:e[-+]?\d+)?(?![\w.-])|nan\b")
 
 
 def render(record: Calibration, exhibits: Exhibits) -> str:
@@ -62,12 +61,12 @@ def render_page(
 
 
 def _column_kinds(table: Table) -> list[str]:
-    """Return for each column ``words`` or, where they are long, ``prose``; nothing where it holds numbers."""
-    found = []
-    for number in range(len(table.columns)):
-        cells = [row[number] for row in table.rows]
-        words = any(cell not in ("", "–") for cell in cells) and not any(_NUMBER.match(cell) for cell in cells)
-        found.append(("prose" if max(map(len, cells)) > _LONG else "words") if words else "")
+    """Return ``unit`` or ``text`` for the columns that hold no number; the first stands at the left anyway."""
+    found = [""] * len(table.columns)
+    for number, title in enumerate(table.columns[1:], start=1):
+        cells = [row[number] for row in table.rows if row[number] not in ("", "–")]
+        if cells and not any(_NUMBER.match(cell) for cell in cells):
+            found[number] = "unit" if title == "unit" else "text"
     return found
 
 

@@ -65,6 +65,9 @@ def _prior(file: str, recording: Recording, access: Files) -> Calibration:
         check_prior(record)
     except RecordError as error:
         raise RecordError(f"{file}: {error}") from None
+    unit, needed = recording.triad_unit("accel"), record.model["output_unit"]
+    if unit != needed:
+        raise RecordError(f"{file}: the prior has outputs in {needed}, {recording.name} in {unit}")
     own = recording.source
     if own is not None and own.sha256 in [source.sha256 for source in record.sources]:
         raise DataError(f"{recording.name}: the prior {file} was made from this recording, which would count twice")

@@ -6,18 +6,19 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
-from imulab.errors import DataError, RecordError
+from imulab.errors import DataError, OptionError, RecordError
+from imulab.recording import Array
 from imulab.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
 from imulab.tumble.solve import Solution
 from imulab.units import from_si, parse_unit, to_si
 
+_MANY_ROWS = 200
 _ENOUGH_TO_TELL = 5
 _DEAD_SPAN = 0.02
 _GYRO_SPAN = 0.05
 _PROPORTIONAL = 0.9999
 _FARTHEST = 5.0
 _WORST_RMS = 0.1
-_MANY_ROWS = 200
 _LEAST_EIGENVALUE = 1e-12
 
 
@@ -111,6 +112,42 @@ def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) ->
         raise DataError(
             f"{attitudes.recording.name}: the calibrated magnitudes miss gravity ({gravity:.5g} m/s^2) by "
             f"{typical * gravity:.3g} m/s^2 in the median attitude: these are not static attitudes of an accelerometer"
+        )
+
+
+def check_fresh(record: Calibration, residuals: Array, limit: float, gravity: float | None, name: str) -> None:
+    """Check that fresh attitudes can be held against a record at all.
+
+    Parameters
+    ----------
+    record
+        Whose gravity counts if none is given.
+    residuals
+        |f| - g of each, m/s^2, shape (n,).
+    limit
+        Largest | |f| - g | that passes, m/s^2.
+    gravity
+        Where the attitudes were measured, m/s^2, or None.
+    name
+        Of the recording.
+
+    Raises
+    ------
+    OptionError
+        The limit is not above 0, or gravity cannot be.
+    DataError
+        The magnitudes are nowhere near gravity.
+    """
+    if not limit > 0:
+        raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
+    if gravity is not None and not 0.5 < gravity < 50.0:
+        raise OptionError(f"gravity {gravity:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
+    local = float(record.model["gravity"]["value"]) if gravity is None else gravity
+    found = float(np.median(residuals)) + local
+    if not local / 2 <= found <= 2 * local:
+        raise DataError(
+            f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {found:.4g} m/s^2 under the "
+            f"record, expected {local:.4g} m/s^2: a wrong unit, or a record of another unit?"
         )
 
 

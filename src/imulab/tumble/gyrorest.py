@@ -136,7 +136,7 @@ def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest
     costs = float((flat**2).sum()), float((left**2).sum())
     shown = n > 6 and f_test(costs[0], 3, costs[1], 12, 3 * n) < _SIGNIFICANT
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
-        scatter: Array = np.sqrt((flat**2).sum(axis=0) / (n - 1) / n)
+        scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
         return Rest(mean.mean(axis=0), None, scatter, None)
     spread: Array = np.sqrt((left**2).sum(axis=0) / max(n - 4, 1))
     root = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))

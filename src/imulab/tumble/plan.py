@@ -22,8 +22,10 @@ from imulab.tumble.model import HIGHEST_ORDER, norm_and_jacobian, parameter_coun
 from imulab.tumble.solve import start_parameters
 
 CRITERIA = ("A", "D")
+MOST_ATTITUDES = 300
 _CANDIDATES = 900
 _STARTS = 12
+_ENOUGH = 600  # attitudes over all starts: with many attitudes the first start is as good as the best
 _SWEEPS = 40
 _CLOSEST = np.radians(3.0)
 """Two attitudes closer than this are the same attitude: the same axis vertical."""
@@ -77,6 +79,7 @@ def plan_tumble(
     criterion: str = "A",
     candidates: Array | None = None,
     already: Array | None = None,
+    source: str = "sphere",
     seed: int = 1,
 ) -> Plan:
     """Choose attitudes for a tumble test.
@@ -95,13 +98,15 @@ def plan_tumble(
         Upward directions that the fixture allows, shape (m, 3); the whole sphere if not given.
     already
         Upward directions already measured, shape (k, 3).
+    source
+        Name of the candidates, for messages.
     seed
         Of the random starts.
 
     Raises
     ------
     OptionError
-        Too few attitudes or candidates, or an unknown criterion.
+        Too few or too many attitudes, too few candidates or none far enough apart, or an unknown criterion.
     ObservabilityError
         No choice among the candidates determines the model.
     """
@@ -111,7 +116,9 @@ def plan_tumble(
     if criterion not in CRITERIA:
         raise OptionError(f"criterion {criterion!r}: expected one of {' '.join(CRITERIA)}")
     before = np.empty((0, 3)) if already is None else already
-    if attitudes < 1 or attitudes + len(before) < size:
+    if not 1 <= attitudes <= MOST_ATTITUDES:
+        raise OptionError(f"{attitudes} attitudes: expected 1 to {MOST_ATTITUDES}")
+    if attitudes + len(before) < size:
         known = f" with the {len(before)} already there" if len(before) else ""
         raise OptionError(
             f"{attitudes} attitudes{known}: order {order} has {size} parameters; expected at least as many"
@@ -119,18 +126,20 @@ def plan_tumble(
     free = candidates is None
     points = _sphere_candidates() if candidates is None else _distinct(candidates)
     if len(points) < attitudes:
-        raise OptionError(f"{len(points)} different candidate attitudes; expected at least {attitudes}")
+        raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {attitudes}")
     rng = np.random.default_rng(seed)
     fixed = information_rows(before, order)
     rows = information_rows(points, order)
     best: Array | None = None
     best_cost = np.inf
-    for _ in range(_STARTS):
+    for _ in range(max(2, min(_STARTS, _ENOUGH // attitudes))):
         chosen, cost = _exchange(rows, points, fixed, before, attitudes, criterion, rng)
         if cost < best_cost:
             best, best_cost = points[chosen], cost
     if best is None:
-        raise ObservabilityError(f"no {attitudes} of the {len(points)} candidate attitudes determine order {order}")
+        raise ObservabilityError(
+            f"{source}: no {attitudes} of the {len(points)} candidate attitudes determine order {order}"
+        )
     if free:
         best = _polish(best, fixed, before, order, criterion, rng)
     everything = np.vstack([before, best])
@@ -138,7 +147,13 @@ def plan_tumble(
     seen = observability(jacobian, np.full(len(everything), 1e16))
     if seen.rank < size:
         confused = " ".join(seen.confused(parameter_names(order)))
-        raise ObservabilityError(f"the candidate attitudes cannot separate {confused} of order {order}")
+        raise ObservabilityError(f"{source}: the candidate attitudes cannot separate {confused} of order {order}")
+    near = np.vstack([best, before])
+    if (best @ near.T - 2 * np.eye(len(best), len(near)) > np.cos(_CLOSEST)).any():
+        there = f" and from the {len(before)} already there" if len(before) else ""
+        raise OptionError(
+            f"{source}: no {attitudes} of the {len(points)} candidate attitudes are 3 deg apart from each other{there}"
+        )
     return Plan(_shortest_path(best), order, _inverse(jacobian.T @ jacobian), seen.condition, len(before))
 
 

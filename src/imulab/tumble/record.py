@@ -124,7 +124,7 @@ def make_record(
         sources=(recording.source,) if recording.source else (),
         warnings=(
             *_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0)),
-            *_prior_warnings(prior, attitudes),
+            *_prior_warnings(prior, attitudes, solution),
         ),
     )
 
@@ -215,9 +215,19 @@ def _prior_shares(prior: Calibration | None, names: list[str], matrix: Array | N
     }
 
 
-def _prior_warnings(prior: Calibration | None, attitudes: Attitudes) -> list[str]:
-    mine, its = (None if prior is None else prior.sensor.get("serial")), attitudes.recording.metadata.get("serial")
-    return [f"the prior is a record of {mine}, the recording one of {its}"] if mine and its and mine != its else []
+def _prior_warnings(prior: Calibration | None, attitudes: Attitudes, solution: Solution) -> list[str]:
+    if prior is None:
+        return []
+    found = []
+    mine, its = prior.sensor.get("serial"), attitudes.recording.metadata.get("serial")
+    if mine and its and mine != its:
+        found.append(f"the prior is a record of {mine}, the recording one of {its}")
+    if solution.excess[0] > 0:
+        found.append(
+            "prior and attitudes contradict each other: if the unit has changed since the prior was made, the values "
+            "still lean on it and the uncertainties do not cover the change; fit without the prior and compare"
+        )
+    return found
 
 
 def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:

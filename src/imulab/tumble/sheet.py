@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.errors import DataError
-from imulab.recording import Array, Recording
+from imulab.errors import DataError, UnitError
+from imulab.recording import Array, Recording, check_finite
 from imulab.tumble.plan import Plan, roll_pitch
+from imulab.units import parse_unit
 
 _SIZE = 62.0
+_LARGEST_LETTER, _SMALLEST_LETTER = 13.0, 6.5
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float) * [1.0, 0.7, 0.35]
 _FACES = (
     (0, (4, 5, 7, 6), "+x"), (0, (0, 1, 3, 2), "−x"), (1, (2, 3, 7, 6), "+y"),
@@ -22,8 +24,8 @@ def plan_recording(plan: Plan) -> Recording:
     """Return a plan as a table: number, upward direction in the body frame, roll and pitch."""
     angles = roll_pitch(plan.directions)
     columns = {"number": np.arange(1.0, len(plan.directions) + 1)}
-    columns |= {f"up_{axis}": np.round(plan.directions[:, i], 6) for i, axis in enumerate("xyz")}
-    columns |= {name: np.round(np.degrees(angles[:, i]), 3) for i, name in enumerate(("roll", "pitch"))}
+    columns |= {f"up_{axis}": np.round(plan.directions[:, i], 6) + 0.0 for i, axis in enumerate("xyz")}
+    columns |= {name: np.round(np.degrees(angles[:, i]), 3) + 0.0 for i, name in enumerate(("roll", "pitch"))}
     units = {"number": "1", "up_x": "1", "up_y": "1", "up_z": "1", "roll": "deg", "pitch": "deg"}
     return Recording(columns=columns, units=units, metadata={"order": str(plan.order)}, name="plan")
 
@@ -34,11 +36,21 @@ def directions_of(recording: Recording) -> Array | None:
     Raises
     ------
     DataError
-        A direction has no length.
+        A direction has no length or is not finite.
+    UnitError
+        Roll or pitch is no angle.
     """
     if all(f"up_{axis}" in recording for axis in "xyz"):
         up = np.column_stack([recording.column(f"up_{axis}") for axis in "xyz"])
+        check_finite(recording, [f"up_{axis}" for axis in "xyz"])
     elif "roll" in recording and "pitch" in recording:
+        for name in ("roll", "pitch"):
+            if parse_unit(recording.units[name]).quantity != "angle":
+                raise UnitError(
+                    f"{recording.name}: column {name}: expected an angle, as in {name} [deg]; found the unit "
+                    f"{recording.units[name]}"
+                )
+        check_finite(recording, ["roll", "pitch"])
         roll, pitch = recording.si("roll"), recording.si("pitch")
         up = np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
     else:
@@ -69,13 +81,21 @@ def attitude_picture(up: Array) -> str:
             f'<polygon points="{outline}" fill="{_SHADES[axis]}" fill-opacity="{0.45 + 0.5 * toward:.2f}" '
             'stroke="#22303a"/>'
         )
-        if toward > 0.25:
+        size = min(_LARGEST_LETTER, 0.7 * _narrowest(points[list(corners)]))
+        if size >= _SMALLEST_LETTER:
             shapes.append(
-                f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="13" text-anchor="middle" '
+                f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="{size:.1f}" text-anchor="middle" '
                 f'dominant-baseline="central" fill="{_LETTERS[axis]}">{text}</text>'
             )
     side = 2 * _SIZE
     return f'<svg viewBox="0 0 {side:.0f} {side:.0f}" width="150" height="150" role="img">{"".join(shapes)}</svg>'
+
+
+def _narrowest(outline: Array) -> float:
+    """Distance between the nearer pair of sides of a parallelogram, shape (4, 2)."""
+    one, two = outline[1] - outline[0], outline[3] - outline[0]
+    area = abs(float(one[0] * two[1] - one[1] * two[0]))
+    return area / max(float(np.linalg.norm(one)), float(np.linalg.norm(two)))
 
 
 def _to_level(up: Array) -> Array:

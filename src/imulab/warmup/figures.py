@@ -35,12 +35,12 @@ def exhibits(record: Calibration) -> Exhibits:
     floor = record.fit["repeatability"]["cycle"]
     jump = ("largest edge jump", "edge_jump") if table.model == "interval-cubic" else ("largest |Z(T_M)|", "exit_jump")
     facts = [
-        (jump[0], f"{_largest(chosen[jump[1]], head, factor)} {label}"),
-        ("power cycles", str(record.fit["cycles"])),
-        ("T_M", f"{table.settling_time:g} s"),
         ("left at the tests", _text(chosen["training"], head, factor, f" {label}")),
-        ("between them", _text(chosen["left_temperature"], head, factor, f" {label}")),
+        ("temperature left out", _text(chosen["left_temperature"], head, factor, f" {label}")),
         ("repeatability", _text(floor, head, factor, f" {label}")),
+        (jump[0], f"{_largest(chosen[jump[1]], head, factor)} {label}"),
+        ("T_M", f"{table.settling_time:g} s"),
+        ("power cycles", str(record.fit["cycles"])),
     ]
     items: list[Figure | Table] = []
     for kind, index in kinds.items():
@@ -218,12 +218,14 @@ def _residuals(record: Calibration, table: WarmupTable, kind: str, index: list[i
             )
     return grid(
         title=f"What is left, {kind}",
-        caption="Mean over the cycles of each temperature, less the table. Scatter about zero is noise and "
-        "repeatability; an arch or an offset common to a temperature is the model.",
+        caption="Mean over the cycles of each temperature, less the table, over the logarithm of time. Scatter about "
+        "zero is noise (most in the short bins at first) and repeatability; an arch or an offset common to a "
+        "temperature is the model.",
         names=[table.axes[i] for i in index],
         cells=cells,
         y_title=label,
         temperatures=table.temperatures,
+        log_time=True,
     )
 
 
@@ -278,7 +280,8 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
     return Figure(
         title=f"Error by power-on temperature, {kind}",
         caption="Root mean square over t < T_M and all axes, on a logarithmic scale. Left out: the temperature "
-        "predicted from its neighbours alone. Nothing can lie much below the repeatability.",
+        "predicted from its neighbours alone. Nothing can lie much below the repeatability. A point that is missing "
+        "lies in the noise.",
         traces=traces,
         layout={
             "xaxis": axis_style("power-on temperature, degC", tickvals=knots),
@@ -327,10 +330,14 @@ def _over_temperature(table: WarmupTable) -> Figure:
         domain = [0, 1] if len(names) == 1 else [[0, 0.44], [0.56, 1]][number]
         layout[f"xaxis{suffix}"] = axis_style("power-on temperature, degC", domain=domain, anchor=f"y{suffix}")
         layout[f"yaxis{suffix}"] = axis_style(f"{axis}, {label}", anchor=f"x{suffix}")
+    steps = (
+        "A vertical step is a jump at an edge: two power-ons a hair apart are corrected by that much differently."
+        if table.model == "interval-cubic"
+        else "Outside these temperatures nothing is subtracted."
+    )
     return Figure(
         title="What the unit subtracts, over power-on temperature",
-        caption="The axis with the largest curve of each kind, at instants after power-on. A vertical step is a jump "
-        "at an edge: two power-ons a hair apart are corrected by that much differently.",
+        caption="The axis with the largest curve of each kind, at instants after power-on. " + steps,
         traces=traces,
         layout=layout,
         height=380,

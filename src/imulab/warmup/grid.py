@@ -10,6 +10,7 @@ from imulab.exhibit import Figure
 from imulab.recording import Array
 
 _ACROSS = 3
+_DECADES = [1, 3, 10, 30, 100, 300, 1000, 3000]
 _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
 """Cold to warm; distinct in lightness too."""
 
@@ -38,8 +39,12 @@ def grid(
     cells: list[list[dict[str, Any]]],
     y_title: str,
     temperatures: Array,
+    log_time: bool = False,
 ) -> Figure:
-    """Lay out one plot per name, at most three across, with a common key of temperatures below the title."""
+    """Lay out one plot per name, at most three across, with a common key of temperatures below the title.
+
+    On a logarithm of time bins that widen with time lie evenly.
+    """
     across = min(len(names), _ACROSS)
     down = -(-len(names) // across)
     gap_x, gap_y = 0.06, 0.16 / down
@@ -68,8 +73,9 @@ def grid(
         here = {"type": "scatter", "showlegend": False, "xaxis": f"x{suffix}", "yaxis": f"y{suffix}"}
         traces += [{**here, **trace} for trace in cell]
         bottom = row == down - 1
+        scale = {"type": "log", "tickvals": _DECADES} if log_time else {"rangemode": "tozero"}
         layout[f"xaxis{suffix}"] = axis_style(
-            "s after power-on" if bottom else "", domain=[left, left + width], anchor=f"y{suffix}", rangemode="tozero"
+            "s after power-on" if bottom else "", domain=[left, left + width], anchor=f"y{suffix}", **scale
         )
         layout[f"yaxis{suffix}"] = axis_style(
             y_title if column == 0 else "",
