@@ -128,9 +128,10 @@ def simulate(
     units: Annotated[str, typer.Option("--units", metavar="N", help="Number of units, 8 or more.")] = "12",
     seed: Annotated[str, typer.Option("--seed", metavar="N", help="Of the random numbers.")] = "1",
 ) -> None:
-    """Simulate a line: units calibrated twice, manifests, limits.
+    """Simulate a line of accelerometers.
 
-    Accelerometer triads; the zero of z drifts over the units, unit 5 is far off, unit 7 changes in between.
+    Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit 5
+    is far off, and unit 7 changes between its two calibrations.
     """
     from imulab.fleet.simulate import simulate_line
 
