@@ -318,10 +318,10 @@ def test_the_report_says_what_is_there(line, capsys):
     for title in ("distribution over the units", "every parameter", "over the date", "change since each unit"):
         assert f"Tumble: {title}" in page
     stands_out = page[page.index("Units that stand out") : page.index("Largest changes")]
-    assert '<td class="words">SN005</td><td class="words">bias_x</td>' in stands_out
+    assert '<td>SN005</td><td class="text">bias_x</td>' in stands_out
     changes = page[page.index("Largest changes") :]
     first = changes[changes.index("<tbody>") :][:600]
-    assert '<td class="words">SN003</td><td class="words">bias_y</td><td>5.1' in first
+    assert '<td>SN003</td><td class="text">bias_y</td><td>5.1' in first
     assert "changed" in first
     assert "2026-01-04" in first
 
