@@ -55,6 +55,13 @@ def test_warnings_name_what_is_wrong_with_the_test():
     assert any("gyro still drifts in the settled part of 4 of 4" in message for message in found)
 
 
+def test_a_unit_that_cannot_be_is_asked_about():
+    cycles = [cycle_of(lambda t: 3600 * flat(t), t, name=f"c{t}{c}") for t in (-20, 0) for c in (1, 2)]
+    found = il.fit_warmup(cycles, temperatures=[-20, 0], settling_time=END).calibration.warnings
+    asked = [message for message in found if "does its column have the right unit?" in message]
+    assert [message.split()[0] for message in asked] == ["gyro_x"]
+
+
 @pytest.mark.parametrize(
     ("temperatures", "options", "kind", "words"),
     [

@@ -16,6 +16,8 @@ _DRIFT_SHARE = 0.5
 _MOST_NAMED = 3
 _FIT_FAILS = 1.5
 _WIDE = 20.0
+_IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
+"""A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
 
 
 def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]:
@@ -23,6 +25,7 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
     return [
         *_ends(curves, settled),
         *_starts(curves),
+        *_sizes(curves),
         *_motion(curves),
         *_drifts(curves, chosen),
         *_temperatures(curves),
@@ -64,6 +67,16 @@ def _ends(curves: Curves, settled: bool) -> list[str]:
 def _starts(curves: Curves) -> list[str]:
     late = [f"{c.name} ({c.first:.3g} s)" for c in curves.cycles if c.first > _LATE]
     return [f"the first sample comes late after power-on: {_named(late)}"] if late else []
+
+
+def _sizes(curves: Curves) -> list[str]:
+    """What a unit in a column's title that is not that of its numbers looks like."""
+    largest = np.nanmax(np.abs(curves.mean), axis=(0, 1))
+    return [
+        f"{axis} changes by {in_engineering(change, unit)} after power-on: does its column have the right unit?"
+        for axis, change, unit in zip(curves.axes, largest, curves.units, strict=True)
+        if change > _IMPROBABLE.get(unit, np.inf)
+    ]
 
 
 def _motion(curves: Curves) -> list[str]:
