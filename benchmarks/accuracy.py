@@ -6,12 +6,15 @@ import json
 import os
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from timing import Row
 
 import imulab as il
+from imulab.centrifuge.manifest import Manifest, Run
+from imulab.centrifuge.simulate import Simulation, Truth, typical_truth
 from imulab.changes import compare_records
 from imulab.gyro_array.fuse import FuseOptions, open_stream
 from imulab.gyro_array.model import find_elements
@@ -21,6 +24,8 @@ from imulab.tumble.plan import plan_tumble
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from reference import tumble as reference
+from reference.centrifuge import fourier
+from reference.warmup import cubic
 
 G = 9.80665
 XYZ = "xyz"
@@ -38,7 +43,7 @@ PLANS = (
 
 def rows() -> list[Row]:
     real = [*_xsens(), *_sap5(), *_mpu9150()] if (DATA / "xsens_mti").is_dir() else []
-    return [*_recovery(), *_plans(), *_array(), *real]
+    return [*_recovery(), *_plans(), *_array(), *_warmup(), *_centrifuge(), *real]
 
 
 def _table(outputs: np.ndarray, unit: str = "m/s^2") -> il.Recording:
@@ -109,6 +114,48 @@ def _robust(readings: np.ndarray, rate: float) -> np.ndarray:
     recording = Recording(columns, {"time": "s"} | dict.fromkeys(list(columns)[1:], "deg/s"))
     stream = open_stream(FuseOptions(), find_elements(recording), rate, readings[:100, None])
     return np.asarray(stream.process(readings[:, None, :]).rate[:, 0])
+
+
+def _warmup() -> list[Row]:
+    """The same cubic at every temperature, without noise."""
+    b = np.random.default_rng(1).standard_normal(4) * 300 * np.pi / 180 / 3600
+    time = np.arange(8000) / 20
+    z = np.where(time < 300, [cubic(b, t / 300) for t in time], 0.0)
+    cycles = [
+        Recording(
+            {"time": time, "gyro_x": 1e-3 + z}, {"time": "s", "gyro_x": "rad/s"}, {"power_on_temperature": str(t)}
+        )
+        for t in (-40, -30, -20, -10, 0, 40, 50, 60)
+    ]
+    found = il.fit_warmup(cycles, model="interval-cubic", settling_time=300.0).table.coefficients[:, 0]
+    worst = np.abs(found / b - 1).max()
+    return [("warm-up, cubic truth, noise-free: worst relative error of a coefficient", f"{worst:.0e}", "<= 1e-9")]
+
+
+def _centrifuge() -> list[Row]:
+    """The source's formulas, transcribed apart, where the period is a whole number of samples."""
+    truth, net = typical_truth(), np.radians(40.0)
+    still = {"angle_random_walk": 0.0}
+    truth = Truth(replace(truth.x, **still), None, replace(truth.fog, **still), replace(truth.rig, flexure=0.0))
+    runs = [Run(f"{n}.csv", 1, "loaded", 2 * np.pi * n + net, 2 * np.pi * n) for n in (1, 2)]
+    test = Manifest(2.0, (Run("s.csv", 1, "static"), *runs), reference=2.0 * runs[0].arm_rate ** 2)
+    simulation = Simulation(test, truth, 200.0, 60.3, 20.0, True)
+    record = il.fit_centrifuge(test, simulation, method="fourier").calibration
+    rest, worst = _columns(simulation, test.runs[0]), 0.0
+    for number, run in enumerate(runs, start=1):
+        c = _columns(simulation, run)
+        x, fog = (c[name] - rest[name].mean() for name in ("dtg_x", "fog"))
+        a, b, *_ = fourier(x - fog, run.table_rate, 1 / 200)
+        expected = np.hypot(a, b) / (2.0 * run.arm_rate**2)
+        worst = max(worst, abs(record.value(f"x_K_{number}") / expected - 1))
+    return [
+        ("centrifuge, `fourier` against the source's formulas: worst relative difference", f"{worst:.0e}", "<= 1e-12")
+    ]
+
+
+def _columns(simulation: Simulation, run: Run) -> dict[str, np.ndarray]:
+    blocks = list(simulation(run))
+    return {name: np.concatenate([block.si(name) for block in blocks]) for name in ("dtg_x", "fog")}
 
 
 def _xsens() -> list[Row]:
