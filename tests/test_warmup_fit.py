@@ -168,6 +168,8 @@ STATED = {
     },
 }
 JUMPS = {"smooth": 108, "bent": 202}
+BETTER = {("smooth", "knot-cubic"): {3}, ("bent", "exponential (2)"): {3}}
+"""Entries that come out better than stated by more than 1.5: 1.6 and 1.8 times, both at 30 degC."""
 TESTS = 8
 
 
@@ -191,7 +193,8 @@ def test_the_table_of_models_comes_out_as_stated(law):
         found = np.sqrt(np.mean(squares[name], axis=0))
         print(law, name, np.round(found, 1), stated)
         assert (found / stated).max() < 1.5
-        assert (found / stated).min() > 1 / 2  # better, at 30 degC: two exponentials where the law bends
+        low = {column for column in range(4) if found[column] / stated[column] <= 1 / 1.5}
+        assert low <= BETTER.get((law, name), set())
         assert 1 / 1.5 < np.sqrt(np.mean(found**2) / np.mean(np.square(stated))) < 1.5
     assert 1 / 1.5 < np.mean(jumps) / JUMPS[law] < 1.5
 

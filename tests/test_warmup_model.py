@@ -72,7 +72,7 @@ def test_between_knots_the_curve_at_the_time_constants_runs_on_scipys_monotone_c
     curve = PchipInterpolator(AT, np.stack([evaluate(table, instants, at) for at in AT]), axis=0)
     for temperature in np.linspace(-40, 60, 37):
         found = evaluate(table, instants, temperature)
-        np.testing.assert_allclose(found, curve(temperature), rtol=1e-11, atol=1e-16)
+        np.testing.assert_allclose(found, curve(temperature), rtol=1e-12, atol=1e-18)
 
 
 def test_errors_that_cancel_in_the_curve_at_the_knots_cancel_between_them():
