@@ -1,9 +1,7 @@
 """Which attitudes to measure: D- or A-optimal sets for a tumble test, and what they will give.
 
-The information of an attitude is the gradient of |f| for a nominal sensor, a function of its upward direction alone.
-Attitudes are exchanged one by one for the best of a list of candidates (Fedorov 1972; Atkinson, Donev and Tobias,
-Optimum Experimental Designs, 2007, ch. 12) from several starts, and on the free sphere then moved to where they are
-best.
+What the user may choose from (the sphere, a fixture's steps, a list), what is chosen (optimal.py), what it predicts for
+every parameter, and the order of the attitudes that turns least.
 """
 
 from __future__ import annotations
@@ -12,27 +10,16 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.errors import ObservabilityError, OptionError
 from imulab.estimate import observability
 from imulab.recording import Array
 from imulab.tumble.advice import sphere_points
-from imulab.tumble.model import HIGHEST_ORDER, norm_and_jacobian, parameter_count, parameter_names
-from imulab.tumble.solve import start_parameters
+from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
+from imulab.tumble.optimal import CLOSEST, CRITERIA, Search, information_rows, inverse, optimal_set
 
-CRITERIA = ("A", "D")
 MOST_ATTITUDES = 300
 _CANDIDATES = 900
-_STARTS = 12
-_ENOUGH = 600  # attitudes over all starts: with many attitudes the first start is as good as the best
-_SWEEPS = 40
-_CLOSEST = np.radians(3.0)
-"""Two attitudes closer than this are the same attitude: the same axis vertical."""
-_POLISH_RADII = np.radians([8.0, 3.0, 1.0])
-_CAP = 48
-_RIDGE = 1e-9
-"""Information that keeps the matrix regular while attitudes are still missing."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +53,6 @@ class Plan:
         return dict(zip(parameter_names(self.order), sigma.tolist(), strict=True))
 
 
-def information_rows(directions: Array, order: int) -> Array:
-    """Return the gradient of |f| with respect to the scaled parameters of a nominal sensor, shape (n, p)."""
-    rows: Array = norm_and_jacobian(start_parameters(order), directions[None], order)[1][0]
-    return rows
-
-
 def plan_tumble(
     *,
     order: int,
@@ -85,6 +66,7 @@ def plan_tumble(
     """Choose attitudes for a tumble test.
 
     Criterion A minimises the sum of the parameters' variances (in units of g), D the volume of their confidence region.
+    Of sets whose sums are within 1 % of the least, A takes that whose worst axes have the least sum.
 
     Parameters
     ----------
@@ -127,21 +109,11 @@ def plan_tumble(
     points = _sphere_candidates() if candidates is None else _distinct(candidates)
     if len(points) < attitudes:
         raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {attitudes}")
-    rng = np.random.default_rng(seed)
-    fixed = information_rows(before, order)
-    rows = information_rows(points, order)
-    best: Array | None = None
-    best_cost = np.inf
-    for _ in range(max(2, min(_STARTS, _ENOUGH // attitudes))):
-        chosen, cost = _exchange(rows, points, fixed, before, attitudes, criterion, rng)
-        if cost < best_cost:
-            best, best_cost = points[chosen], cost
+    best = optimal_set(Search(order, criterion, before), points, attitudes, seed, free=free)
     if best is None:
         raise ObservabilityError(
             f"{source}: no {attitudes} of the {len(points)} candidate attitudes determine order {order}"
         )
-    if free:
-        best = _polish(best, fixed, before, order, criterion, rng)
     everything = np.vstack([before, best])
     jacobian = information_rows(everything, order)
     seen = observability(jacobian, np.full(len(everything), 1e16))
@@ -149,12 +121,12 @@ def plan_tumble(
         confused = " ".join(seen.confused(parameter_names(order)))
         raise ObservabilityError(f"{source}: the candidate attitudes cannot separate {confused} of order {order}")
     near = np.vstack([best, before])
-    if (best @ near.T - 2 * np.eye(len(best), len(near)) > np.cos(_CLOSEST)).any():
+    if (best @ near.T - 2 * np.eye(len(best), len(near)) > np.cos(CLOSEST)).any():
         there = f" and from the {len(before)} already there" if len(before) else ""
         raise OptionError(
             f"{source}: no {attitudes} of the {len(points)} candidate attitudes are 3 deg apart from each other{there}"
         )
-    return Plan(_shortest_path(best), order, _inverse(jacobian.T @ jacobian), seen.condition, len(before))
+    return Plan(_shortest_path(best), order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
 
 
 def fixture_candidates(step: float) -> Array:
@@ -203,75 +175,6 @@ def _distinct(directions: Array) -> Array:
     _, first = np.unique(np.round(unit, 6) + 0.0, axis=0, return_index=True)
     distinct: Array = unit[np.sort(first)]
     return distinct
-
-
-def _exchange(
-    rows: Array,
-    points: Array,
-    fixed: Array,
-    before: Array,
-    count: int,
-    criterion: str,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.int64], float]:
-    """Exchange attitudes from a random start until no exchange helps; return the choice and its cost."""
-    chosen = rng.choice(len(rows), count, replace=False)
-    base = fixed.T @ fixed + _RIDGE * np.eye(rows.shape[1])
-    for _ in range(_SWEEPS):
-        moved = False
-        for place in range(count):
-            others = np.delete(chosen, place)
-            inverse = _inverse(base + rows[others].T @ rows[others])
-            gain = _gain(inverse, rows, criterion)
-            # The same attitude twice measures nothing new that a longer hold would not.
-            near = np.vstack([points[others], before])
-            gain[(points @ near.T).max(axis=1, initial=-1.0) > np.cos(_CLOSEST)] = -np.inf
-            best = int(np.argmax(gain))
-            if gain[best] > gain[chosen[place]] * (1 + 1e-9) or gain[chosen[place]] == -np.inf:
-                chosen[place], moved = best, True
-        if not moved:
-            break
-    return chosen, _cost(base + rows[chosen].T @ rows[chosen], criterion)
-
-
-def _gain(inverse: Array, rows: Array, criterion: str) -> Array:
-    """What adding each row improves: the drop of the trace of the inverse (A) or the growth of the determinant (D)."""
-    carried = rows @ inverse
-    variance: Array = 1 + np.einsum("ij,ij->i", carried, rows)
-    if criterion == "D":
-        return variance
-    gain: Array = np.einsum("ij,ij->i", carried, carried) / variance
-    return gain
-
-
-def _inverse(information: Array) -> Array:
-    return np.asarray(np.linalg.inv(information), dtype=np.float64)
-
-
-def _cost(information: Array, criterion: str) -> float:
-    if criterion == "D":
-        return -float(np.linalg.slogdet(information)[1])
-    return float(np.trace(np.linalg.inv(information)))
-
-
-def _polish(
-    directions: Array, fixed: Array, before: Array, order: int, criterion: str, rng: np.random.Generator
-) -> Array:
-    """Move each attitude within shrinking caps to where it gives most."""
-    best = directions.copy()
-    base = fixed.T @ fixed + _RIDGE * np.eye(fixed.shape[1])
-    for radius in _POLISH_RADII:
-        for _ in range(4):
-            for place in range(len(best)):
-                others = np.delete(best, place, axis=0)
-                kept = information_rows(others, order)
-                cap = best[place] + radius * rng.uniform(-1, 1, (_CAP, 3))
-                cap = np.vstack([best[place], cap / np.linalg.norm(cap, axis=1, keepdims=True)])
-                gain = _gain(_inverse(base + kept.T @ kept), information_rows(cap, order), criterion)
-                near = np.vstack([others, before])
-                gain[1:][(cap[1:] @ near.T).max(axis=1, initial=-1.0) > np.cos(_CLOSEST)] = -np.inf
-                best[place] = cap[int(np.argmax(gain))]
-    return best
 
 
 def _shortest_path(directions: Array) -> Array:
