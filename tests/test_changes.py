@@ -80,6 +80,38 @@ def test_what_cannot_be_judged_is_shown_and_what_is_another_thing_is_left_out():
     assert bare.probability is None
 
 
+def test_models_that_differ_are_named_and_what_scatters_from_test_to_test_is_not():
+    parameters = {"bias_x": Parameter(0.0, 1.0, "m/s^2")}
+
+    def record(order, gravity, temperature, settled):
+        quantities = {
+            "gravity": (gravity, "m/s^2"),
+            "temperature": (temperature, "degC"),
+            "settling_time": (settled, "s"),
+        }
+        model = {"order": order} | {key: {"value": value, "unit": unit} for key, (value, unit) in quantities.items()}
+        return Calibration("tumble", parameters, Covariance((), ()), model, {})
+
+    first = record(1, 9.81, 24.0, 300.0)
+    assert compare_records(first, record(1, 9.81, 24.9, 310.0)).models == ()
+    assert compare_records(first, record(2, 9.82, 31.5, 400.0)).models == (
+        "order 1 and 2",
+        "gravity 9.81 and 9.82 m/s^2",
+        "temperature 24 and 31.5 degC",
+        "settling_time 300 and 400 s",
+    )
+
+
+def test_show_says_that_a_change_may_come_from_the_order(tmp_path, capsys):
+    data = tmp_path / "tumble.csv"
+    assert main(["tumble", "simulate", "--order", "2", "--attitudes", "18", "-o", str(data)]) == 0
+    for order in "12":
+        assert main(["tumble", "fit", str(data), "--order", order, "-o", str(tmp_path / f"{order}.json")]) == 0
+    capsys.readouterr()
+    assert main(["show", str(tmp_path / "1.json"), str(tmp_path / "2.json")]) == 0
+    assert "the records differ in order 1 and 2: a change may come from that\n" in capsys.readouterr().out
+
+
 def test_records_that_cannot_be_compared_are_refused():
     a = a_record([0, 0, 0], FIRST)
     other = Calibration("warmup", a.parameters, a.covariance, {}, {})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,8 @@ _SINGULAR = 1e-9
 """Eigenvalues of the correlations below this share of the largest belong to parameters that follow from others."""
 _OF_A_LEVEL = re.compile(r"_(K|zeta|cross)_\d+$")
 _SAME_LEVEL = 0.01
+_ALIKE = {"degC": (1.0, 0.0), "s": (0.0, 0.1)}
+"""Quantities of two models count as different beyond this, absolute and relative; others beyond 1e-6 relative."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +51,14 @@ class Comparison:
         where a covariance is missing.
     left_out
         Parameters that one record alone has, or that mean something else in the other.
+    models
+        In what the two models differ (order, gravity, temperature ...), a text each: a change may come from that.
     """
 
     changes: tuple[Change, ...]
     probability: float | None
     left_out: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()
 
 
 def compare_records(first: Calibration, second: Calibration) -> Comparison:
@@ -87,7 +92,10 @@ def compare_records(first: Calibration, second: Calibration) -> Comparison:
         changes.append(Change(name, difference, uncertainty, first.parameters[name].unit, bool(significant)))
     either = dict.fromkeys([*first.parameters, *second.parameters])
     return Comparison(
-        tuple(changes), _joint(first, second, judged, changes), tuple(name for name in either if name not in shared)
+        tuple(changes),
+        _joint(first, second, judged, changes),
+        tuple(name for name in either if name not in shared),
+        tuple(_model_differences(first, second)),
     )
 
 
@@ -99,6 +107,19 @@ def _check_units(first: Calibration, second: Calibration) -> None:
         other = second.parameters.get(name, parameter).unit
         if parameter.unit != other:
             raise RecordError(f"the records have {name} in different units: {parameter.unit} and {other}")
+
+
+def _model_differences(first: Calibration, second: Calibration) -> Iterator[str]:
+    """Entries of the models that both have and that differ: words, numbers, and quantities with a unit."""
+    for key, mine in first.model.items():
+        its = second.model.get(key)
+        if isinstance(mine, dict) and isinstance(its, dict) and {"value", "unit"} <= mine.keys() & its.keys():
+            values, unit = (mine["value"], its["value"]), mine["unit"]
+            absolute, relative = _ALIKE.get(unit, (0.0, 1e-6))
+            if unit == its["unit"] and abs(values[0] - values[1]) > absolute + relative * max(map(abs, values)):
+                yield f"{key} {values[0]:.7g} and {values[1]:.7g} {unit}"
+        elif isinstance(mine, str | int) and isinstance(its, str | int) and mine != its:
+            yield f"{key} {mine} and {its}"
 
 
 def _same_meaning(name: str, first: Calibration, second: Calibration) -> bool:

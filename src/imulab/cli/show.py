@@ -69,6 +69,8 @@ def describe_changes(first: str, second: str, comparison: Comparison, record: Ca
     lines = [f"{second} less {first}: {verdict}", "", *aligned(titles, rows)]
     if comparison.probability is not None:
         lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
+    if comparison.models:
+        lines += ["", f"the records differ in {', '.join(comparison.models)}: a change may come from that"]
     if comparison.left_out:
         lines += ["", f"not in both, or of other levels: {' '.join(comparison.left_out)}"]
     if "table" in record.sections:
