@@ -7,6 +7,7 @@ import numpy as np
 from imulab.warmup.curves import SETTLED, Curves
 from imulab.warmup.engineering import in_engineering
 from imulab.warmup.judge import Judged
+from imulab.warmup.solve import SCALE_LIMIT
 
 _COLD = 1.0
 _FAR = 0.5
@@ -16,6 +17,8 @@ _DRIFT_SHARE = 0.5
 _MOST_NAMED = 3
 _FIT_FAILS = 1.5
 _WIDE = 20.0
+_AT_LIMIT = 1.02
+_COUNTS = 0.05
 _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 """A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
 
@@ -31,6 +34,7 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
         *_temperatures(curves),
         *_single(curves),
         *_intervals(curves, chosen),
+        *_constants(curves, chosen),
     ]
 
 
@@ -149,4 +153,19 @@ def _intervals(curves: Curves, chosen: Judged) -> list[str]:
     return [
         f"interval-cubic uses one curve for all of {' '.join(wide)} degC, the mean of both ends: measure in between, "
         "or use a model with knots"
+    ]
+
+
+def _constants(curves: Curves, chosen: Judged) -> list[str]:
+    """A time constant that the search was stopped at, not led to, where its part of the curve is one that counts."""
+    if chosen.model != "exponential" or chosen.solution is None:
+        return []
+    tau = chosen.solution.scales[-1]
+    changes = np.abs(chosen.table.coefficients[..., -1]) * (1 - np.exp(-curves.settling_time / tau))
+    share = float((changes / np.nanmax(np.abs(curves.mean), axis=(0, 1))).max())
+    if tau < SCALE_LIMIT * curves.settling_time / _AT_LIMIT or share < _COUNTS:
+        return []
+    return [
+        f"the time constant {tau:.4g} s is the longest that is sought, {SCALE_LIMIT:g} T_M: the cycles only show that "
+        "something changes more slowly than they last"
     ]

@@ -21,6 +21,8 @@ Mask = NDArray[np.bool_]
 _START = {1: (20.0,), 2: (0.1, 0.4), 3: (0.06, 0.2, 0.6)}
 _CLOSEST = 1.6
 """Neighbouring time constants differ by this factor at least: closer ones cannot be told apart."""
+SCALE_LIMIT = 3.0
+"""Longest time scale that is sought, in units of T_M."""
 _PASSES = 3
 _WORST_CONDITION = 1e8
 _SHRINK = 2.0
@@ -234,7 +236,7 @@ def find_scales(
     scale = curves.noise / 100 + 1e-4 * size
     scale = np.where(scale > 0, scale, 1.0)
     end = curves.settling_time
-    low, high = np.log(0.5), np.log(3 * end)
+    low, high = np.log(0.5), np.log(SCALE_LIMIT * end)
 
     def cost(logs: Array) -> float:
         logs = np.sort(logs)
