@@ -1,7 +1,9 @@
 """The gyroscope triad: truth of simulated turns, derivatives, real recordings, and what can go wrong."""
 
 import re
+import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -259,6 +261,15 @@ def test_a_clock_that_is_off_is_said(case, late, words):
     assert np.abs((values(late_fit) - truth_of(recording)) / np.sqrt(np.diag(late_fit.covariance))).max() < 5
     same = recording.with_columns({"time": time + 30.0}, {})
     assert fit_gyro(record, own, same).notes == ()
+
+
+def test_a_fit_that_has_not_settled_is_no_result(case, monkeypatch):
+    recording, attitudes, record = case
+    module = sys.modules["imulab.tumble.gyro"]
+    settled = module.levenberg_marquardt
+    monkeypatch.setattr(module, "levenberg_marquardt", partial(settled, max_iterations=1))
+    with pytest.raises(DataError, match=r"does not converge on these \d+ turns \(condition number \d+\)"):
+        fit_gyro(record, attitudes, recording)
 
 
 def test_a_record_of_another_unit_is_said(case):

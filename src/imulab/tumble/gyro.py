@@ -161,7 +161,7 @@ def fit_gyro(
     if attitudes.recording is not recording:
         notes += clock_notes(holds, attitudes, time)
     scale = _start_scale(segments, unit)
-    theta, jacobian, residual = _estimate(segments, scale, fit_bias)
+    theta, jacobian, residual, converged = _estimate(segments, scale, fit_bias)
     miss = np.linalg.norm(residual.reshape(-1, 3), axis=1)
     if not np.median(miss) < _WORST_TURN:
         raise DataError(
@@ -174,6 +174,11 @@ def fit_gyro(
     if seen.rank < theta.size:
         confused = " ".join(seen.confused(gyro_names()[: theta.size]))
         raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
+    if not converged:
+        raise DataError(
+            f"{recording.name}: the fit of the gyroscopes does not converge on these {len(miss)} turns "
+            f"(condition number {seen.condition:.0f}); use more turns, about more directions"
+        )
     known = direction_covariance(record, attitudes, means, force)
     matrix = _covariance(segments, scale, theta, jacobian, residual, known, None if fit_bias else rest)
     result = _result(theta, matrix, scale, rest, miss, segments, unit, fit_bias, seen)
@@ -305,8 +310,8 @@ def _start_scale(segments: _Segments, unit: str) -> Array:
     return np.full(3, guess * float(_START_FACTORS[int(np.argmin(costs))]))
 
 
-def _estimate(segments: _Segments, scale: Array, fit_bias: bool) -> tuple[Array, Array, Array]:
-    """Return scaled parameters (p,), Jacobian (3 m, p) and residuals (3 m,)."""
+def _estimate(segments: _Segments, scale: Array, fit_bias: bool) -> tuple[Array, Array, Array, bool]:
+    """Return scaled parameters (p,), Jacobian (3 m, p), residuals (3 m,), and whether the steps became small."""
 
     def model(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         residual, jacobian = _model(segments, scale, parameters[0], fit_bias)
@@ -314,7 +319,7 @@ def _estimate(segments: _Segments, scale: Array, fit_bias: bool) -> tuple[Array,
 
     count = 12 if fit_bias else 9
     fit = levenberg_marquardt(model, np.zeros((1, count)), np.ones((1, 3 * len(segments.before))), tolerance=1e-8)
-    return fit.parameters[0], fit.jacobian[0], fit.residuals[0]
+    return fit.parameters[0], fit.jacobian[0], fit.residuals[0], bool(fit.converged[0])
 
 
 def _covariance(
