@@ -3,18 +3,19 @@
  * The decimal is found without trial by three multiplications with a power of ten of 128 bits (R. Giulietti, "The
  * Schubfach way to render doubles", 2020; its names are kept) and written as Python writes it: 0.1, 1e-05, 1e+16, nan.
  */
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "_digits.h"
 #include <stdint.h>
 #include <string.h>
 
-enum { LOWEST = -292, HIGHEST = 324, POWERS = HIGHEST - LOWEST + 1, LONGEST = 25 };
+enum { LOWEST = -292, HIGHEST = 324, POWERS = HIGHEST - LOWEST + 1 };
+
+static int prepared = 0;
+
+int numbers_prepared(void) { return prepared; }
 
 #ifdef __SIZEOF_INT128__
 /* 10^k, scaled to 128 bits and rounded up: high and low half of each; filled by prepare(). */
 static uint64_t tens[2 * POWERS];
-static int prepared = 0;
 
 typedef struct {
     uint64_t digits;
@@ -65,8 +66,7 @@ static char *repeated(char *out, char c, int count) {
     return out;
 }
 
-/* One double at `out`, at most 24 bytes; returns where it ends. */
-static char *print(double value, char *out) {
+char *print_number(double value, char *out) {
     uint64_t bits;
     memcpy(&bits, &value, sizeof bits);
     const uint64_t magnitude = bits & ~(UINT64_C(1) << 63);
@@ -129,6 +129,11 @@ static char *print(double value, char *out) {
     *out++ = (char)('0' + power % 10);
     return out;
 }
+#else
+char *print_number(double value, char *out) {
+    (void)value;
+    return out;
+}
 #endif
 
 PyDoc_STRVAR(rows_doc,
@@ -150,7 +155,7 @@ static PyObject *rows(PyObject *module, PyObject *args) {
         char *p = out.buf;
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t i = 0, column = 1; i < count; i++, column++) {
-            p = print(value[i], p);
+            p = print_number(value[i], p);
             *p++ = column == columns ? '\n' : ',';
             if (column == columns) column = 0;
         }
@@ -192,6 +197,7 @@ static PyObject *prepare(PyObject *module, PyObject *args) {
 
 static PyMethodDef methods[] = {{"rows", rows, METH_VARARGS, rows_doc},
                                 {"prepare", prepare, METH_VARARGS, prepare_doc},
+                                {"json", json_texts, METH_O, json_doc},
                                 {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef definition = {

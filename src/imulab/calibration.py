@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.errors import RecordError
 from imulab.files import write_text
-from imulab.jsontext import all_floats, content_sha256, sealed_text
+from imulab.jsontext import content_sha256, sealed_text
 from imulab.jsontext import json_text as json_text
 from imulab.recording import Source
 
@@ -108,12 +108,20 @@ class Calibration:
         RecordError
             A number is not finite.
         """
-        plain = self._plain()
+        plain: dict[str, Any] = plain_values(self._content(), "")
         return {**plain, "content_sha256": content_sha256(plain)}
 
-    def _plain(self) -> dict[str, Any]:
-        """Return the record as plain JSON values without ``content_sha256``."""
-        content: dict[str, Any] = {
+    def sealed(self) -> tuple[str, str]:
+        """Return the record's ``content_sha256`` and its JSON text, which ends with it; errors as for `to_dict`."""
+        content = self._content()
+        try:
+            return sealed_text(content)
+        except (TypeError, ValueError):  # arrays, or a number that is not finite, which gets its name here
+            return sealed_text(plain_values(content, ""))
+
+    def _content(self) -> dict[str, Any]:
+        """Return the record as it goes into its file, without ``content_sha256``."""
+        return {
             "format": FORMAT,
             "version": self.version,
             "procedure": self.procedure,
@@ -133,12 +141,6 @@ class Calibration:
             **self.sections,
             "data": self.data,
         }
-        plain: dict[str, Any] = plain_values(content, "")
-        return plain
-
-    def sealed(self) -> tuple[str, str]:
-        """Return the record's ``content_sha256`` and its JSON text, which ends with it; errors as for `to_dict`."""
-        return sealed_text(self._plain())
 
     def to_json(self) -> str:
         """Return the record as JSON text."""
@@ -282,7 +284,7 @@ def plain_values(value: Any, where: str) -> Any:
     if kind is dict or isinstance(value, Mapping):
         return {str(key): plain_values(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        if all_floats(value) and all(map(math.isfinite, value)):
+        if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
             return list(value)
         return [plain_values(item, f"{where}[{index}]") for index, item in enumerate(value)]
     return value
