@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import cumulative_trapezoid, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from imulab.rotation import frame_rotations
+from imulab.rotation import frame_rotations, weighted_turns
 
 EPS = np.finfo(float).eps
 
@@ -103,3 +103,32 @@ def test_rotations_compose_and_are_proper():
 def test_no_time_turns_nothing():
     time = np.arange(5) / 10
     np.testing.assert_array_equal(carried(np.ones((5, 3)), time, 3, 3), np.eye(3))
+
+
+def test_sums_are_those_of_each_step_on_its_own():
+    """The sum of C' x, with C to the middle of each step, against one matrix exponential after the other."""
+    rng = np.random.default_rng(9)
+    rate, step, weights = rng.normal(0, 3, (2, 17, 3)), rng.uniform(0, 0.1, (2, 17)), rng.standard_normal((2, 17, 4))
+    found = weighted_turns(rate, step, weights)
+    for m in range(2):
+        whole, sums = Rotation.identity(), np.zeros((4, 3, 3))
+        for w, dt, x in zip(rate[m], step[m], weights[m], strict=True):
+            middle = (Rotation.from_rotvec(-w * dt / 2) * whole).as_matrix()
+            sums += (x * dt)[:, None, None] * middle.T
+            whole = Rotation.from_rotvec(-w * dt) * whole
+        np.testing.assert_allclose(found.matrix[m], whole.as_matrix(), atol=100 * EPS)
+        np.testing.assert_allclose(found.weighted[m], sums, atol=100 * EPS)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_stays_in_its_segment(bad):
+    rate = np.ones((40, 3))
+    rate[25, 1] = bad
+    turns = frame_rotations(rate, np.arange(40) / 10, np.array([0, 20, 26]), np.array([24, 39, 39]))
+    assert np.isfinite(turns).all(axis=(1, 2)).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, 3), (3, 2), (0, 5)])
+def test_a_segment_beyond_the_samples_is_refused(start, stop):
+    with pytest.raises(ValueError, match="a segment beyond the steps"):
+        carried(np.ones((5, 3)), np.arange(5.0), start, stop)

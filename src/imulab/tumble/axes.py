@@ -14,7 +14,7 @@ from imulab.attitudes import Attitudes
 from imulab.errors import DataError
 from imulab.recording import Array
 from imulab.rotation import frame_rotations
-from imulab.units import parse_unit
+from imulab.units import parse_unit, to_si
 
 _LONGEST_TURN = 20.0  # s; beyond it the drift of a cheap gyroscope counts
 _FEWEST_TURNS = 4
@@ -44,7 +44,7 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
         return
     if any(parse_unit(recording.units[name]).quantity != "rate" for name in names):
         return
-    columns = [recording.si(name) for name in names]
+    columns = [recording.column(name) for name in names]
     if not all(np.isfinite(column).all() for column in columns):
         return
     first = np.unique(pieces[:, 2], return_index=True)[1]
@@ -54,13 +54,14 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
     if np.count_nonzero(short) < _FEWEST_TURNS:
         return
     edges, samples = pieces[:, :2].ravel(), pieces[:, 1] - pieces[:, 0]
-    bias = np.array([np.mean(np.add.reduceat(c[: edges[-1]], edges[:-1])[::2] / samples) for c in columns])
+    bias = [np.mean(np.add.reduceat(c[: edges[-1]], edges[:-1])[::2] / samples) for c in columns]
     start, stop = start[short], stop[short]
     # Only the samples of the turns, one turn behind the other.
     size = stop - start + 1
     begin = np.cumsum(size) - size
-    samples = np.arange(size.sum()) + np.repeat(start - begin, size)
-    rate, when = np.column_stack([column[samples] for column in columns]) - bias, time[samples]
+    turning = np.arange(size.sum()) + np.repeat(start - begin, size)
+    rates = [to_si(c[turning] - b, recording.units[name]) for c, b, name in zip(columns, bias, names, strict=True)]
+    rate, when = np.column_stack(rates), time[turning]
     start, stop = begin, begin + size - 1
     turn = frame_rotations(rate, when, start, stop)
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
