@@ -15,6 +15,7 @@ from imulab.estimate import (
     huber_weights,
     levenberg_marquardt,
     leverage,
+    median,
     observability,
     robust_scale,
 )
@@ -398,3 +399,10 @@ def test_coverage_factors_are_students_and_the_normal_ones():
     assert round(coverage_factor(None, 0.99), 3) == 2.576
     for freedom in (1, 2.5, 29, 1000):
         assert coverage_factor(freedom, 0.9) == pytest.approx(stats.t.ppf(0.95, freedom), rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    "values", [[3.0], [2.0, 1.0], [5.0, 1.0, 2.0], [1.0, np.inf, -np.inf, 0.0], [1.0, np.nan, 2.0]]
+)
+def test_the_median_is_that_of_numpy(values):
+    np.testing.assert_equal(median(np.array(values)), np.median(values))

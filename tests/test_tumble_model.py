@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from imulab.estimate import levenberg_marquardt
-from imulab.tumble.model import fit_lengths, invert, norm_and_jacobian, parameter_names
+from imulab.tumble.model import fit_lengths, invert, length_noise, norm_and_jacobian, parameter_names
 from reference import tumble as reference
 
 G = 9.80665
@@ -34,6 +34,14 @@ def test_nan_stays_in_the_components_it_touches():
     found = invert(reading, np.array([0.01, 0.02, 0.03]), np.full((1, 3), 1e-3)).force
     expected = [[False, False, True], [False, True, True], [True, True, True], [False, False, False]]
     assert np.isnan(found).tolist() == expected
+
+
+def test_an_axis_that_gives_no_such_output_leaves_the_others_alone():
+    """s - s^2 / 4 is 1 at most; the axes are inverted side by side, each for as long as it needs."""
+    k = np.array([[0.0, 0.0, -0.25]])
+    found = invert(np.array([[0.3, -0.7, 0.9], [0.3, -0.7, 1.1]]), np.zeros(3), k).force
+    np.testing.assert_allclose(found[0], [0.3, -0.7, 2 - 2 * np.sqrt(0.1)], rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(found[1], [0.3, -0.7, np.nan])
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
@@ -110,8 +118,39 @@ def test_a_bad_start_and_what_nothing_senses_are_met_alike():
     assert not lost.converged[0]
 
 
+@pytest.mark.parametrize("alike", [True, False])
+def test_noise_of_the_length_is_that_of_the_matrices(alike):
+    rng = np.random.default_rng(6)
+    theta = np.tile([0.0] * 3 + [1.0] * 3 + [0.0] * 6, (4, 1)) + 0.05 * rng.standard_normal((4, 12))
+    reading = reference.random_attitudes(rng, 4 * 7).reshape(4, 7, 3)
+    root = 0.01 * rng.standard_normal((1 if alike else 4, 7, 3, 3))
+    covariance = root @ np.swapaxes(root, 2, 3)
+    jacobian = norm_and_jacobian(theta, reading, 2)[1]
+    lengthening, variance = length_noise(theta, jacobian, covariance)
+    for b in range(4):
+        yx, zx, zy = theta[b, 6:9]
+        carried = np.linalg.inv([[1, 0, 0], [yx, 1, 0], [zx, zy, 1]]) @ np.diag(1 / theta[b, 3:6])
+        for i in range(7):
+            c, q = covariance[0 if alike else b, i], -jacobian[b, i, :3]
+            np.testing.assert_allclose(variance[b, i], q @ c @ q, rtol=1e-13)
+            np.testing.assert_allclose(
+                lengthening[b, i], (np.trace(carried @ c @ carried.T) - q @ c @ q) / 2, rtol=0, atol=1e-13 * np.trace(c)
+            )
+
+
+def test_noise_that_is_not_finite_stays_in_its_attitude():
+    theta = np.array([[0.0] * 3 + [1.0] * 3 + [0.0] * 3])
+    reading = reference.random_attitudes(np.random.default_rng(7), 5)[None]
+    covariance = np.tile(np.eye(3), (1, 5, 1, 1))
+    covariance[0, 2, 1, 1] = np.nan
+    lengthening, variance = length_noise(theta, norm_and_jacobian(theta, reading, 1)[1], covariance)
+    assert np.isfinite(variance[0]).tolist() == np.isfinite(lengthening[0]).tolist() == [True, True, False, True, True]
+
+
 def test_arrays_that_do_not_go_together_are_refused():
     with pytest.raises(ValueError, match="do not go together"):
         norm_and_jacobian(np.zeros((2, 9)), np.zeros((3, 5, 3)), 1)
     with pytest.raises(ValueError, match="do not go together"):
         fit_lengths(np.ones((1, 9)), np.ones((1, 5, 3)), np.ones((1, 4)), np.ones((1, 4)), 1, tolerance=1.0, most=1)
+    with pytest.raises(ValueError, match="do not go together"):
+        length_noise(np.ones((2, 9)), np.ones((2, 5, 9)), np.ones((3, 5, 3, 3)))

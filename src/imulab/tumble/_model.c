@@ -25,44 +25,46 @@ static void polynomial(double s, const double *k, int count, double *value, doub
     *slope = 1.0 + s * (2.0 * v + s * d);
 }
 
-/* The s at which the polynomial is a, and the slope there, by Newton's method; NaN where it turns back before. */
-static double inverted(double a, const double *k, int count, double *slope) {
-    if (count == 0) {
-        *slope = 1.0;
-        return a;
+/* The s at which each axis's polynomial is a, and the slopes there, by Newton's method; NaN where it turns back before.
+ *
+ * The three axes step together: each step waits for a division, and the processor has three to wait for at once. */
+static void inverted(const double *a, const double *k, int count, double *s, double *slope) {
+    double value, size[3];
+    int on_its_way[3] = {count > 0, count > 0, count > 0};
+    for (int i = 0; i < 3; i++) {
+        s[i] = a[i];
+        slope[i] = 1.0;
+        size[i] = CLOSE * fmax(fabs(a[i]), 1.0);
     }
-    const double size = CLOSE * fmax(fabs(a), 1.0);
-    double s = a, value;
-    for (int i = 0; i < NEWTON_STEPS; i++) {
-        polynomial(s, k, count, &value, slope);
-        const double step = (value - a) / *slope;
-        if (!(fabs(step) > size)) {
-            if (!isnan(step) && *slope > 0.0) return s;
-            break;
+    for (int number = 0; number < NEWTON_STEPS && (on_its_way[0] | on_its_way[1] | on_its_way[2]); number++) {
+        for (int i = 0; i < 3; i++) {
+            polynomial(s[i], k + i, count, &value, &slope[i]);
+            const double step = (value - a[i]) / slope[i];
+            on_its_way[i] = fabs(step) > size[i];
+            s[i] -= on_its_way[i] || isnan(step) ? step : 0.0;
         }
-        s -= step;
     }
-    *slope = (double)NAN;
-    return (double)NAN;
+    for (int i = 0; i < 3; i++) {
+        if (on_its_way[i] || isnan(s[i]) || !(slope[i] > 0.0)) s[i] = slope[i] = (double)NAN;
+    }
 }
 
 /* |f| in one attitude, its derivatives (3 (order + 2) of them), and f. */
 static double length(const double *theta, const double *reading, int order, double *derivative, double *f) {
     const double *scale = theta + 3, *m = theta + 6, *k = theta + 9;
     double a[3], s[3], slope[3];
-    for (int i = 0; i < 3; i++) {
-        a[i] = (reading[i] - theta[i]) / scale[i];
-        s[i] = inverted(a[i], k + i, order - 1, &slope[i]);
-    }
+    for (int i = 0; i < 3; i++) a[i] = (reading[i] - theta[i]) / scale[i];
+    inverted(a, k, order - 1, s, slope);
     f[0] = s[0];
     f[1] = s[1] - m[0] * f[0];
     f[2] = s[2] - m[1] * f[0] - m[2] * f[1];
     double norm = sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2]);
     if (norm < DBL_MIN) norm = DBL_MIN;
+    const double per_norm = 1.0 / norm;
     double v[3]; /* T' v = f / |f|, so that d|f| = v . (ds - dT f) */
-    v[2] = f[2] / norm;
-    v[1] = f[1] / norm - m[2] * v[2];
-    v[0] = f[0] / norm - m[0] * v[1] - m[1] * v[2];
+    v[2] = f[2] * per_norm;
+    v[1] = f[1] * per_norm - m[2] * v[2];
+    v[0] = f[0] * per_norm - m[0] * v[1] - m[1] * v[2];
     for (int i = 0; i < 3; i++) {
         const double per_reading = v[i] / slope[i], q = per_reading / scale[i];
         derivative[i] = -q;
@@ -119,6 +121,57 @@ static PyObject *lengths(PyObject *module, PyObject *args) {
     Py_RETURN_NONE;
 }
 
+PyDoc_STRVAR(noise_doc,
+             "noise(theta, jacobian, covariance, lengthening, variance) -> None\n\n"
+             "theta (b, p), jacobian (b, n, p) and the covariance of the outputs (b, n, 3, 3), or (1, n, 3, 3) for all alike,\n"
+             "to the lengthening of |f| by noise and its variance (b, n); float64 buffers without gaps.");
+
+/* d' C d */
+static double quadratic(const double *c, const double *d) {
+    double sum = 0.0;
+    for (int i = 0; i < 3; i++) sum += d[i] * (c[3 * i] * d[0] + c[3 * i + 1] * d[1] + c[3 * i + 2] * d[2]);
+    return sum;
+}
+
+static PyObject *noise(PyObject *module, PyObject *args) {
+    enum { THETA, JACOBIAN, COVARIANCE, LENGTHENING, VARIANCE, BUFFERS };
+    Py_buffer v[BUFFERS];
+    (void)module;
+    if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &v[THETA], &v[JACOBIAN], &v[COVARIANCE], &v[LENGTHENING], &v[VARIANCE])) {
+        return NULL;
+    }
+    const Py_ssize_t one = (Py_ssize_t)sizeof(double), all = v[VARIANCE].len / one;
+    const Py_ssize_t p = all > 0 ? v[JACOBIAN].len / one / all : 0, problems = p > 0 ? v[THETA].len / one / p : 0;
+    const Py_ssize_t n = problems > 0 ? all / problems : 0;
+    const int fits = p >= 9 && n > 0 && v[THETA].len == problems * p * one && all == problems * n &&
+                     v[JACOBIAN].len == all * p * one && v[LENGTHENING].len == v[VARIANCE].len &&
+                     (v[COVARIANCE].len == 9 * n * one || v[COVARIANCE].len == 9 * all * one);
+    if (fits) {
+        const Py_ssize_t next = v[COVARIANCE].len == 9 * all * one ? 9 * n : 0;
+        const double *theta = v[THETA].buf, *derivative = v[JACOBIAN].buf, *covariance = v[COVARIANCE].buf;
+        double *lengthening = v[LENGTHENING].buf, *variance = v[VARIANCE].buf;
+        for (Py_ssize_t b = 0; b < problems; b++, theta += p, covariance += next) {
+            /* df/dM = T^-1 diag(1 / (slope S)); the nonlinearity's slope is 1 to the order that matters here. */
+            const double *scale = theta + 3, *m = theta + 6;
+            const double carried[3][3] = {{1.0 / scale[0], 0.0, 0.0},
+                                          {-m[0] / scale[0], 1.0 / scale[1], 0.0},
+                                          {(m[2] * m[0] - m[1]) / scale[0], -m[2] / scale[1], 1.0 / scale[2]}};
+            for (Py_ssize_t i = 0; i < n; i++, derivative += p) {
+                const double *c = covariance + 9 * i, along = quadratic(c, derivative); /* its first three are -q */
+                const double trace = quadratic(c, carried[0]) + quadratic(c, carried[1]) + quadratic(c, carried[2]);
+                *lengthening++ = (trace - along) / 2.0;
+                *variance++ = along;
+            }
+        }
+    }
+    for (int i = 0; i < BUFFERS; i++) PyBuffer_Release(&v[i]);
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "buffers that do not go together");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 /* What the fit of one problem works on: n observations, p parameters, two evaluations that take turns. */
 typedef struct {
     Py_ssize_t n, p;
@@ -137,19 +190,27 @@ static double evaluate(const Work *w, const double *theta, double *residuals, do
     return cost;
 }
 
-/* Upper triangle of J' W J, and -J' W r where the step will be. */
+/* Upper triangle of J' W J, and -J' W r where the step will be; four attitudes at a time, as its rows are short. */
 static void normal_equations(const Work *w) {
     const Py_ssize_t p = w->p;
     for (Py_ssize_t a = 0; a < p * p; a++) w->normal[a] = 0.0;
     for (Py_ssize_t a = 0; a < p; a++) w->step[a] = 0.0;
-    for (Py_ssize_t i = 0; i < w->n; i++) {
-        const double *row = w->jacobian + i * p;
-        if (w->weights[i] == 0.0) continue;
+    for (Py_ssize_t i = 0; i < w->n; i += 4) {
+        const double *row[4];
+        double weight[4], residual[4];
+        for (Py_ssize_t k = 0; k < 4; k++) {
+            const int there = i + k < w->n;
+            const Py_ssize_t j = there ? i + k : i;
+            row[k] = w->jacobian + j * p, residual[k] = w->residuals[j], weight[k] = there ? w->weights[j] : 0.0;
+        }
         for (Py_ssize_t a = 0; a < p; a++) {
-            const double weighted = row[a] * w->weights[i];
+            const double first = row[0][a] * weight[0], second = row[1][a] * weight[1];
+            const double third = row[2][a] * weight[2], fourth = row[3][a] * weight[3];
             double *into = w->normal + a * p;
-            for (Py_ssize_t b = a; b < p; b++) into[b] += weighted * row[b];
-            w->step[a] -= weighted * w->residuals[i];
+            for (Py_ssize_t b = a; b < p; b++) {
+                into[b] += (first * row[0][b] + second * row[1][b]) + (third * row[2][b] + fourth * row[3][b]);
+            }
+            w->step[a] -= (first * residual[0] + second * residual[1]) + (third * residual[2] + fourth * residual[3]);
         }
     }
 }
@@ -164,22 +225,20 @@ static void damped_step(const Work *w, double damping) {
     }
     const double added = damping > LEAST_DAMPING ? damping : LEAST_DAMPING;
     for (Py_ssize_t a = 0; a < p; a++) {
-        if (!(scale[a] > SENSED * longest)) scale[a] = isnan(scale[a]) ? scale[a] : 0.0;
+        /* From here on 1 / scale, and 0 for what is not sensed. */
+        scale[a] = scale[a] > SENSED * longest || isnan(scale[a]) ? 1.0 / scale[a] : 0.0;
     }
     for (Py_ssize_t a = 0; a < p; a++) {
         const double *from = w->normal + a * p;
-        for (Py_ssize_t b = a; b < p; b++) {
-            const double product = scale[a] * scale[b];
-            u[a * p + b] = product == 0.0 ? 0.0 : from[b] / product;
-        }
+        for (Py_ssize_t b = a; b < p; b++) u[a * p + b] = from[b] * scale[a] * scale[b];
         u[a * p + a] += scale[a] == 0.0 ? 1.0 : added;
-        x[a] = scale[a] == 0.0 ? 0.0 : x[a] / scale[a];
+        x[a] *= scale[a];
     }
     for (Py_ssize_t a = 0; a < p; a++) { /* U' U = H, row by row; U' y = -g beside it */
         double *row = u + a * p;
-        const double pivot = sqrt(row[a]);
-        for (Py_ssize_t b = a; b < p; b++) row[b] /= pivot;
-        x[a] /= pivot;
+        const double per_pivot = 1.0 / sqrt(row[a]);
+        for (Py_ssize_t b = a; b < p; b++) row[b] *= per_pivot;
+        x[a] *= per_pivot;
         for (Py_ssize_t c = a + 1; c < p; c++) {
             double *below = u + c * p;
             const double factor = row[c];
@@ -192,7 +251,7 @@ static void damped_step(const Work *w, double damping) {
         for (Py_ssize_t b = a + 1; b < p; b++) sum -= u[a * p + b] * x[b];
         x[a] = sum / u[a * p + a];
     }
-    for (Py_ssize_t a = 0; a < p; a++) x[a] = scale[a] == 0.0 ? 0.0 : x[a] / scale[a];
+    for (Py_ssize_t a = 0; a < p; a++) x[a] *= scale[a];
 }
 
 /* Levenberg-Marquardt on one problem; returns the number of steps tried. */
@@ -286,6 +345,7 @@ static PyObject *fit(PyObject *module, PyObject *args) {
 }
 
 static PyMethodDef methods[] = {{"lengths", lengths, METH_VARARGS, lengths_doc},
+                                {"noise", noise, METH_VARARGS, noise_doc},
                                 {"fit", fit, METH_VARARGS, fit_doc},
                                 {NULL, NULL, 0, NULL}};
 

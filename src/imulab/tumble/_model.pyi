@@ -10,6 +10,13 @@ def lengths(
     jacobian: NDArray[Any],
     force: NDArray[Any],
 ) -> None: ...
+def noise(
+    theta: NDArray[Any],
+    jacobian: NDArray[Any],
+    covariance: NDArray[Any],
+    lengthening: NDArray[Any],
+    variance: NDArray[Any],
+) -> None: ...
 def fit(
     theta: NDArray[Any],
     reading: NDArray[Any],

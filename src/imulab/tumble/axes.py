@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.errors import DataError
+from imulab.estimate import median
 from imulab.recording import Array
 from imulab.rotation import frame_rotations
 from imulab.units import parse_unit, to_si
@@ -87,7 +88,7 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
 
 def _median_miss(turn: Array, before: Array, after: Array) -> float:
     cosine = np.einsum("mij,mj,mi->m", turn, before, after)
-    return float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+    return median(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def _signed_permutations() -> dict[str, Array]:

@@ -7,6 +7,7 @@ import numpy as np
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.estimate import median
 from imulab.recording import Array
 from imulab.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
 from imulab.tumble.solve import Solution
@@ -46,7 +47,9 @@ def _check_turned(attitudes: Attitudes) -> None:
                     f"expected three different axes"
                 )
     if len(attitudes) >= _ENOUGH_TO_TELL and (span > 0).all():
-        correlation = np.atleast_2d(np.corrcoef(attitudes.mean.T))
+        centred = attitudes.mean - attitudes.mean.mean(axis=0)
+        centred = centred / np.linalg.norm(centred, axis=0)
+        correlation = centred.T @ centred
         for axis, other in ((1, 0), (2, 0), (2, 1)):
             if abs(correlation[axis, other]) > _PROPORTIONAL:
                 raise DataError(
@@ -74,14 +77,15 @@ def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
     unit = parse_unit(attitudes.unit)
     if unit.quantity != "acceleration":
         return
-    found = to_si(float(np.median(np.linalg.norm(attitudes.mean, axis=1))), unit.symbol)
+    lengths = to_si(np.linalg.norm(attitudes.mean, axis=1), unit.symbol)
+    found = median(lengths)
     if not gravity / 2 <= found <= 2 * gravity:
         raise DataError(
             f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
             f"{from_si(found, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
             f"{unit.symbol}: is the unit wrong?"
         )
-    magnitude = to_si(np.linalg.norm(attitudes.mean, axis=1), unit.symbol) / gravity
+    magnitude = lengths / gravity
     far = (magnitude < 1 / _FARTHEST) | (magnitude > _FARTHEST)
     if far.any():
         index = int(np.argmax(far))
@@ -107,7 +111,7 @@ def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) ->
     DataError
         It is off by more than a tenth of g in the median attitude.
     """
-    typical = float(np.median(np.abs(solution.deviations[0])))
+    typical = median(np.abs(solution.deviations[0]))
     if not typical < _WORST_RMS:
         raise DataError(
             f"{attitudes.recording.name}: the calibrated magnitudes miss gravity ({gravity:.5g} m/s^2) by "
@@ -143,7 +147,7 @@ def check_fresh(record: Calibration, residuals: Array, limit: float, gravity: fl
     if gravity is not None and not 0.5 < gravity < 50.0:
         raise OptionError(f"gravity {gravity:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
     local = float(record.model["gravity"]["value"]) if gravity is None else gravity
-    found = float(np.median(residuals)) + local
+    found = median(residuals) + local
     if not local / 2 <= found <= 2 * local:
         raise DataError(
             f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {found:.4g} m/s^2 under the "

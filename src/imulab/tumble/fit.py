@@ -128,8 +128,7 @@ def fit_tumble(
     else:
         chosen = int(order)
     problem = Problem(reading, noise, chosen, robust=loss == "huber", prior=known)
-    solved = choice.solution if choice is not None and known is None else None
-    solution, seen = _solve(problem, attitudes, method, solved)
+    solution, seen = _solve(problem, attitudes, method, choice)
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])
     matrix, freedom = _covariance(problem, solution)
@@ -218,19 +217,15 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 
 
 def _solve(
-    problem: Problem, attitudes: Attitudes, method: str, solved: Solution | None
+    problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None
 ) -> tuple[Solution, Observability]:
-    """Solve the problem, unless the choice of the order has `solved` it by norm, and see what it determines."""
+    """Solve the problem, unless the `choice` of the order has done so by norm, and see what it determines."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
-    if method == "linearised" and n >= size:
-        solution = solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
-    elif solved is not None:
-        solution = solved
+    if method == "norm" and choice is not None:
+        solution, seen = choice.solution, choice.observability
     else:
-        limit = chi_square_limit(n - size if problem.prior is None else n)
-        start = None if problem.prior is None else problem.prior.mean[None]
-        solution = solve_norm(problem, start, limit=limit)
-    seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
+        solution = _solved(problem, attitudes, method)
+        seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
     if seen.rank < size:
         names = parameter_names(problem.order)
         confused = seen.confused(names)
@@ -249,6 +244,15 @@ def _solve(
             f"(condition number {seen.condition:.0f}); use a lower order or more attitudes"
         )
     return solution, seen
+
+
+def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
+    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    if method == "linearised" and n >= size:
+        return solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
+    limit = chi_square_limit(n - size if problem.prior is None else n)
+    start = None if problem.prior is None else problem.prior.mean[None]
+    return solve_norm(problem, start, limit=limit)
 
 
 def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:

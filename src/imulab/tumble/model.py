@@ -106,6 +106,26 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
     return norm, jacobian, force, -jacobian[:, :, 0:3]
 
 
+def length_noise(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the lengthening ``(tr C_f - u' C_f u) / 2`` of |f| by noise, and its variance ``q' C q``, shapes (b, n).
+
+    ``q = d|f|/d reading`` is the negative of the Jacobian's columns for the zero; |f| is 1 to first order.
+
+    Parameters
+    ----------
+    theta, jacobian
+        As for, and from, `norm_and_jacobian`.
+    covariance
+        C, of the outputs, shape (b, n, 3, 3), or (1, n, 3, 3) for all problems alike.
+    """
+    lengthening, variance = np.empty(jacobian.shape[:2]), np.empty(jacobian.shape[:2])
+    _model.noise(
+        np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), np.ascontiguousarray(covariance),
+        lengthening, variance,
+    )  # fmt: skip
+    return lengthening, variance
+
+
 def fit_lengths(
     start: Array, reading: Array, weights: Array, lengthening: Array, order: int, *, tolerance: float, most: int
 ) -> Fit:

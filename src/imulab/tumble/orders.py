@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imulab.estimate import bayesian_information, chi_square_limit, f_test, observability
+from imulab.estimate import Observability, bayesian_information, chi_square_limit, f_test, observability
 from imulab.recording import Array
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count
 from imulab.tumble.solve import Problem, Solution, leave_one_out, solve_norm
@@ -43,11 +43,12 @@ class OrderRow:
 
 @dataclass(frozen=True)
 class OrderChoice:
-    """The table of orders, lowest first, the order that it leads to, and the solution of that order."""
+    """The table of orders, lowest first, the order that it leads to, its solution and what that determines."""
 
     order: int
     rows: tuple[OrderRow, ...]
-    solution: Solution | None
+    solution: Solution
+    observability: Observability
 
 
 def choose_order(problem: Problem, gravity: float) -> OrderChoice:
@@ -60,7 +61,7 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
     Parameters
     ----------
     problem
-        Attitudes of one unit (a batch of one); its order is ignored.
+        Attitudes of one unit (a batch of one), as many as order 1 has parameters or more; its order is ignored.
     gravity
         Magnitude of gravity, m/s^2, the scale of the figures in the table.
     """
@@ -72,6 +73,7 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
             fits[order] = trial, solve_norm(trial, limit=chi_square_limit(n - parameter_count(order)))
     smallest = min((fit.excess[0] for order, (_, fit) in fits.items() if order <= 2), default=0.0)
     rows: list[OrderRow] = []
+    seen = {order: observability(fit.jacobian[0], absolute_weights(trial, fit)) for order, (trial, fit) in fits.items()}
     chosen = 1
     best = np.inf
     costs: dict[int, float] = {}
@@ -79,20 +81,19 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
         size = parameter_count(order)
         common = 1 / (fit.own_variance[0] + smallest**2)
         costs[order] = float((fit.down_weights[0] * common * fit.residuals[0] ** 2).sum())
-        row = _row(trial, fit, costs, gravity)
+        row = _row(trial, fit, seen[order], costs, gravity)
         rows.append(row)
         better = row.leave_one_out is not None and row.leave_one_out < best
         level = _SIGNIFICANT if order <= 2 else _SIGNIFICANT_BEYOND
         significant = order == 1 or f_test(costs[chosen], parameter_count(chosen), costs[order], size, n) < level
         if row.observable and better and significant:
             chosen, best = order, row.leave_one_out or np.inf
-    return OrderChoice(chosen, tuple(rows), fits[chosen][1] if chosen in fits else None)
+    return OrderChoice(chosen, tuple(rows), fits[chosen][1], seen[chosen])
 
 
-def _row(problem: Problem, fit: Solution, costs: dict[int, float], gravity: float) -> OrderRow:
+def _row(problem: Problem, fit: Solution, seen: Observability, costs: dict[int, float], gravity: float) -> OrderRow:
     order = problem.order
     size, n = parameter_count(order), problem.reading.shape[1]
-    seen = observability(fit.jacobian[0], absolute_weights(problem, fit))
     predicted: float | None = None
     if n > size:
         errors = leave_one_out(problem, fit)

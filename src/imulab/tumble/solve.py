@@ -23,7 +23,7 @@ from imulab.estimate import (
     robust_scale,
 )
 from imulab.recording import Array
-from imulab.tumble.model import fit_lengths, norm_and_jacobian, parameter_count
+from imulab.tumble.model import fit_lengths, length_noise, norm_and_jacobian, parameter_count
 
 _SCALE_CHANGE = 5e-6
 _BIAS_CHANGE = 2e-6
@@ -35,6 +35,7 @@ _DIVERGED = 0.98
 """A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
 _REFIT_STEPS = 15  # without one attitude of many the solution is near; what wanders for longer is not determined
 _REFIT_AT_MOST = 150
+_REFIT_TOLERANCE = 1e-7  # the next step would be a thousandth of it, or less
 
 
 @dataclass(frozen=True)
@@ -253,35 +254,12 @@ def _mean_square(fit: Fit, down: Array, size: int) -> Array:
 
 
 def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tuple[Array, Array]:
-    """Lengthening ``(tr C_f - u' C_f u) / 2`` of |f| by noise, and its variance ``q' C q``, shapes (b, n).
-
-    ``q = d|f|/d reading`` is the negative of the Jacobian's columns for the zero; |f| is 1 to first order.
-    """
-    count, n, _ = problem.reading.shape
+    """Lengthening of |f| by noise, and its variance, shapes (b, n)."""
     if problem.covariance is None:
-        return np.zeros((count, n)), np.ones((count, n))
+        return np.zeros(problem.reading.shape[:2]), np.ones(problem.reading.shape[:2])
     if jacobian is None:
         jacobian = norm_and_jacobian(theta, problem.reading, problem.order)[1]
-    q = -jacobian[:, :, 0:3]
-    covariance = problem.covariance
-    if len(covariance) != count:
-        covariance = np.broadcast_to(covariance, (count, n, 3, 3))
-    along = np.einsum("bni,bnij,bnj->bn", q, covariance, q)
-    # df/dM = T^-1 diag(1 / (slope S)); the nonlinearity's slope is 1 to the order that matters here
-    carried = _unalign(theta[:, 6:9]) / theta[:, None, 3:6]
-    trace = np.einsum("bij,bnij->bn", carried.transpose(0, 2, 1) @ carried, covariance)
-    return (trace - along) / 2, along
-
-
-def _unalign(misalignment: Array) -> Array:
-    """T^-1 of each problem, shape (b, 3, 3)."""
-    inverse = np.zeros((len(misalignment), 3, 3))
-    inverse[:, 0, 0] = inverse[:, 1, 1] = inverse[:, 2, 2] = 1.0
-    yx, zx, zy = misalignment.T
-    inverse[:, 1, 0] = -yx
-    inverse[:, 2, 0] = zy * yx - zx
-    inverse[:, 2, 1] = -zy
-    return inverse
+    return length_noise(theta, jacobian, problem.covariance)
 
 
 def forces(problem: Problem, solution: Solution) -> Array:
@@ -302,7 +280,7 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
     lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
     start = np.repeat(solution.theta, n, axis=0)
-    fit = _least_squares(problem, start, weights, lengthening, max_iterations=_REFIT_STEPS)
+    fit = _least_squares(problem, start, weights, lengthening, _REFIT_TOLERANCE, _REFIT_STEPS)
     return np.diagonal(fit.residuals)
 
 
