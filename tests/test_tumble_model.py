@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from imulab.estimate import levenberg_marquardt
-from imulab.tumble.model import fit_lengths, invert, length_noise, norm_and_jacobian, parameter_names
+from imulab.tumble.model import (
+    fit_lengths,
+    invert,
+    left_out_lengths,
+    length_noise,
+    norm_and_jacobian,
+    parameter_names,
+)
 from reference import tumble as reference
 
 G = 9.80665
@@ -154,3 +161,36 @@ def test_arrays_that_do_not_go_together_are_refused():
         fit_lengths(np.ones((1, 9)), np.ones((1, 5, 3)), np.ones((1, 4)), np.ones((1, 4)), 1, tolerance=1.0, most=1)
     with pytest.raises(ValueError, match="do not go together"):
         length_noise(np.ones((2, 9)), np.ones((2, 5, 9)), np.ones((3, 5, 3, 3)))
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_attitudes_left_out_one_by_one_are_predicted_by_fits_to_the_others(order):
+    rng = np.random.default_rng(30 + order)
+    start = np.array([[0.0] * 3 + [1.0] * 3 + [0.0] * (3 * order)])
+    reading = reference.random_attitudes(rng, 26)[None] * 1.01 + 0.01 + 1e-3 * rng.standard_normal((1, 26, 3))
+    weights, lengthening = rng.uniform(0.5, 2.0, (1, 26)), rng.uniform(0, 1e-4, (1, 26))
+
+    def model(theta, index):
+        norm, jacobian, _, _ = norm_and_jacobian(theta, reading, order)
+        return norm - 1 - lengthening, jacobian
+
+    start = levenberg_marquardt(model, start, weights).parameters
+    found = left_out_lengths(start, reading, weights, lengthening, order, tolerance=1e-9, most=60)
+    others = weights * (1 - np.eye(26))
+    expected = levenberg_marquardt(model, np.repeat(start, 26, axis=0), others)
+    np.testing.assert_allclose(found, np.diagonal(expected.residuals), rtol=0, atol=2e-8)
+    for most in (0, 1, 2):
+        cut = levenberg_marquardt(model, np.repeat(start, 26, axis=0), others, max_iterations=most)
+        found = left_out_lengths(start, reading, weights, lengthening, order, tolerance=1e-9, most=most)
+        np.testing.assert_allclose(found, np.diagonal(cut.residuals), rtol=0, atol=1e-10)
+
+
+def test_an_attitude_that_is_not_finite_spoils_its_predictions_and_no_more():
+    reading = reference.random_attitudes(np.random.default_rng(8), 12)[None].copy()
+    reading[0, 3, 1] = np.nan
+    start, ones = np.array([[0.0] * 3 + [1.0] * 3 + [0.0] * 3]), np.ones((1, 12))
+    found = left_out_lengths(start, reading, ones, 0 * ones, 1, tolerance=1e-9, most=15)
+    # With a residual that is no number no step is better than the start.
+    np.testing.assert_array_equal(found, norm_and_jacobian(start, reading, 1)[0][0] - 1)
+    with pytest.raises(ValueError, match="do not go together"):
+        left_out_lengths(start, reading, ones, np.ones((1, 11)), 1, tolerance=1e-9, most=15)

@@ -30,3 +30,13 @@ def fit(
     iterations: NDArray[Any],
     converged: NDArray[Any],
 ) -> None: ...
+def left_out(
+    theta: NDArray[Any],
+    reading: NDArray[Any],
+    weights: NDArray[Any],
+    lengthening: NDArray[Any],
+    order: int,
+    tolerance: float,
+    most: int,
+    errors: NDArray[Any],
+) -> None: ...

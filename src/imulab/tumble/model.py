@@ -149,3 +149,21 @@ def fit_lengths(
         tolerance, most, residuals, jacobian, iterations, converged,
     )  # fmt: skip
     return Fit(theta, residuals, jacobian, weights, iterations, converged)
+
+
+def left_out_lengths(
+    start: Array, reading: Array, weights: Array, lengthening: Array, order: int, *, tolerance: float, most: int
+) -> Array:
+    """Return ``|f| - 1 - lengthening`` of each attitude under the fit to all others, shape (n,), for a batch of one.
+
+    Parameters
+    ----------
+    start, reading, weights, lengthening, order, tolerance, most
+        As for `fit_lengths`, a batch of one; all n fits start alike.
+    """
+    errors = np.empty(weights.shape[1])
+    _model.left_out(
+        np.ascontiguousarray(start), np.ascontiguousarray(reading), np.ascontiguousarray(weights),
+        np.ascontiguousarray(lengthening), order, tolerance, most, errors,
+    )  # fmt: skip
+    return errors

@@ -23,7 +23,7 @@ from imulab.estimate import (
     robust_scale,
 )
 from imulab.recording import Array
-from imulab.tumble.model import fit_lengths, length_noise, norm_and_jacobian, parameter_count
+from imulab.tumble.model import fit_lengths, left_out_lengths, length_noise, norm_and_jacobian, parameter_count
 
 _SCALE_CHANGE = 5e-6
 _BIAS_CHANGE = 2e-6
@@ -270,18 +270,17 @@ def forces(problem: Problem, solution: Solution) -> Array:
 def leave_one_out(problem: Problem, solution: Solution) -> Array:
     """Return the error |f| - 1 of each attitude under the fit to all others, shape (n,), for a batch of one.
 
-    Each of the n refits is one problem of a batch, with the weights of the whole fit and one of them set to zero.
-    Beyond some hundred attitudes no single one moves the fit, and the linear formula r / (1 - h) is exact enough.
+    The n refits have the weights of the whole fit and no prior. Beyond some hundred attitudes no single one moves the
+    fit, and the linear formula r / (1 - h) is exact enough.
     """
-    n = problem.reading.shape[1]
-    if n > _REFIT_AT_MOST:
+    if problem.reading.shape[1] > _REFIT_AT_MOST:
         errors: Array = (solution.residuals / (1 - leverage(solution.jacobian, solution.weights)))[0]
         return errors
-    weights = np.broadcast_to(solution.weights[0], (n, n)) * (1 - np.eye(n))
-    lengthening = np.broadcast_to(solution.deviations[0] - solution.residuals[0], (n, n))
-    start = np.repeat(solution.theta, n, axis=0)
-    fit = _least_squares(problem, start, weights, lengthening, _REFIT_TOLERANCE, _REFIT_STEPS)
-    return np.diagonal(fit.residuals)
+    lengthening = solution.deviations - solution.residuals
+    return left_out_lengths(
+        solution.theta, problem.reading, solution.weights, lengthening, problem.order,
+        tolerance=_REFIT_TOLERANCE, most=_REFIT_STEPS,
+    )  # fmt: skip
 
 
 def solve_linearised(problem: Problem, name: str, limit: float = np.inf) -> Solution:

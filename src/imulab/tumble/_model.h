@@ -1,0 +1,17 @@
+/* What the two halves of the module share: _model.c has the model, _fit.c its least squares. */
+#ifndef IMULAB_MODEL_H
+#define IMULAB_MODEL_H
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+
+/* |f| in one attitude, its derivatives (3 (order + 2) of them), and f. */
+double length(const double *theta, const double *reading, int order, double *derivative, double *f);
+
+/* The methods `fit` and `left_out`. */
+extern const char fit_doc[], left_out_doc[];
+PyObject *fit(PyObject *module, PyObject *args);
+PyObject *left_out(PyObject *module, PyObject *args);
+
+#endif
