@@ -61,6 +61,11 @@ static Decimal shortest(uint64_t bits) {
     return (Decimal){s + (uint64_t)(vb > middle || (vb == middle && (s & 1) != 0)), k};
 }
 
+/* 00 to 99 */
+static const char pairs[] = "00010203040506070809101112131415161718192021222324252627282930313233343536373839404142434445464748"
+                            "49505152535455565758596061626364656667686970717273747576777879808182838485868788899091929394959697"
+                            "9899";
+
 static char *repeated(char *out, char c, int count) {
     for (int i = 0; i < count; i++) *out++ = c;
     return out;
@@ -84,14 +89,23 @@ char *print_number(double value, char *out) {
         return out + 3;
     }
     Decimal d = shortest(magnitude);
+    if (d.digits % 100000000 == 0) { /* as what was typed ends: many zeros, taken off at once */
+        d.digits /= 100000000;
+        d.exponent += 8;
+    }
     while (d.digits % 10 == 0) {
         d.digits /= 10;
         d.exponent++;
     }
-    char text[20];
-    int count = 0;
-    for (uint64_t rest = d.digits; rest != 0; rest /= 10) text[sizeof text - 1 - (size_t)count++] = (char)('0' + rest % 10);
-    const char *digits = text + sizeof text - count;
+    char text[20], *digits = text + sizeof text;
+    uint64_t rest = d.digits;
+    while (rest >= 10) {
+        digits -= 2;
+        memcpy(digits, pairs + 2 * (rest % 100), 2);
+        rest /= 100;
+    }
+    if (rest > 0) *--digits = (char)('0' + rest);
+    const int count = (int)(text + sizeof text - digits);
     const int point = count + d.exponent; /* digits before the decimal point */
     if (point > -4 && point <= 16) {
         if (point <= 0) {
