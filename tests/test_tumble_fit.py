@@ -260,6 +260,23 @@ def test_unknown_options_are_refused_with_what_there_is(options, message):
         fit(data, **({"order": 1} | options))
 
 
+def test_linearised_that_ends_where_the_model_cannot_be_inverted_says_so():
+    rng = np.random.default_rng(257)
+    data = G * (reference.random_attitudes(rng, 24) + 0.4 * rng.standard_normal((24, 3)))
+    with pytest.raises(DataError, match=r"no specific force leads to some of these attitudes; use --method norm"):
+        fit(data, 3, method="linearised")
+
+
+@pytest.mark.parametrize("order", [1, "auto"])
+def test_huber_on_as_many_attitudes_as_parameters_leaves_nothing_to_weigh_with(order):
+    """Residuals that are zero to the last bit: no scale, and no division by it."""
+    data = np.vstack([np.eye(3), -np.eye(3), [[0.6, 0.8, 0.0], [0.6, 0.0, 0.8], [0.0, 0.6, 0.8]]])
+    found = fit(data, order, unit="g", loss="huber")
+    assert found.observability.rank == 9
+    assert not found.residuals.any()
+    assert "leave nothing to estimate the noise from" in " ".join(found.calibration.warnings)
+
+
 def test_linearised_that_does_not_converge_says_so():
     rng = np.random.default_rng(91)
     truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)} | {"bias_x": 0.9 * G}

@@ -118,7 +118,7 @@ def _row(problem: Problem, fit: Solution, seen: Observability, costs: dict[int, 
 
 def absolute_weights(problem: Problem, fit: Solution) -> Array:
     """Weights in true inverse variances, shape (n,): where noise is unknown, its level comes from the residuals."""
-    weights: Array = fit.weights[0] / fit.scale[0] ** 2
+    weights: Array = fit.weights[0] / max(fit.scale[0] ** 2, _ROUNDING)  # as many attitudes as parameters leave nothing
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if problem.covariance is None and n > size and not problem.robust:
         mean_square = float((weights * fit.residuals[0] ** 2).sum()) / (n - size)

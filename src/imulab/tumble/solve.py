@@ -292,18 +292,18 @@ def solve_linearised(problem: Problem, name: str, limit: float = np.inf) -> Solu
     Raises
     ------
     DataError
-        The iteration does not converge.
+        The iteration does not converge, or ends where the model cannot be inverted.
     """
     _, own = _noise(problem, start_parameters(problem.order))
     theta, passes = _linearised_iteration(problem, own[0], name)
-    solution = _evaluated(problem, theta, passes)
+    solution = _evaluated(problem, theta, passes, name)
     chi_square = float((solution.residuals**2 / solution.own_variance).sum())
     if problem.covariance is None or chi_square <= limit:
         return solution
     n, size = problem.reading.shape[1], theta.shape[1]
     excess = excess_variance(solution.residuals, solution.own_variance, max(n - size, 1))
     theta, passes = _linearised_iteration(problem, solution.own_variance[0] + excess, name)
-    solution = _evaluated(problem, theta, passes)
+    solution = _evaluated(problem, theta, passes, name)
     return replace(solution, variance=solution.own_variance + excess[:, None], excess=np.sqrt(excess))
 
 
@@ -340,9 +340,14 @@ def _linearised_iteration(problem: Problem, variance: Array, name: str) -> tuple
     )
 
 
-def _evaluated(problem: Problem, theta: Array, iterations: int) -> Solution:
-    """Wrap given parameters as a solution."""
+def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> Solution:
+    """Wrap parameters of the linearised iteration as a solution."""
     norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, problem.order)
+    if not np.isfinite(norm).all():
+        raise DataError(
+            f"{name}: method linearised ends at a nonlinearity under which no specific force leads to some of these "
+            "attitudes; use --method norm"
+        )
     lengthening, own = _noise(problem, theta, jacobian)
     n = norm.shape[1]
     return Solution(
