@@ -114,3 +114,17 @@ def test_the_command_and_its_report(imulab, tmp_path):
     assert refused.returncode == 2
     assert refused.stderr == "imulab: --monte-carlo 'many': expected a whole number\n"
     assert not (tmp_path / "u.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--monte-carlo", "0"], "monte-carlo 0: expected 1000 to 10000000 trials"),
+        (["--monte-carlo", "2000", "--method", "linearised"], "monte-carlo needs method norm, found method linearised"),
+        (["--monte-carlo", "2000", "--prior", "p.json"], "monte-carlo draws the attitudes anew, not a prior"),
+    ],
+)
+def test_trials_that_cannot_be_are_refused_before_the_recording_is_read(imulab, options, words):
+    refused = imulab("tumble", "fit", "there_is_no_such_file.csv", *options)
+    assert refused.returncode == 2
+    assert words in refused.stderr

@@ -134,8 +134,8 @@ def test_the_order_is_that_of_the_prior():
     [
         ({"method": "linearised"}, {}, OptionError, "a prior needs method norm and loss square"),
         ({"loss": "huber"}, {}, OptionError, "a prior needs method norm and loss square"),
-        ({"monte_carlo": 1000}, {}, OptionError, "no prior"),
-        ({}, {"stated": False}, OptionError, "a prior needs the noise of the attitudes"),
+        ({"monte_carlo": 1000}, {}, OptionError, "monte-carlo draws the attitudes anew, not a prior"),
+        ({}, {"stated": False}, OptionError, ": a prior needs the noise of the attitudes"),
         ({}, {"unit": "V"}, RecordError, r"the prior has outputs in m/s\^2, the recording in V"),
     ],
 )

@@ -31,7 +31,10 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "layout": texts.get("layout"),
         "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
     }
-    check_options(values["order"], values["method"], values["loss"])
+    check_options(
+        values["order"], values["method"], values["loss"],
+        monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None,
+    )  # fmt: skip
     return values
 
 

@@ -23,7 +23,7 @@ from imulab.tumble.advice import helpful_attitudes
 from imulab.tumble.axes import check_axes
 from imulab.tumble.checks import check_attitudes, check_residuals
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
-from imulab.tumble.montecarlo import propagate
+from imulab.tumble.montecarlo import check_trials, propagate
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
 from imulab.tumble.record import Gravity, Scaling, make_record, prior_of
 from imulab.tumble.solve import Problem, Solution, data_freedom, forces, informed_rows, solve_linearised, solve_norm
@@ -108,7 +108,7 @@ def fit_tumble(
     RecordError
         The prior lacks a parameter, or has outputs in another unit.
     """
-    check_options(order, method, loss)
+    check_options(order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None)
     local = _gravity(gravity)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
@@ -119,7 +119,7 @@ def fit_tumble(
     choice: OrderChoice | None = None
     known = None
     if prior is not None:
-        order = _prior_order(prior, order, method, loss, attitudes)
+        order = _prior_order(prior, order, attitudes)
         known = prior_of(prior, scaling, local.value, attitudes.unit)
     if order == "auto":
         if len(attitudes) >= parameter_count(1):
@@ -134,9 +134,10 @@ def fit_tumble(
     matrix, freedom = _covariance(problem, solution)
     trials = None
     if monte_carlo is not None:
-        if matrix is None or method != "norm" or known is not None:
+        if matrix is None:
             raise OptionError(
-                "monte-carlo needs method norm, no prior, and more attitudes than parameters or stated deviations"
+                f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
+                f"columns); found {len(attitudes)} attitudes for {parameter_count(chosen)} parameters"
             )
         trials = propagate(problem, solution, trials=monte_carlo, freedom=freedom, progress=progress)
     record = make_record(
@@ -163,7 +164,9 @@ def fit_tumble(
     )
 
 
-def check_options(order: int | str, method: str, loss: str) -> None:
+def check_options(
+    order: int | str, method: str, loss: str, *, monte_carlo: int | None = None, with_prior: bool = False
+) -> None:
     """Check what can be checked before there is data.
 
     Raises
@@ -180,17 +183,25 @@ def check_options(order: int | str, method: str, loss: str) -> None:
         raise OptionError(f"loss {loss!r}: expected one of {' '.join(LOSSES)}")
     if loss == "huber" and method == "linearised":
         raise OptionError("loss huber needs method norm, found method linearised")
+    if with_prior and (method != "norm" or loss != "square"):
+        raise OptionError(f"a prior needs method norm and loss square, found method {method} and loss {loss}")
+    if monte_carlo is None:
+        return
+    check_trials(monte_carlo)
+    if method != "norm":
+        raise OptionError(f"monte-carlo needs method norm, found method {method}")
+    if with_prior:
+        raise OptionError("monte-carlo draws the attitudes anew, not a prior: expected one of the two options")
 
 
-def _prior_order(prior: Calibration, order: int | str, method: str, loss: str, attitudes: Attitudes) -> int:
+def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:
     """Return the order of the prior, which is that of the fit."""
     if prior.procedure != "tumble" or not prior.covariance.names:
         raise OptionError("prior: expected a tumble record that states uncertainties")
-    if method != "norm" or loss != "square":
-        raise OptionError("a prior needs method norm and loss square")
     if attitudes.covariance is None:
         raise OptionError(
-            "a prior needs the noise of the attitudes, to be weighed against: a recording, or std_* columns"
+            f"{attitudes.recording.name}: a prior needs the noise of the attitudes, to be weighed against: a "
+            "recording, or std_* columns"
         )
     own = int(prior.model["order"])
     if order not in ("auto", own):

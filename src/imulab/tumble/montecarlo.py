@@ -36,6 +36,18 @@ class MonteCarlo:
     failed: int
 
 
+def check_trials(trials: int) -> None:
+    """Check the number of trials.
+
+    Raises
+    ------
+    OptionError
+        Too few or too many.
+    """
+    if not FEWEST_TRIALS <= trials <= MOST_TRIALS:
+        raise OptionError(f"monte-carlo {trials}: expected {FEWEST_TRIALS} to {MOST_TRIALS} trials")
+
+
 def propagate(
     problem: Problem,
     solution: Solution,
@@ -65,8 +77,7 @@ def propagate(
     OptionError
         Too few or too many trials.
     """
-    if not FEWEST_TRIALS <= trials <= MOST_TRIALS:
-        raise OptionError(f"monte-carlo {trials}: expected {FEWEST_TRIALS} to {MOST_TRIALS} trials")
+    check_trials(trials)
     rng = np.random.default_rng(seed)
     covariance = _noise(problem, solution)
     root = np.linalg.cholesky(covariance)
