@@ -11,11 +11,12 @@ digital simulation, Management Science 24 (1978) 510.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab import _segment
 from imulab.attitudes import Attitudes, Trace
 from imulab.clipping import check_clipped_rows, check_clipping
 from imulab.errors import SegmentError, UnitError
@@ -59,11 +60,12 @@ class _Blocks:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """Static stretches in blocks, half-open, and the attitude that each belongs to."""
+    """Static stretches in blocks, half-open, the attitude that each belongs to, and the attitudes' means (n, 3)."""
 
     start: NDArray[np.int64]
     stop: NDArray[np.int64]
-    attitude: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    attitude: NDArray[np.int64]
+    mean: Array
 
 
 def find_attitudes(
@@ -144,7 +146,7 @@ def find_attitudes(
     trim = int(np.ceil(settling / blocks.duration))
     fewest = max(2, int(np.ceil(shortest / blocks.duration)))
     candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
-    best = _choose(candidates, blocks)
+    best = _choose(candidates)
     trace = _trace(variance, time, blocks, width, _THRESHOLDS[best] * quiet, quiet)
     pieces = candidates[best]
     if not pieces.start.size:
@@ -240,118 +242,66 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
     step = float(usual.mean())
     length = max(_SMALLEST_BLOCK, round(min(_BLOCK_SECONDS, window / 3) / step))
     count = len(time) // length
-    mean, scatter = np.empty((count, 3)), np.empty((count, 3))
-    for axis, name in enumerate(names):
-        samples = recording.column(name)[: count * length].reshape(count, length)
-        mean[:, axis] = samples.mean(axis=1)
-        deviation = samples - mean[:, axis, None]
-        scatter[:, axis] = np.einsum("ij,ij->i", deviation, deviation) / length
-    largest = np.append(steps, 0.0)[: count * length].reshape(count, length).max(axis=1, initial=0.0)
-    return _Blocks(mean, scatter, length, length * step, largest > max(_GAP_SECONDS, _GAP_STEPS * step))
+    mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
+    _segment.blocks(x, y, z, np.ascontiguousarray(time), length, mean, scatter, longest)
+    return _Blocks(mean, scatter, length, length * step, longest > max(_GAP_SECONDS, _GAP_STEPS * step))
 
 
 def _window_variance(blocks: _Blocks, width: int) -> Array:
     """Variance of each window of `width` blocks, summed over the axes; infinite across a gap in time."""
-    count = len(blocks.mean) - width + 1
-    windows = [slice(k, k + count) for k in range(width)]
-    centre = sum(blocks.mean[w] for w in windows) / width
-    within = sum(blocks.scatter[w] for w in windows) / width
-    between = sum((blocks.mean[w] - centre) ** 2 for w in windows) / width
-    variance: Array = np.sum(within + between, axis=1)
-    broken = np.convolve(blocks.broken, np.ones(width), mode="valid") > 0
-    variance[broken] = np.inf
+    variance = np.empty(len(blocks.mean) - width + 1)
+    _segment.windows(blocks.mean, blocks.scatter, blocks.broken, width, variance)
     return variance
 
 
-def _stretches(quiet: NDArray[np.bool_], width: int, trim: int, fewest: int) -> _Pieces:
-    """Blocks covered by a quiet window, as stretches without their settling edges."""
-    edges = np.zeros(len(quiet) + width, dtype=np.int64)
-    edges[: len(quiet)] += quiet
-    edges[width:] -= quiet
-    static = np.concatenate([[False], np.cumsum(edges) > 0, [False]])
-    change = np.flatnonzero(static[1:] != static[:-1])
-    start, stop = change[::2] + trim, np.minimum(change[1::2], len(quiet) + width - 1) - trim
-    keep = stop - start >= fewest
-    return _Pieces(start[keep], stop[keep])
-
-
 def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
-    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches."""
-    found: dict[bytes, _Pieces] = {}
-    candidates = []
+    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches.
+
+    Those are neighbours: what is quiet under one threshold is so under the next.
+    """
+    candidates: list[_Pieces] = []
+    start, stop = np.empty((2, len(variance)), dtype=np.int64)
     for factor in _THRESHOLDS:
-        pieces = _stretches(variance <= factor * quiet, width, trim, fewest)
-        key = pieces.start.tobytes() + pieces.stop.tobytes()
-        if key not in found:
-            found[key] = _merge(pieces, blocks)
-        candidates.append(found[key])
+        count = _segment.stretches(variance, factor * quiet, width, trim, fewest, start, stop)
+        last = candidates[-1] if candidates else None
+        if last is None or not (np.array_equal(start[:count], last.start) and np.array_equal(stop[:count], last.stop)):
+            last = _merge(start[:count].copy(), stop[:count].copy(), blocks)
+        candidates.append(last)
     return candidates
 
 
-def _piece_means(pieces: _Pieces, blocks: _Blocks) -> Array:
-    """Mean of the blocks of each stretch, shape (pieces, 3)."""
-    bounds = np.column_stack([pieces.start, pieces.stop]).ravel()
-    sums = np.add.reduceat(np.vstack([blocks.mean, np.zeros((1, 3))]), bounds, axis=0)[::2]
-    mean: Array = sums / (pieces.stop - pieces.start)[:, None]
-    return mean
-
-
-def _merge(pieces: _Pieces, blocks: _Blocks) -> _Pieces:
+def _merge(start: NDArray[np.int64], stop: NDArray[np.int64], blocks: _Blocks) -> _Pieces:
     """Number the attitudes: neighbouring stretches with the same mean are one attitude that was interrupted."""
-    if not pieces.start.size:
-        return pieces
-    mean = _piece_means(pieces, blocks)
-    radius = np.ptp(mean, axis=0).max() / 2
-    new = np.linalg.norm(np.diff(mean, axis=0), axis=1) > _SAME_ATTITUDE * radius
-    return _Pieces(pieces.start, pieces.stop, np.concatenate([[0], np.cumsum(new)]))
+    attitude, mean = np.empty(len(start), dtype=np.int64), np.empty((len(start), 3))
+    count = _segment.attitudes(blocks.mean, start, stop, _SAME_ATTITUDE, attitude, mean)
+    return _Pieces(start, stop, attitude, mean[:count])
 
 
-def _attitude_means(pieces: _Pieces, blocks: _Blocks) -> Array:
-    first = np.unique(pieces.attitude, return_index=True)[1]
-    size = (pieces.stop - pieces.start).astype(np.float64)
-    sums = np.add.reduceat(_piece_means(pieces, blocks) * size[:, None], first, axis=0)
-    mean: Array = sums / np.add.reduceat(size, first)[:, None]
-    return mean
+def _choose(candidates: list[_Pieces]) -> int:
+    """Index of the threshold whose attitudes predict each other best, among those that find enough.
 
-
-def _choose(candidates: list[_Pieces], blocks: _Blocks) -> int:
-    """Index of the threshold whose attitudes predict each other best, among those that find enough."""
-    counts = np.array([pieces.attitude[-1] + 1 if pieces.attitude.size else 0 for pieces in candidates])
+    An ellipsoid ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude
+    predicted from all others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the
+    radius.
+    """
+    counts = np.array([len(pieces.mean) for pieces in candidates])
     enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * np.median(counts[counts > 0])))) if counts.any() else 0)
     known: dict[int, float] = {}
     errors = []
     for pieces, count in zip(candidates, counts, strict=True):
         if id(pieces) not in known:
             usable = count >= max(enough, 1)
-            known[id(pieces)] = _ellipsoid_error(_attitude_means(pieces, blocks)) if usable else np.inf
+            known[id(pieces)] = _segment.ellipsoid_error(pieces.mean) if usable else np.inf
         errors.append(known[id(pieces)])
     if np.isfinite(errors).any():
         return int(np.argmin(errors))
     return int(np.argmax(counts))
 
 
-def _ellipsoid_error(mean: Array) -> float:
-    """Leave-one-out error of an ellipsoid through the attitude means, as a fraction of its radius.
-
-    ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude predicted from all
-    others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the radius.
-    """
-    if len(mean) < 11:
-        return np.inf
-    centre = (mean.max(axis=0) + mean.min(axis=0)) / 2
-    x, y, z = ((mean - centre) / (np.ptp(mean, axis=0).max() / 2)).T
-    design = np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x, x, y, z])
-    q, r = np.linalg.qr(design)
-    if np.abs(np.diag(r)).min() < 1e-6 * np.abs(np.diag(r)).max():
-        return np.inf
-    leverage = np.einsum("ij,ij->i", q, q)
-    residual = 1 - q @ q.sum(axis=0)
-    return float(np.sqrt(np.mean((residual / np.maximum(1 - leverage, 1e-9)) ** 2)) / 2)
-
-
 def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """Mean, its covariance by batch means, and number of samples of each attitude; noise of each axis, shape (3,)."""
-    mean = _attitude_means(pieces, blocks)
+    mean = pieces.mean
     count = len(mean)
     size = pieces.stop - pieces.start
     total = np.bincount(pieces.attitude, size, count)
