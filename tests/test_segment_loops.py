@@ -103,6 +103,34 @@ def test_the_attitudes_of_a_recording_are_the_best_of_the_plain_sweep(moved):
     assert found.trace.threshold == pytest.approx(sweep[best][3] * quiet, rel=1e-9)
 
 
+@pytest.mark.parametrize("size", [1, 3, 7])
+def test_batches_are_those_of_the_plain_form(size):
+    mean, _, _ = walk(3)
+    found = [(k, k + 7 + k % 5) for k in range(0, 380, 13)]
+    number = [k // 2 for k in range(len(found))]
+    first, counts, scatters = reference.batches(mean, found, number, size)
+    start, stop = np.array(found).T.astype(np.int64).copy()
+    ours = np.empty(len(first), dtype=np.int64), np.empty((len(first), 3))
+    many, scatter = np.empty(len(counts), dtype=np.int64), np.empty((len(counts), 3, 3))
+    _segment.batches(mean, start, stop, np.array(number), size, *ours, many, scatter)
+    assert (ours[0].tolist(), many.tolist()) == (first, counts)
+    np.testing.assert_allclose(ours[1], [mean[at : at + size].mean(axis=0) for at in first], rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(scatter, scatters, rtol=1e-10, atol=1e-12)
+
+
+def test_drift_is_the_slope_of_least_squares():
+    mean, _, _ = walk(4)
+    mean[:, 1] += 0.01 * np.arange(len(mean))
+    found = [(k, k + 2 + k % 9) for k in range(0, 380, 13)]
+    start, stop = np.array(found).T.astype(np.int64).copy()
+    slope, scatter = np.empty(3), np.empty(3)
+    spread = _segment.drift(mean, start, stop, slope, scatter)
+    expected = reference.drift(mean, found)
+    np.testing.assert_allclose(slope, expected[0], rtol=1e-10)
+    np.testing.assert_allclose(scatter, expected[1], rtol=1e-10)
+    assert spread == pytest.approx(sum(np.var(np.arange(a, b)) * (b - a) for a, b in found), rel=1e-13)
+
+
 def test_buffers_that_do_not_go_together_are_refused():
     three, many = np.zeros((4, 3)), np.zeros(40)
     index = np.zeros(4, dtype=np.int64)
@@ -114,6 +142,10 @@ def test_buffers_that_do_not_go_together_are_refused():
         lambda: _segment.stretches(np.arange(40) % 2.0, 0.5, 1, 0, 1, index, index.copy()),
         lambda: _segment.attitudes(three, index, index + 5, 0.1, index.copy(), three.copy()),
         lambda: _segment.attitudes(three, index, index, 0.1, index.copy(), three.copy()),
+        lambda: _segment.batches(three, index, index + 2, index, 1, index.copy(), three.copy(), index, np.zeros(36)),
+        lambda: _segment.batches(three, index, index + 1, index + 9, 1, index, three.copy(), index, np.zeros(36)),
+        lambda: _segment.drift(three, index, index + 5, np.zeros(3), np.zeros(3)),
+        lambda: _segment.drift(three, index, index + 1, np.zeros(3), np.zeros(4)),
     )
     for call in calls:
         with pytest.raises(ValueError, match="do not go together"):

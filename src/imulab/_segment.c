@@ -1,4 +1,5 @@
-/* The inner loops of segment.py: blocks, windows, the stretches of a threshold, its attitudes, and how well they agree.
+/* The inner loops of segment.py: blocks, windows, the stretches of a threshold, its attitudes, how well they agree, and
+ * how they scatter and drift.
  *
  * What each is for stands there. A sweep of the threshold passes a few times over a few thousand blocks: as calls on
  * arrays of that size it took longer than as loops. The plain form is tests/reference/segment.py.
@@ -22,15 +23,24 @@ static PyObject *done(Py_buffer *buffers, int count, int fits) {
     return NULL;
 }
 
-/* Mean and mean squared scatter of each block, from its first sample on: equal samples have a scatter of exactly 0. */
+/* Mean and mean squared scatter of each block, from its first sample on: equal samples have a scatter of exactly 0.
+ * Even and odd samples have sums of their own, since a sum cannot go on before the last is there. */
 static void form_axis(const double *samples, Py_ssize_t count, Py_ssize_t length, double *mean, double *scatter) {
     for (Py_ssize_t block = 0; block < count; block++, samples += length, mean += AXES, scatter += AXES) {
-        double sum = 0.0, squares = 0.0;
-        for (Py_ssize_t i = 1; i < length; i++) sum += samples[i] - samples[0];
-        const double centre = samples[0] + sum / (double)length;
-        for (Py_ssize_t i = 0; i < length; i++) squares += (samples[i] - centre) * (samples[i] - centre);
+        double sum[2] = {0.0}, squares[2] = {0.0};
+        for (Py_ssize_t i = 0; i + 1 < length; i += 2) {
+            sum[0] += samples[i] - samples[0];
+            sum[1] += samples[i + 1] - samples[0];
+        }
+        if (length % 2 != 0) sum[0] += samples[length - 1] - samples[0];
+        const double centre = samples[0] + (sum[0] + sum[1]) / (double)length;
+        for (Py_ssize_t i = 0; i + 1 < length; i += 2) {
+            squares[0] += (samples[i] - centre) * (samples[i] - centre);
+            squares[1] += (samples[i + 1] - centre) * (samples[i + 1] - centre);
+        }
+        if (length % 2 != 0) squares[0] += (samples[length - 1] - centre) * (samples[length - 1] - centre);
         *mean = centre;
-        *scatter = squares / (double)length;
+        *scatter = (squares[0] + squares[1]) / (double)length;
     }
 }
 
@@ -296,11 +306,114 @@ static PyObject *ellipsoid_error(PyObject *module, PyObject *args) {
     return PyFloat_FromDouble(error);
 }
 
+PyDoc_STRVAR(batches_doc,
+             "batches(block_mean, start, stop, attitude, size, first, mean, number, scatter) -> None\n\n"
+             "Cut stretches (s), int64, into batches of `size` blocks: the first block of each (b), int64, and its mean (b, 3);\n"
+             "for each attitude the number of its batches (a), int64, and the sum of the products of their deviations from\n"
+             "the mean of all of them (a, 3, 3). Stretches of one attitude follow each other.");
+
+static PyObject *batches(PyObject *module, PyObject *args) {
+    enum { BLOCK, START, STOP, ATTITUDE, FIRST, MEAN, NUMBER, SCATTER, BUFFERS };
+    Py_buffer v[BUFFERS];
+    Py_ssize_t size;
+    (void)module;
+    if (!PyArg_ParseTuple(args, "y*y*y*y*nw*w*w*w*", &v[BLOCK], &v[START], &v[STOP], &v[ATTITUDE], &size, &v[FIRST], &v[MEAN],
+                          &v[NUMBER], &v[SCATTER])) {
+        return NULL;
+    }
+    const Py_ssize_t n = v[START].len / INDEX, count = v[NUMBER].len / INDEX, blocks_there = v[BLOCK].len / (AXES * ONE);
+    const int64_t *start = v[START].buf, *stop = v[STOP].buf, *attitude = v[ATTITUDE].buf;
+    int fits = size > 0 && v[STOP].len == v[START].len && v[ATTITUDE].len == v[START].len &&
+               v[MEAN].len == AXES * ONE * (v[FIRST].len / INDEX) && v[SCATTER].len == AXES * AXES * ONE * count;
+    int64_t needed = 0;
+    for (Py_ssize_t i = 0; i < n && fits; i++) {
+        fits = 0 <= start[i] && start[i] < stop[i] && stop[i] <= blocks_there && 0 <= attitude[i] && attitude[i] < count;
+        needed += (stop[i] - start[i]) / size;
+    }
+    fits = fits && needed == v[FIRST].len / INDEX;
+    if (fits) {
+        const double *block = v[BLOCK].buf;
+        int64_t *first = v[FIRST].buf, *number = v[NUMBER].buf;
+        double *mean = v[MEAN].buf;
+        memset(number, 0, (size_t)v[NUMBER].len);
+        memset(v[SCATTER].buf, 0, (size_t)v[SCATTER].len);
+        for (Py_ssize_t i = 0; i < n;) {
+            const int64_t own = attitude[i];
+            double *scatter = (double *)v[SCATTER].buf + AXES * AXES * own, centre[AXES] = {0.0};
+            Py_ssize_t found = 0;
+            for (; i < n && attitude[i] == own; i++) {
+                for (int64_t at = start[i]; at + size <= stop[i]; at += size, found++) {
+                    first[found] = at;
+                    mean_of(block, at, at + size, mean + AXES * found);
+                    for (int axis = 0; axis < AXES; axis++) centre[axis] += mean[AXES * found + axis];
+                }
+            }
+            for (int axis = 0; axis < AXES; axis++) centre[axis] /= (double)found;
+            for (Py_ssize_t k = 0; k < found; k++, mean += AXES) {
+                for (int a = 0; a < AXES; a++) {
+                    for (int b = 0; b < AXES; b++) scatter[AXES * a + b] += (mean[a] - centre[a]) * (mean[b] - centre[b]);
+                }
+            }
+            number[own] = found;
+            first += found;
+        }
+    }
+    return done(v, BUFFERS, fits);
+}
+
+PyDoc_STRVAR(drift_doc,
+             "drift(block_mean, start, stop, slope, scatter) -> float\n\n"
+             "The slope (3), for each block, that stretches of blocks have in common, each about its own mean, and the mean\n"
+             "squared scatter about it (3); returns the sum of the squared distances from the middles of the stretches.");
+
+static PyObject *drift(PyObject *module, PyObject *args) {
+    enum { BLOCK, START, STOP, SLOPE, SCATTER, BUFFERS };
+    Py_buffer v[BUFFERS];
+    (void)module;
+    if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &v[BLOCK], &v[START], &v[STOP], &v[SLOPE], &v[SCATTER])) return NULL;
+    const Py_ssize_t n = v[START].len / INDEX, count = v[BLOCK].len / (AXES * ONE);
+    const int64_t *start = v[START].buf, *stop = v[STOP].buf;
+    int fits = v[STOP].len == v[START].len && v[SLOPE].len == AXES * ONE && v[SCATTER].len == AXES * ONE;
+    for (Py_ssize_t i = 0; i < n && fits; i++) fits = 0 <= start[i] && start[i] < stop[i] && stop[i] <= count;
+    double spread = 0.0, used = 0.0;
+    if (fits) {
+        const double *block = v[BLOCK].buf;
+        double *slope = v[SLOPE].buf, *scatter = v[SCATTER].buf, mean[AXES];
+        for (int axis = 0; axis < AXES; axis++) slope[axis] = scatter[axis] = 0.0;
+        for (int pass = 0; pass < 2; pass++) {
+            for (Py_ssize_t i = 0; i < n; i++) {
+                const double middle = (double)(start[i] + stop[i] - 1) / 2.0;
+                mean_of(block, start[i], stop[i], mean);
+                for (int64_t at = start[i]; at < stop[i]; at++) {
+                    const double time = (double)at - middle;
+                    if (pass == 0) spread += time * time;
+                    for (int axis = 0; axis < AXES; axis++) {
+                        const double deviation = block[AXES * at + axis] - mean[axis];
+                        if (pass == 0) slope[axis] += time * deviation;
+                        else scatter[axis] += (deviation - slope[axis] * time) * (deviation - slope[axis] * time);
+                    }
+                }
+                if (pass == 0) used += (double)(stop[i] - start[i]);
+            }
+            for (int axis = 0; axis < AXES; axis++) {
+                if (pass == 0) slope[axis] /= spread;
+                else scatter[axis] /= used;
+            }
+        }
+    }
+    PyObject *nothing = done(v, BUFFERS, fits);
+    if (nothing == NULL) return NULL;
+    Py_DECREF(nothing);
+    return PyFloat_FromDouble(spread);
+}
+
 static PyMethodDef methods[] = {{"blocks", blocks, METH_VARARGS, blocks_doc},
                                 {"windows", windows, METH_VARARGS, windows_doc},
                                 {"stretches", stretches, METH_VARARGS, stretches_doc},
                                 {"attitudes", attitudes, METH_VARARGS, attitudes_doc},
                                 {"ellipsoid_error", ellipsoid_error, METH_VARARGS, ellipsoid_error_doc},
+                                {"batches", batches, METH_VARARGS, batches_doc},
+                                {"drift", drift, METH_VARARGS, drift_doc},
                                 {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef definition = {

@@ -27,3 +27,17 @@ def attitudes(
     mean: NDArray[Any],
 ) -> int: ...
 def ellipsoid_error(mean: NDArray[Any]) -> float: ...
+def batches(
+    block_mean: NDArray[Any],
+    start: NDArray[Any],
+    stop: NDArray[Any],
+    attitude: NDArray[Any],
+    size: int,
+    first: NDArray[Any],
+    mean: NDArray[Any],
+    number: NDArray[Any],
+    scatter: NDArray[Any],
+) -> None: ...
+def drift(
+    block_mean: NDArray[Any], start: NDArray[Any], stop: NDArray[Any], slope: NDArray[Any], scatter: NDArray[Any]
+) -> float: ...

@@ -11,6 +11,7 @@ digital simulation, Management Science 24 (1978) 510.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -190,21 +191,16 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
 
 def _drift_notes(pieces: _Pieces, blocks: _Blocks, names: list[str], unit: str) -> tuple[str, ...]:
     """Drift of the zero, seen as a common slope within the attitudes at rest; no fit of attitudes alone shows it."""
-    owner = np.repeat(np.arange(len(pieces.start)), pieces.stop - pieces.start)
-    offset = np.arange(len(owner)) - np.repeat(np.cumsum(pieces.stop - pieces.start), pieces.stop - pieces.start)
-    block = offset + np.repeat(pieces.stop, pieces.stop - pieces.start)
-    size = np.bincount(owner)
-    time = block - np.bincount(owner, block)[owner] / size[owner]
-    spread = float((time**2).sum())
+    slopes, scatters = np.empty(3), np.empty(3)
+    spread = _segment.drift(blocks.mean, pieces.start, pieces.stop, slopes, scatters)
     notes = []
     total = (int(pieces.stop[-1]) - int(pieces.start[0])) * blocks.duration
-    for axis, name in enumerate(names):
-        values = blocks.mean[block, axis]
-        values = values - np.bincount(owner, values)[owner] / size[owner]
-        slope = float((time * values).sum()) / spread
-        error = float(np.sqrt(np.mean((values - slope * time) ** 2) / spread))
+    for name, slope, scatter in zip(names, slopes.tolist(), scatters.tolist(), strict=True):
+        error = math.sqrt(scatter / spread)
         rate = slope / blocks.duration
-        if abs(slope) > _CLEAR_DRIFT * error and abs(rate) * total > _CLEAR_DRIFT * error * np.sqrt(spread / len(size)):
+        if abs(slope) > _CLEAR_DRIFT * error and abs(rate) * total > _CLEAR_DRIFT * error * math.sqrt(
+            spread / len(pieces.start)
+        ):
             notes.append(
                 f"{name} drifts at rest by {rate:+.3g} {unit}/s, {rate * total:+.3g} {unit} over the test: "
                 "its zero is not constant, and the uncertainties do not cover that"
@@ -262,12 +258,14 @@ def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim
     """
     candidates: list[_Pieces] = []
     start, stop = np.empty((2, len(variance)), dtype=np.int64)
-    for factor in _THRESHOLDS:
-        count = _segment.stretches(variance, factor * quiet, width, trim, fewest, start, stop)
-        last = candidates[-1] if candidates else None
-        if last is None or not (np.array_equal(start[:count], last.start) and np.array_equal(stop[:count], last.stop)):
-            last = _merge(start[:count].copy(), stop[:count].copy(), blocks)
-        candidates.append(last)
+    before = None
+    for limit in (_THRESHOLDS * quiet).tolist():
+        count = _segment.stretches(variance, limit, width, trim, fewest, start, stop)
+        found = start[:count].tobytes(), stop[:count].tobytes()
+        candidates.append(
+            candidates[-1] if found == before else _merge(start[:count].copy(), stop[:count].copy(), blocks)
+        )
+        before = found
     return candidates
 
 
@@ -306,16 +304,10 @@ def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray
     size = pieces.stop - pieces.start
     total = np.bincount(pieces.attitude, size, count)
     per_batch = max(1, min(int(np.median(total)) // _BATCHES, int(size.min()) // 2))
-    batches = size // per_batch
-    owner = np.repeat(pieces.attitude, batches)
-    offset = np.arange(len(owner)) - np.repeat(np.cumsum(batches) - batches, batches)
-    start = np.repeat(pieces.start, batches) + offset * per_batch
-    batch = blocks.mean[start[:, None] + np.arange(per_batch)].mean(axis=1)
-    number = np.bincount(owner, minlength=count)
-    centre = np.column_stack([np.bincount(owner, batch[:, k], count) for k in range(3)]) / number[:, None]
-    deviation = batch - centre[owner]
-    scatter = np.zeros((count, 3, 3))
-    np.add.at(scatter, owner, deviation[:, :, None] * deviation[:, None, :])
+    first = np.empty(int((size // per_batch).sum()), dtype=np.int64)
+    number, scatter = np.empty(count, dtype=np.int64), np.empty((count, 3, 3))
+    batch = np.empty((len(first), 3))
+    _segment.batches(blocks.mean, pieces.start, pieces.stop, pieces.attitude, per_batch, first, batch, number, scatter)
     # Shrink towards the noise common to all: ten batches alone would make poor weights.
     freedom = (number - 1.0)[:, None, None]
     level = np.trace(scatter, axis1=1, axis2=2) / np.maximum(number - 1, 1)
@@ -323,7 +315,7 @@ def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray
     pooled = scatter[usual].sum(axis=0) / max(float((number - 1)[usual].sum()), 1.0)
     shrunk = (scatter + _POOL_DEGREES * pooled) / (freedom + _POOL_DEGREES)
     covariance: Array = shrunk * (per_batch / total)[:, None, None]
-    noise: Array = np.sqrt(np.median(blocks.scatter[start], axis=0))
+    noise: Array = np.sqrt(np.median(blocks.scatter[first], axis=0))
     return mean, covariance, (total * blocks.length).astype(np.int64), noise
 
 

@@ -69,3 +69,29 @@ def ellipsoid_error(points: Array) -> float:
         coefficients = np.linalg.lstsq(design[rest], np.ones(len(points) - 1), rcond=None)[0]
         errors.append(1 - design[out] @ coefficients)
     return float(np.sqrt(np.mean(np.square(errors))) / 2)
+
+
+def batches(
+    mean: Array, found: list[tuple[int, int]], number: list[int], size: int
+) -> tuple[list[int], list[int], list[Array]]:
+    """Return the first block of each batch, and for each attitude how many there are and how their means scatter."""
+    first = [list(range(start, stop - size + 1, size)) for start, stop in found]
+    counts, scatters = [], []
+    for k in range(max(number) + 1):
+        begins = [at for begin, n in zip(first, number, strict=True) if n == k for at in begin]
+        own = [mean[at : at + size].mean(axis=0) for at in begins]
+        deviation = np.array(own) - np.mean(own, axis=0)
+        counts.append(len(own))
+        scatters.append(deviation.T @ deviation)
+    return [at for begin in first for at in begin], counts, scatters
+
+
+def drift(mean: Array, found: list[tuple[int, int]]) -> tuple[Array, Array]:
+    """Return the slope, and the variance about it, of lines through the blocks: a zero for each stretch, one slope."""
+    rows = [(k, at) for k, (start, stop) in enumerate(found) for at in range(start, stop)]
+    design = np.zeros((len(rows), len(found) + 1))
+    for i, (k, at) in enumerate(rows):
+        design[i, [k, -1]] = 1, at
+    blocks_used = mean[[at for _, at in rows]]
+    solution = np.linalg.lstsq(design, blocks_used, rcond=None)[0]
+    return solution[-1], ((blocks_used - design @ solution) ** 2).mean(axis=0)
