@@ -1,6 +1,10 @@
 """Processes of this machine: what comes of calls, and what they leave behind."""
 
 import os
+import platform
+import resource
+import subprocess
+import sys
 
 import pytest
 
@@ -34,6 +38,32 @@ def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, b
     calls = processes.run(os.getenv, [(NAME,)] * 3, 2)
     assert list(calls) == ["1"] * 3
     assert os.environ.get(NAME) == before
+
+
+FAULTS = """
+import resource, sys
+from imulab.fleet import processes
+
+def use():
+    parts = [b"x" * (3 << 20) for _ in range(5)]
+
+if sys.argv[1] == "keep":
+    processes.keep_memory()
+use()
+use()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    use()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's")
+def test_memory_that_one_unit_has_used_is_kept_for_the_next():
+    given, kept = (int(subprocess.check_output([sys.executable, "-c", FAULTS, how])) for how in ("give", "keep"))
+    pages = 10 * 5 * (3 << 20) // resource.getpagesize()
+    assert kept < 0.01 * pages
+    assert given > 0.5 * pages  # or there is nothing to keep
 
 
 def test_calls_that_nobody_waits_for_any_more_are_not_begun(tmp_path):

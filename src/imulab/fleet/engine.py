@@ -45,6 +45,8 @@ class LocalEngine:
         self.workers = workers
         if workers > 1:
             processes.prepare(modules)
+        else:
+            processes.keep_memory()
 
     def run(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
         """Work on the units in several processes."""
