@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import resource
 import shutil
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from imulab.tumble.fit import fit_tumble
 G = 9.80665
 UNITS = 1000
 RECORDINGS = 200
+_PR_SET_CHILD_SUBREAPER = 36  # of Linux' prctl
 SAMPLES = 50_000
 
 
@@ -82,17 +85,17 @@ def _fleet(manifest: Path, out: Path, *options: str, fresh: bool = True) -> tupl
 
 def _timed(command: list[str], path: str = "") -> tuple[float, float]:
     """Wall and processor time of a command with all processes that it starts."""
+    # Processes that the command does not wait for become this one's, which does.
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
     subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONPATH": path})
     wall = time.perf_counter() - begin
+    with suppress(ChildProcessError):
+        while True:
+            os.wait()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return wall, after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-
-
-def read_only(file: str) -> int:
-    """Read a recording, and nothing else."""
-    return len(il.read(file))
 
 
 def _read_all(files: list[str], workers: int) -> tuple[float, float]:
@@ -100,7 +103,7 @@ def _read_all(files: list[str], workers: int) -> tuple[float, float]:
     code = (
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "from fleet import read_only\n"
+        "from reading import read_only\n"
         "from joblib import Parallel, delayed, parallel_config\n"
         f"with parallel_config(backend='loky', n_jobs={workers}, inner_max_num_threads=1):\n"
         "    Parallel()(delayed(read_only)(file) for file in sys.argv[1:])\n"

@@ -52,6 +52,7 @@ def command(*arguments: object, cwd: Path | None = None, env: dict[str, str] | N
     return subprocess.Popen(
         [sys.executable, "-m", "imulab", *map(str, arguments)],
         cwd=cwd, env={**os.environ, **(env or {})}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
     )  # fmt: skip
 
 
@@ -81,12 +82,12 @@ def children(pid: int) -> list[int]:
 
 
 def workers_of(pid: int) -> list[int]:
-    """Those of them that do the work."""
+    """Processes that do its work: those of its fork server."""
     found = []
     for child in children(pid):
         try:
-            if b"popen_loky" in Path(f"/proc/{child}/cmdline").read_bytes():
-                found.append(child)
+            if b"forkserver" in Path(f"/proc/{child}/cmdline").read_bytes():
+                found += children(child)
         except OSError:
             continue
     return found

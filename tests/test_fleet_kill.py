@@ -11,7 +11,7 @@ import time
 import pytest
 
 import imulab as il
-from fleets import command, make_fleet, records, wait_for, workers_of
+from fleets import children, command, make_fleet, records, wait_for, workers_of
 from imulab.fleet.run import fleet_state, run_fleet
 from imulab.fleet.store import MOST_ATTEMPTS
 
@@ -113,6 +113,24 @@ def test_a_unit_that_kills_its_process_fails_alone(tmp_path):
     assert out.startswith("12 units: 11 done, 1 failed")
     assert f"failed: SN005 (poison.csv): its process ended {MOST_ATTEMPTS} times while it worked on this unit" in out
     assert set(records(tmp_path / "out")) == {f"SN{i:03d}" for i in range(12) if i != 5}
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_an_interrupt_of_the_terminal_ends_all_processes_without_a_word(fleet, reference, tmp_path, begun):
+    folder = tmp_path / "out"
+    process = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
+    wait_for(lambda: len(list(folder.glob("*.json"))) >= 5 if begun else children(process.pid))
+    workers = workers_of(process.pid)
+    assert bool(workers) or not begun
+    os.killpg(process.pid, signal.SIGINT)
+    out, error = process.communicate(timeout=30)
+    assert (process.returncode, out, error) == (130, "", "")
+    wait_for(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers), 10)  # noqa: PTH110
+    before = records(folder)
+    assert len(before) < UNITS
+    done = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
+    assert done.communicate()[1] == ""
+    check_complete(folder, reference, before)
 
 
 def test_two_runs_at_once_the_second_is_refused(fleet, tmp_path):

@@ -11,11 +11,13 @@ digital simulation, Management Science 24 (1978) 510.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab import _segment
 from imulab.attitudes import Attitudes, Trace
 from imulab.clipping import check_clipped_rows, check_clipping
 from imulab.errors import SegmentError, UnitError
@@ -59,11 +61,12 @@ class _Blocks:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """Static stretches in blocks, half-open, and the attitude that each belongs to."""
+    """Static stretches in blocks, half-open, the attitude that each belongs to, and the attitudes' means (n, 3)."""
 
     start: NDArray[np.int64]
     stop: NDArray[np.int64]
-    attitude: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    attitude: NDArray[np.int64]
+    mean: Array
 
 
 def find_attitudes(
@@ -144,7 +147,7 @@ def find_attitudes(
     trim = int(np.ceil(settling / blocks.duration))
     fewest = max(2, int(np.ceil(shortest / blocks.duration)))
     candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
-    best = _choose(candidates, blocks)
+    best = _choose(candidates)
     trace = _trace(variance, time, blocks, width, _THRESHOLDS[best] * quiet, quiet)
     pieces = candidates[best]
     if not pieces.start.size:
@@ -188,21 +191,16 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
 
 def _drift_notes(pieces: _Pieces, blocks: _Blocks, names: list[str], unit: str) -> tuple[str, ...]:
     """Drift of the zero, seen as a common slope within the attitudes at rest; no fit of attitudes alone shows it."""
-    owner = np.repeat(np.arange(len(pieces.start)), pieces.stop - pieces.start)
-    offset = np.arange(len(owner)) - np.repeat(np.cumsum(pieces.stop - pieces.start), pieces.stop - pieces.start)
-    block = offset + np.repeat(pieces.stop, pieces.stop - pieces.start)
-    size = np.bincount(owner)
-    time = block - np.bincount(owner, block)[owner] / size[owner]
-    spread = float((time**2).sum())
+    slopes, scatters = np.empty(3), np.empty(3)
+    spread = _segment.drift(blocks.mean, pieces.start, pieces.stop, slopes, scatters)
     notes = []
     total = (int(pieces.stop[-1]) - int(pieces.start[0])) * blocks.duration
-    for axis, name in enumerate(names):
-        values = blocks.mean[block, axis]
-        values = values - np.bincount(owner, values)[owner] / size[owner]
-        slope = float((time * values).sum()) / spread
-        error = float(np.sqrt(np.mean((values - slope * time) ** 2) / spread))
+    for name, slope, scatter in zip(names, slopes.tolist(), scatters.tolist(), strict=True):
+        error = math.sqrt(scatter / spread)
         rate = slope / blocks.duration
-        if abs(slope) > _CLEAR_DRIFT * error and abs(rate) * total > _CLEAR_DRIFT * error * np.sqrt(spread / len(size)):
+        if abs(slope) > _CLEAR_DRIFT * error and abs(rate) * total > _CLEAR_DRIFT * error * math.sqrt(
+            spread / len(pieces.start)
+        ):
             notes.append(
                 f"{name} drifts at rest by {rate:+.3g} {unit}/s, {rate * total:+.3g} {unit} over the test: "
                 "its zero is not constant, and the uncertainties do not cover that"
@@ -240,132 +238,76 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
     step = float(usual.mean())
     length = max(_SMALLEST_BLOCK, round(min(_BLOCK_SECONDS, window / 3) / step))
     count = len(time) // length
-    mean, scatter = np.empty((count, 3)), np.empty((count, 3))
-    for axis, name in enumerate(names):
-        samples = recording.column(name)[: count * length].reshape(count, length)
-        mean[:, axis] = samples.mean(axis=1)
-        deviation = samples - mean[:, axis, None]
-        scatter[:, axis] = np.einsum("ij,ij->i", deviation, deviation) / length
-    largest = np.append(steps, 0.0)[: count * length].reshape(count, length).max(axis=1, initial=0.0)
-    return _Blocks(mean, scatter, length, length * step, largest > max(_GAP_SECONDS, _GAP_STEPS * step))
+    mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
+    _segment.blocks(x, y, z, np.ascontiguousarray(time), length, mean, scatter, longest)
+    return _Blocks(mean, scatter, length, length * step, longest > max(_GAP_SECONDS, _GAP_STEPS * step))
 
 
 def _window_variance(blocks: _Blocks, width: int) -> Array:
     """Variance of each window of `width` blocks, summed over the axes; infinite across a gap in time."""
-    count = len(blocks.mean) - width + 1
-    windows = [slice(k, k + count) for k in range(width)]
-    centre = sum(blocks.mean[w] for w in windows) / width
-    within = sum(blocks.scatter[w] for w in windows) / width
-    between = sum((blocks.mean[w] - centre) ** 2 for w in windows) / width
-    variance: Array = np.sum(within + between, axis=1)
-    broken = np.convolve(blocks.broken, np.ones(width), mode="valid") > 0
-    variance[broken] = np.inf
+    variance = np.empty(len(blocks.mean) - width + 1)
+    _segment.windows(blocks.mean, blocks.scatter, blocks.broken, width, variance)
     return variance
 
 
-def _stretches(quiet: NDArray[np.bool_], width: int, trim: int, fewest: int) -> _Pieces:
-    """Blocks covered by a quiet window, as stretches without their settling edges."""
-    edges = np.zeros(len(quiet) + width, dtype=np.int64)
-    edges[: len(quiet)] += quiet
-    edges[width:] -= quiet
-    static = np.concatenate([[False], np.cumsum(edges) > 0, [False]])
-    change = np.flatnonzero(static[1:] != static[:-1])
-    start, stop = change[::2] + trim, np.minimum(change[1::2], len(quiet) + width - 1) - trim
-    keep = stop - start >= fewest
-    return _Pieces(start[keep], stop[keep])
-
-
 def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
-    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches."""
-    found: dict[bytes, _Pieces] = {}
-    candidates = []
-    for factor in _THRESHOLDS:
-        pieces = _stretches(variance <= factor * quiet, width, trim, fewest)
-        key = pieces.start.tobytes() + pieces.stop.tobytes()
-        if key not in found:
-            found[key] = _merge(pieces, blocks)
-        candidates.append(found[key])
+    """Return the attitudes under each threshold; the same object where two thresholds find the same stretches.
+
+    Those are neighbours: what is quiet under one threshold is so under the next.
+    """
+    candidates: list[_Pieces] = []
+    start, stop = np.empty((2, len(variance)), dtype=np.int64)
+    before = None
+    for limit in (_THRESHOLDS * quiet).tolist():
+        count = _segment.stretches(variance, limit, width, trim, fewest, start, stop)
+        found = start[:count].tobytes(), stop[:count].tobytes()
+        candidates.append(
+            candidates[-1] if found == before else _merge(start[:count].copy(), stop[:count].copy(), blocks)
+        )
+        before = found
     return candidates
 
 
-def _piece_means(pieces: _Pieces, blocks: _Blocks) -> Array:
-    """Mean of the blocks of each stretch, shape (pieces, 3)."""
-    bounds = np.column_stack([pieces.start, pieces.stop]).ravel()
-    sums = np.add.reduceat(np.vstack([blocks.mean, np.zeros((1, 3))]), bounds, axis=0)[::2]
-    mean: Array = sums / (pieces.stop - pieces.start)[:, None]
-    return mean
-
-
-def _merge(pieces: _Pieces, blocks: _Blocks) -> _Pieces:
+def _merge(start: NDArray[np.int64], stop: NDArray[np.int64], blocks: _Blocks) -> _Pieces:
     """Number the attitudes: neighbouring stretches with the same mean are one attitude that was interrupted."""
-    if not pieces.start.size:
-        return pieces
-    mean = _piece_means(pieces, blocks)
-    radius = np.ptp(mean, axis=0).max() / 2
-    new = np.linalg.norm(np.diff(mean, axis=0), axis=1) > _SAME_ATTITUDE * radius
-    return _Pieces(pieces.start, pieces.stop, np.concatenate([[0], np.cumsum(new)]))
+    attitude, mean = np.empty(len(start), dtype=np.int64), np.empty((len(start), 3))
+    count = _segment.attitudes(blocks.mean, start, stop, _SAME_ATTITUDE, attitude, mean)
+    return _Pieces(start, stop, attitude, mean[:count])
 
 
-def _attitude_means(pieces: _Pieces, blocks: _Blocks) -> Array:
-    first = np.unique(pieces.attitude, return_index=True)[1]
-    size = (pieces.stop - pieces.start).astype(np.float64)
-    sums = np.add.reduceat(_piece_means(pieces, blocks) * size[:, None], first, axis=0)
-    mean: Array = sums / np.add.reduceat(size, first)[:, None]
-    return mean
+def _choose(candidates: list[_Pieces]) -> int:
+    """Index of the threshold whose attitudes predict each other best, among those that find enough.
 
-
-def _choose(candidates: list[_Pieces], blocks: _Blocks) -> int:
-    """Index of the threshold whose attitudes predict each other best, among those that find enough."""
-    counts = np.array([pieces.attitude[-1] + 1 if pieces.attitude.size else 0 for pieces in candidates])
+    An ellipsoid ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude
+    predicted from all others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the
+    radius.
+    """
+    counts = np.array([len(pieces.mean) for pieces in candidates])
     enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * np.median(counts[counts > 0])))) if counts.any() else 0)
     known: dict[int, float] = {}
     errors = []
     for pieces, count in zip(candidates, counts, strict=True):
         if id(pieces) not in known:
             usable = count >= max(enough, 1)
-            known[id(pieces)] = _ellipsoid_error(_attitude_means(pieces, blocks)) if usable else np.inf
+            known[id(pieces)] = _segment.ellipsoid_error(pieces.mean) if usable else np.inf
         errors.append(known[id(pieces)])
     if np.isfinite(errors).any():
         return int(np.argmin(errors))
     return int(np.argmax(counts))
 
 
-def _ellipsoid_error(mean: Array) -> float:
-    """Leave-one-out error of an ellipsoid through the attitude means, as a fraction of its radius.
-
-    ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude predicted from all
-    others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the radius.
-    """
-    if len(mean) < 11:
-        return np.inf
-    centre = (mean.max(axis=0) + mean.min(axis=0)) / 2
-    x, y, z = ((mean - centre) / (np.ptp(mean, axis=0).max() / 2)).T
-    design = np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x, x, y, z])
-    q, r = np.linalg.qr(design)
-    if np.abs(np.diag(r)).min() < 1e-6 * np.abs(np.diag(r)).max():
-        return np.inf
-    leverage = np.einsum("ij,ij->i", q, q)
-    residual = 1 - q @ q.sum(axis=0)
-    return float(np.sqrt(np.mean((residual / np.maximum(1 - leverage, 1e-9)) ** 2)) / 2)
-
-
 def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """Mean, its covariance by batch means, and number of samples of each attitude; noise of each axis, shape (3,)."""
-    mean = _attitude_means(pieces, blocks)
+    mean = pieces.mean
     count = len(mean)
     size = pieces.stop - pieces.start
     total = np.bincount(pieces.attitude, size, count)
     per_batch = max(1, min(int(np.median(total)) // _BATCHES, int(size.min()) // 2))
-    batches = size // per_batch
-    owner = np.repeat(pieces.attitude, batches)
-    offset = np.arange(len(owner)) - np.repeat(np.cumsum(batches) - batches, batches)
-    start = np.repeat(pieces.start, batches) + offset * per_batch
-    batch = blocks.mean[start[:, None] + np.arange(per_batch)].mean(axis=1)
-    number = np.bincount(owner, minlength=count)
-    centre = np.column_stack([np.bincount(owner, batch[:, k], count) for k in range(3)]) / number[:, None]
-    deviation = batch - centre[owner]
-    scatter = np.zeros((count, 3, 3))
-    np.add.at(scatter, owner, deviation[:, :, None] * deviation[:, None, :])
+    first = np.empty(int((size // per_batch).sum()), dtype=np.int64)
+    number, scatter = np.empty(count, dtype=np.int64), np.empty((count, 3, 3))
+    batch = np.empty((len(first), 3))
+    _segment.batches(blocks.mean, pieces.start, pieces.stop, pieces.attitude, per_batch, first, batch, number, scatter)
     # Shrink towards the noise common to all: ten batches alone would make poor weights.
     freedom = (number - 1.0)[:, None, None]
     level = np.trace(scatter, axis1=1, axis2=2) / np.maximum(number - 1, 1)
@@ -373,7 +315,7 @@ def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray
     pooled = scatter[usual].sum(axis=0) / max(float((number - 1)[usual].sum()), 1.0)
     shrunk = (scatter + _POOL_DEGREES * pooled) / (freedom + _POOL_DEGREES)
     covariance: Array = shrunk * (per_batch / total)[:, None, None]
-    noise: Array = np.sqrt(np.median(blocks.scatter[start], axis=0))
+    noise: Array = np.sqrt(np.median(blocks.scatter[first], axis=0))
     return mean, covariance, (total * blocks.length).astype(np.int64), noise
 
 

@@ -1,20 +1,19 @@
-"""Where the work is done: processes of this machine, or the workers of a Dask cluster; both through joblib."""
+"""Where the work is done: processes of this machine, or the workers of a Dask cluster, through joblib."""
 
 from __future__ import annotations
 
 import logging
-import os
 import queue
 import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from typing import Any, Protocol
 
 from imulab._version import VERSION
 from imulab.errors import OptionError
+from imulab.fleet import processes
 from imulab.fleet.manifest import Unit
 from imulab.fleet.work import Job, Outcome, work
 
@@ -40,38 +39,30 @@ class Engine(Protocol):
 
 
 class LocalEngine:
-    """Processes of this machine (joblib's loky): nothing to start; one process works without a second."""
+    """Processes of this machine: nothing to start; one process works without a second."""
 
-    def __init__(self, workers: int | None) -> None:
-        import joblib
-
-        self.workers = workers or int(joblib.cpu_count())
+    def __init__(self, workers: int, modules: Sequence[str]) -> None:
+        self.workers = workers
+        if workers > 1:
+            processes.prepare(modules)
+        else:
+            processes.keep_memory()
 
     def run(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
         """Work on the units in several processes."""
-        return _local(units, job, min(self.workers, max(len(units), 1)))
+        workers = min(self.workers, max(len(units), 1))
+        return (work(unit, job) for unit in units) if workers == 1 else _local(units, job, workers)
 
     def run_alone(self, unit: Unit, job: Job) -> Iterator[Outcome]:
-        """Work on one unit in a process of its own: two are allowed, since one would be this one."""
-        return _local([unit], job, 2)
+        """Work on one unit in a process of its own."""
+        return _local([unit], job, 1)
 
 
 def _local(units: Sequence[Unit], job: Job, workers: int) -> Iterator[Outcome]:
-    from joblib import Parallel, delayed, parallel_config
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    if workers == 1:
-        for unit in units:
-            yield work(unit, job)
-        return
-    # A thread for linear algebra and one for text in each process: they are beside each other already.
-    with parallel_config(backend="loky", n_jobs=workers, inner_max_num_threads=1):
-        parallel = Parallel(return_as="generator_unordered", pre_dispatch="3 * n_jobs")
-        try:
-            mine = replace(job, driver=os.getpid())
-            yield from parallel(delayed(work)(unit, mine) for unit in units)
-        except BrokenProcessPool as error:
-            raise WorkersLostError(str(error)) from None
+    try:
+        yield from processes.run(work, ((unit, job) for unit in units), workers)
+    except processes.ProcessLostError as error:
+        raise WorkersLostError(str(error)) from None
 
 
 class DaskEngine:
@@ -171,8 +162,10 @@ class _Watch:
 
 
 @contextmanager
-def open_engine(kind: str, *, scheduler: str | None, workers: int | None) -> Iterator[Engine]:
-    """Give the engine for a run.
+def open_engine(
+    kind: str, *, scheduler: str | None, workers: int | None, modules: Sequence[str] = ()
+) -> Iterator[Engine]:
+    """Give the engine for a run; `modules` are those that its work needs.
 
     Raises
     ------
@@ -188,10 +181,17 @@ def open_engine(kind: str, *, scheduler: str | None, workers: int | None) -> Ite
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: expected 1 or more")
     if kind == "local":
-        yield LocalEngine(workers)
+        yield LocalEngine(workers or _processors(), modules)
         return
     with ExitStack() as stack:
         yield _dask(scheduler, workers, stack)
+
+
+def _processors() -> int:
+    """Return how many processors this process may use, by its affinity and its control group."""
+    import joblib
+
+    return int(joblib.cpu_count())
 
 
 def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskEngine:
@@ -203,9 +203,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
         if name.partition(".")[0] in ("asyncio", "distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what a person must know is said by the watch
     if scheduler is None:
-        import joblib
-
-        count = workers or int(joblib.cpu_count())
+        count = workers or _processors()
         cluster = stack.enter_context(
             LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"

@@ -125,7 +125,9 @@ def run_fleet(
     with ExitStack() as stack:
         notes: list[str] = []
         past = _open_history(history, stack) if history else None
-        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=workers))
+        needed = dict.fromkeys(name for unit in fleet.units for name in TASKS[unit.procedure].modules)
+        modules = ("imulab.fleet.work", *needed)
+        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=workers, modules=modules))
         token = stack.enter_context(store.run())
         if history is None:
             try:

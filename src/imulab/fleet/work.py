@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import os
-import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 
 from imulab.calibration import Calibration, Parameter
@@ -26,14 +23,12 @@ DONE, KEPT, FAILED, LEFT = "done", "kept", "failed", "left"
 class Job:
     """What all units of a run share: the folder of the records, the base of the manifest's paths, the run's token.
 
-    Without a folder the records are sent back. `driver` is the process that started this worker, where one did: a
-    worker does not outlive it.
+    Without a folder the records are sent back.
     """
 
     folder: str | None
     base: str
     token: str
-    driver: int | None = None
 
 
 @dataclass(frozen=True)
@@ -74,8 +69,6 @@ class Outcome:
 
 def work(unit: Unit, job: Job) -> Outcome:
     """Make the record of one unit, unless it is there already and was made from the same files and options."""
-    if job.driver is not None and job.driver != os.getpid():
-        _end_with(job.driver)
     if job.folder is None:
         return _fit(unit, job, None)
     store = Store(Path(job.folder))
@@ -93,18 +86,6 @@ def work(unit: Unit, job: Job) -> Outcome:
             store.fail(unit, outcome.reason)
         store.end(unit.serial)
         return outcome
-
-
-@cache
-def _end_with(driver: int) -> None:
-    """End this process soon after the one that started it, whatever that died of; records are whole or not there."""
-
-    def watch() -> None:
-        while os.getppid() == driver:
-            time.sleep(0.2)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def _fit(unit: Unit, job: Job, store: Store | None) -> Outcome:

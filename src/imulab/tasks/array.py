@@ -61,6 +61,7 @@ TASK = Task(
     count=(1, 2),
     options=("interval", "averaging", "layout"),
     paths=("layout",),
+    modules=("imulab.readers", "imulab.gyro_array.fit", "scipy.special"),
     values=_array_values,
     fit=_array_fit,
 )

@@ -54,6 +54,7 @@ TASK = Task(
     count=(1, 1),
     options=("method", "curve", "layout"),
     paths=("layout",),
+    modules=("imulab.readers", "imulab.centrifuge.manifest", "imulab.centrifuge.fit", "scipy.special"),
     values=_centrifuge_values,
     fit=_centrifuge_fit,
 )

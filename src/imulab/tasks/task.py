@@ -48,6 +48,8 @@ class Task:
         Names of the options of its fit.
     paths
         Those of them that name a file.
+    modules
+        What its fit loads: whoever has several processes fit loads them once, before.
     values
         Texts of options and how messages call an option (``"--{}"``) to checked values; raises OptionError.
     fit
@@ -59,6 +61,7 @@ class Task:
     count: tuple[int, int | None]
     options: tuple[str, ...]
     paths: tuple[str, ...]
+    modules: tuple[str, ...]
     values: Callable[[Mapping[str, str], str], dict[str, Any]]
     fit: Callable[[Sequence[str], Mapping[str, Any], Files, Callable[[int], None]], Calibration]
 

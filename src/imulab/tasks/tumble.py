@@ -117,6 +117,7 @@ TASK = Task(
         "window",
     ),
     paths=("prior", "layout"),
+    modules=("imulab.readers", "imulab.segment", "imulab.tumble.fit", "scipy.special"),
     values=_tumble_values,
     fit=_tumble_fit,
 )

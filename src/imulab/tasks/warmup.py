@@ -132,6 +132,7 @@ TASK = Task(
         "window",
     ),
     paths=("layout",),
+    modules=("imulab.readers", "imulab.warmup.cycles", "imulab.warmup.fit", "scipy.special"),
     values=_values,
     fit=_fit,
 )

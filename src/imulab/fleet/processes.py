@@ -1,0 +1,117 @@
+"""Processes of this machine, forked off one that has loaded what a fit needs: that takes time once, not in each."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
+from queue import SimpleQueue
+from typing import TypeVar
+
+T = TypeVar("T")
+
+_FORKS = sys.platform == "linux"  # what other systems' libraries start when they are loaded does not always outlive it
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS")
+_AHEAD = 64
+"""Calls for each process that wait, so that none waits for a driver that is writing to the history."""
+
+_KEPT = {-3: 1 << 25, -1: 1 << 28}
+"""Bytes up to which glibc is to keep memory: M_MMAP_THRESHOLD, of which that is the most, and M_TRIM_THRESHOLD."""
+
+
+class ProcessLostError(Exception):
+    """A process has ended under its work."""
+
+
+def prepare(modules: Sequence[str]) -> None:
+    """Begin to load modules in the process that others will be forked off, and do not wait for it."""
+    if not _FORKS:
+        return
+    from multiprocessing import forkserver, resource_tracker
+
+    resource_tracker.ensure_running()  # by itself: it would let interrupts through again
+    forkserver.set_forkserver_preload(list(modules))
+    # An interrupt of the terminal goes to all its processes: this one says what is to be said of it.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        with _one_thread_each():
+            forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], processes: int) -> Iterator[T]:
+    """Give the results of calls as they come; no process outlives this one.
+
+    Raises
+    ------
+    ProcessLostError
+        A process has ended under its work; the others are ended too.
+    """
+    context = multiprocessing.get_context("forkserver" if _FORKS else "spawn")
+    with _one_thread_each():
+        pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_attend)
+        over: SimpleQueue[Future[T]] = SimpleQueue()
+        left = 0
+        try:
+            for call in calls:
+                pool.submit(function, *call).add_done_callback(over.put)
+                left += 1
+                if left >= _AHEAD * processes:
+                    yield over.get().result()
+                    left -= 1
+            for _ in range(left):
+                yield over.get().result()
+        except BrokenProcessPool as error:
+            raise ProcessLostError(str(error)) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Let processes that are started meanwhile use one thread for linear algebra and text: they are several already."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def keep_memory() -> None:
+    """Keep the memory that one unit has used for the next, as far as the C library lets itself be told.
+
+    Otherwise it goes back to the system with every recording, which clears it page by page before it gives it again: a
+    seventh of the time of a unit.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        for parameter, size in _KEPT.items():
+            mallopt(parameter, size)
+
+
+def _attend() -> None:
+    """Leave interrupts to the process that started this one, and end with it, whatever that dies of."""
+    keep_memory()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)

@@ -1,0 +1,97 @@
+"""Segmentation of a tumble recording into static attitudes, written out plainly.
+
+Blocks of samples, windows of blocks, stretches of quiet windows, attitudes of stretches, and the error with which the
+attitudes predict each other; one definition a function, without regard to speed. Shares nothing with the package.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def blocks(samples: Array, time: Array, length: int) -> tuple[Array, Array, Array]:
+    """Return mean and mean squared scatter (b, 3) of blocks of samples (n, 3), and the longest step in time of each."""
+    count = len(samples) // length
+    parts = samples[: count * length].reshape(count, length, 3)
+    mean = parts.mean(axis=1)
+    steps = np.append(np.diff(time), 0.0)[: count * length].reshape(count, length)
+    return mean, ((parts - mean[:, None]) ** 2).mean(axis=1), steps.max(axis=1)
+
+
+def window_variance(mean: Array, scatter: Array, broken: NDArray[np.bool_], width: int) -> Array:
+    """Return the variance of each window of blocks, summed over the axes, infinite where time breaks off within it."""
+    result = []
+    for first in range(len(mean) - width + 1):
+        own = slice(first, first + width)
+        between = mean[own] - mean[own].mean(axis=0)
+        result.append(np.inf if broken[own].any() else (scatter[own].mean(axis=0) + (between**2).mean(axis=0)).sum())
+    return np.array(result)
+
+
+def stretches(variance: Array, limit: float, width: int, trim: int, fewest: int) -> list[tuple[int, int]]:
+    """Return the runs of blocks that quiet windows cover, without their ends, where enough blocks are left."""
+    covered = np.zeros(len(variance) + width - 1, dtype=bool)
+    for first in np.flatnonzero(variance <= limit):
+        covered[first : first + width] = True
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], covered.astype(int), [0]])))
+    trimmed = [(int(start) + trim, int(stop) - trim) for start, stop in edges.reshape(-1, 2)]
+    return [(start, stop) for start, stop in trimmed if stop - start >= fewest]
+
+
+def attitudes(mean: Array, found: list[tuple[int, int]], same: float) -> tuple[list[int], Array]:
+    """Return the attitude of each stretch, where neighbours within `same` radii are one, and the attitudes' means."""
+    own = np.array([mean[start:stop].mean(axis=0) for start, stop in found])
+    radius = (own.max(axis=0) - own.min(axis=0)).max() / 2
+    number = [0]
+    for before, after in itertools.pairwise(own):
+        number.append(number[-1] + int(np.linalg.norm(after - before) > same * radius))
+    of_attitude = [
+        np.vstack([mean[start:stop] for (start, stop), n in zip(found, number, strict=True) if n == k]).mean(axis=0)
+        for k in range(number[-1] + 1)
+    ]
+    return number, np.array(of_attitude)
+
+
+def ellipsoid_error(points: Array) -> float:
+    """Return the root mean square error, in radii, of an ellipsoid through all points but one at that one."""
+    centre = (points.max(axis=0) + points.min(axis=0)) / 2
+    radius = (points.max(axis=0) - points.min(axis=0)).max() / 2
+    x, y, z = ((points - centre) / radius).T
+    design = np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x, x, y, z])
+    errors = []
+    for out in range(len(points)):
+        rest = np.arange(len(points)) != out
+        coefficients = np.linalg.lstsq(design[rest], np.ones(len(points) - 1), rcond=None)[0]
+        errors.append(1 - design[out] @ coefficients)
+    return float(np.sqrt(np.mean(np.square(errors))) / 2)
+
+
+def batches(
+    mean: Array, found: list[tuple[int, int]], number: list[int], size: int
+) -> tuple[list[int], list[int], list[Array]]:
+    """Return the first block of each batch, and for each attitude how many there are and how their means scatter."""
+    first = [list(range(start, stop - size + 1, size)) for start, stop in found]
+    counts, scatters = [], []
+    for k in range(max(number) + 1):
+        begins = [at for begin, n in zip(first, number, strict=True) if n == k for at in begin]
+        own = [mean[at : at + size].mean(axis=0) for at in begins]
+        deviation = np.array(own) - np.mean(own, axis=0)
+        counts.append(len(own))
+        scatters.append(deviation.T @ deviation)
+    return [at for begin in first for at in begin], counts, scatters
+
+
+def drift(mean: Array, found: list[tuple[int, int]]) -> tuple[Array, Array]:
+    """Return the slope, and the variance about it, of lines through the blocks: a zero for each stretch, one slope."""
+    rows = [(k, at) for k, (start, stop) in enumerate(found) for at in range(start, stop)]
+    design = np.zeros((len(rows), len(found) + 1))
+    for i, (k, at) in enumerate(rows):
+        design[i, [k, -1]] = 1, at
+    blocks_used = mean[[at for _, at in rows]]
+    solution = np.linalg.lstsq(design, blocks_used, rcond=None)[0]
+    return solution[-1], ((blocks_used - design @ solution) ** 2).mean(axis=0)

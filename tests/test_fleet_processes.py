@@ -1,0 +1,73 @@
+"""Processes of this machine: what comes of calls, and what they leave behind."""
+
+import os
+import platform
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from imulab.fleet import processes
+
+NAME = "OMP_NUM_THREADS"
+
+
+def test_results_come_as_they_are_ready_and_all_come():
+    processes.prepare(["imulab.fleet.work"])
+    found = list(processes.run(pow, ((2, k) for k in range(400)), 2))  # more calls than wait at a time
+    assert sorted(found) == [2**k for k in range(400)]
+
+
+def test_an_error_in_a_process_is_raised_here():
+    with pytest.raises(ZeroDivisionError):
+        list(processes.run(divmod, [(1, 0)], 1))
+
+
+def test_a_process_that_ends_is_reported():
+    with pytest.raises(processes.ProcessLostError):
+        list(processes.run(os._exit, [(3,)], 2))
+
+
+@pytest.mark.parametrize("before", [None, "7"])
+def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, before):
+    monkeypatch.delenv(NAME, raising=False)
+    if before is not None:
+        monkeypatch.setenv(NAME, before)
+    processes.prepare(["imulab.fleet.work"])
+    calls = processes.run(os.getenv, [(NAME,)] * 3, 2)
+    assert list(calls) == ["1"] * 3
+    assert os.environ.get(NAME) == before
+
+
+FAULTS = """
+import resource, sys
+from imulab.fleet import processes
+
+def use():
+    parts = [b"x" * (3 << 20) for _ in range(5)]
+
+if sys.argv[1] == "keep":
+    processes.keep_memory()
+use()
+use()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    use()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's")
+def test_memory_that_one_unit_has_used_is_kept_for_the_next():
+    given, kept = (int(subprocess.check_output([sys.executable, "-c", FAULTS, how])) for how in ("give", "keep"))
+    pages = 10 * 5 * (3 << 20) // resource.getpagesize()
+    assert kept < 0.01 * pages
+    assert given > 0.5 * pages  # or there is nothing to keep
+
+
+def test_calls_that_nobody_waits_for_any_more_are_not_begun(tmp_path):
+    made = processes.run(os.mkdir, ((str(tmp_path / str(k)),) for k in range(10**6)), 2)
+    next(made)
+    made.close()
+    assert 1 <= len(list(tmp_path.iterdir())) < 1000
