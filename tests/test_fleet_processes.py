@@ -3,8 +3,11 @@
 import os
 import platform
 import resource
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 
 import pytest
 
@@ -27,6 +30,22 @@ def test_an_error_in_a_process_is_raised_here():
 def test_a_process_that_ends_is_reported():
     with pytest.raises(processes.ProcessLostError):
         list(processes.run(os._exit, [(3,)], 2))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others do not fork")
+def test_the_process_that_forks_may_end_too():
+    from multiprocessing.forkserver import _forkserver
+
+    for _ in range(2):
+        processes.prepare(["imulab.fleet.work"])
+        os.kill(_forkserver._forkserver_pid, signal.SIGKILL)
+        for _ in range(50):  # it takes a moment until it is known; then another is started
+            with suppress(processes.ProcessLostError):
+                assert sorted(processes.run(abs, [(-1,), (-2,)], 2)) == [1, 2]
+                break
+            time.sleep(0.02)
+        else:
+            pytest.fail("no other was started")
 
 
 @pytest.mark.parametrize("before", [None, "7"])

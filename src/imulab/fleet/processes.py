@@ -70,7 +70,7 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
                     left -= 1
             for _ in range(left):
                 yield over.get().result()
-        except BrokenProcessPool as error:
+        except (BrokenProcessPool, EOFError, ConnectionError) as error:  # the latter two: of the one that is to fork
             raise ProcessLostError(str(error)) from None
         finally:
             pool.shutdown(cancel_futures=True)
