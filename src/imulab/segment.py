@@ -44,7 +44,7 @@ _SAME_ATTITUDE = 2e-3
 shortens the vector by less than 0.5 ug."""
 _POOL_DEGREES = 10.0
 """Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
-_TRACE_POINTS = 4000
+_TRACE_POINTS = 2000
 _A_PART = 2000
 
 
@@ -335,7 +335,7 @@ def _resolutions(recording: Recording, names: list[str], part: int | None = None
 
 def _trace(variance: Array, time: Array, blocks: _Blocks, width: int, threshold: float, quiet: float) -> Trace:
     """Decimate the variance trace for the record: the largest value of each group of windows."""
-    group = max(1, len(variance) // _TRACE_POINTS)
+    group = max(1, -(-len(variance) // _TRACE_POINTS))
     usable = variance[: len(variance) // group * group].reshape(-1, group)
     largest = np.where(np.isfinite(usable), usable, 0.0).max(axis=1)
     middle = (np.arange(len(largest)) * group * blocks.length + width * blocks.length // 2).clip(max=len(time) - 1)
