@@ -1,5 +1,5 @@
-/* Gyro array: the plain methods, and what all methods share; robust.c and robust_well.c hold the robust one. */
-#include "array.h"
+/* Gyro array: the plain methods, and what all methods share; the robust one is in robust.c and what goes with it. */
+#include "lanes.h"
 
 /* A reading may come with an alignment of its element over the axes; then one lost axis loses all. */
 static void aligned(const il_array *a, const il_real *reading, il_real *z) {
@@ -218,7 +218,7 @@ static void feedback_health(const il_array *a, il_array_axis *s, const il_real *
 }
 
 static inline unsigned step(const il_array *a, const il_robust_terms *t, il_array_state *state,
-                            const il_real *reading, il_real *rate, int want_health) {
+                            const il_real *reading, il_real *rate, int want_health, il_lanes *lanes) {
     il_real moved[3 * IL_ARRAY_ELEMENTS];
     const il_real *z = reading;
     unsigned flags = 0;
@@ -226,6 +226,17 @@ static inline unsigned step(const il_array *a, const il_robust_terms *t, il_arra
         aligned(a, reading, moved);
         z = moved;
     }
+#if IL_LANES
+    if (lanes != NULL) {
+        if (lanes->wait > 0) {
+            lanes->wait--;
+        } else if (lanes->together || il_lanes_ready(lanes, a, state)) {
+            return il_lanes_step(lanes, a, t, state, z, reading, rate, want_health);
+        }
+    }
+#else
+    (void)lanes;
+#endif
     for (int32_t axis = 0; axis < a->axes; axis++) {
         il_array_axis *s = &state->axis[axis];
         const il_real *mine = z + axis * a->elements;
@@ -284,7 +295,7 @@ il_status il_array_start(const il_array *settings, il_array_state *state) {
 unsigned il_array_step(const il_array *settings, il_array_state *state, const il_real *reading, il_real *rate) {
     il_robust_terms t;
     if (settings->method == IL_ROBUST) t = il_robust_prepare(settings);
-    return step(settings, &t, state, reading, rate, 1);
+    return step(settings, &t, state, reading, rate, 1, NULL);
 }
 
 void il_array_still(const il_array *settings, il_array_state *state) {
@@ -304,10 +315,16 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
     unsigned all = 0;
     int want_health = flags != NULL || weight != NULL;
     il_robust_terms t;
+    il_lanes *lanes = NULL;
     if (a.method == IL_ROBUST) t = il_robust_prepare(&a);
+#if IL_LANES
+    il_lanes room;
+    if (il_lanes_start(&room, &a, n)) lanes = &room;
+#endif
     for (size_t k = 0; k < n; k++) {
         /* the last sample leaves flags and weights in the state, as single steps do */
-        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
+        const int health = want_health || k + 1 == n;
+        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, health, lanes);
         if (still != NULL && still[k]) il_array_still(&a, state);
         for (size_t axis = 0; want_health && axis < (size_t)a.axes; axis++) {
             const il_array_axis *s = &state->axis[axis];
@@ -316,5 +333,8 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
             if (weight != NULL) memcpy(weight + place, s->weight, elements * sizeof(il_real));
         }
     }
+#if IL_LANES
+    if (lanes != NULL) il_lanes_end(lanes, &a, state);
+#endif
     return all;
 }
