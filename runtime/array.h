@@ -4,6 +4,12 @@
 
 #include "real.h"
 
+#if defined(__GNUC__)
+#define IL_APART __attribute__((noinline)) /* a function that is not to become part of another */
+#else
+#define IL_APART
+#endif
+
 /* Gain of the running estimates at sample k, k >= 1. */
 il_real il_array_gain(const il_array *a, uint32_t k);
 

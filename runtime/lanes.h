@@ -4,8 +4,8 @@
 
 #include "robust.h"
 
-/* Whether it is compiled: by default for x86-64 by gcc or clang, and then used where there is AVX2; -DIL_LANES=0 leaves it out,
- * -DIL_LANES=1 has gcc or clang make it of what instructions there are. The results are the same, bit for bit. */
+/* Whether it is compiled: by default for x86-64 by gcc or clang, and then used where there is AVX2; -DIL_LANES=0 leaves it
+ * out, -DIL_LANES=1 has gcc or clang make it of what instructions there are. The results are the same, bit for bit. */
 #ifndef IL_LANES /* (gcc does not align vectors on the stack of Windows) */
 #if defined(__x86_64__) && !defined(_WIN32) && (defined(__clang__) || (defined(__GNUC__) && __GNUC__ >= 9))
 #define IL_LANES 1
@@ -29,7 +29,8 @@ typedef int32_t il_verdict __attribute__((vector_size(16))); /* what a compariso
 typedef int64_t il_verdict __attribute__((vector_size(32)));
 #endif
 
-/* State of the robust method while all is well, the axes beside each other, and one sample at work (as in robust.h). */
+/* State of the robust method while all is well, or of least squares while no reading is missing, the axes beside each
+ * other; and one sample at work (as in robust.h). */
 struct il_lanes {
     int together;          /* not 0: the state is here, and what il_array_axis has of it is out of date */
     int settled;           /* gains and pulls do not change any more */
@@ -53,12 +54,23 @@ int il_lanes_start(il_lanes *l, const il_array *a, size_t n);
 /* Try to have the axes together, when l->wait has passed. Returns whether they are. */
 int il_lanes_ready(il_lanes *l, const il_array *a, const il_array_state *state);
 
-/* One sample of three axes that are together. Returns the flags met. */
-unsigned il_lanes_step(il_lanes *l, const il_array *a, const il_robust_terms *t, il_array_state *state, const il_real *z,
-                       const il_real *reading, il_real *rate, int want_health);
+/* One sample of three axes that are together. Returns whether it is done; if not, they are not together any more. */
+int il_lanes_step(il_lanes *l, const il_array *a, const il_robust_terms *t, il_array_state *state, const il_real *z,
+                  const il_real *reading, il_real *rate, int want_health, unsigned *met);
 
 /* Bring the state up to date. */
 void il_lanes_end(il_lanes *l, const il_array *a, il_array_state *state);
+
+/* Each axis by itself for a while, the longer the less it was worth to have them together. */
+void il_lanes_part(il_lanes *l);
+
+/* robust_lanes.c: whether all is well in three axes; have them together; one sample, flags met; bring the state up to
+ * date. */
+int il_robust_lanes_ready(const il_array_state *state);
+void il_robust_lanes_enter(il_lanes *l, const il_array *a, const il_array_state *state);
+unsigned il_robust_lanes_step(il_lanes *l, const il_array *a, const il_robust_terms *t, il_array_state *state,
+                              const il_real *z, const il_real *reading, il_real *rate, int want_health);
+void il_robust_lanes_leave(il_lanes *l, const il_array *a, il_array_state *state);
 
 /* ---- four numbers at a time ------------------------------------------------------------------------------------------ */
 

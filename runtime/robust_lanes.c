@@ -8,10 +8,6 @@
 #include "lanes.h"
 
 #if IL_LANES
-enum { BLOCK = 8 };                /* samples in a block that are worth it, */
-enum { SHORT = 64 };               /* and in a row without a pause */
-enum { PAUSE = 8, LONGEST = 512 }; /* samples between two tries, at first and when they fail again and again */
-
 LANES_BEGIN
 
 /* ---- from the state into lanes, and back ----------------------------------------------------------------------------- */
@@ -61,28 +57,18 @@ static void lanes_count(il_lanes *l, il_array_state *state) {
     l->done = 0;
 }
 
-static int all_well(const il_array_state *state) {
+int il_robust_lanes_ready(const il_array_state *state) {
     return state->axis[0].well && state->axis[1].well && state->axis[2].well;
 }
 
-static void lanes_enter(il_lanes *l, const il_array *a, const il_array_state *state) {
-    l->together = 1;
+void il_robust_lanes_enter(il_lanes *l, const il_array *a, const il_array_state *state) {
     l->settled = 0;
-    l->stay = 0;
-    l->done = 0;
     l->most = MOST_CLEAN;
     l->before = NULL;
     EACH_AXIS {
         lanes_gather(l, a, &state->axis[j], j);
         lanes_recount(l, a, &state->axis[j], j);
     }
-}
-
-/* Each axis by itself for a while, the longer the less it was worth to have them together. */
-static void lanes_part(il_lanes *l) {
-    l->pause = l->together && l->stay >= SHORT ? PAUSE : l->pause < LONGEST ? 2 * l->pause : LONGEST;
-    l->wait = l->pause;
-    l->together = 0;
 }
 
 /* ---- one sample ------------------------------------------------------------------------------------------------------ */
@@ -212,7 +198,8 @@ static il_verdict lanes_straight(const il_lanes *l, int32_t n) {
 }
 
 /* il_robust_all_well */
-LANES_INLINE void lanes_fuse(il_lanes *l, const il_array *a, const il_robust_terms *t, const il_real *z, const il_real *reading) {
+LANES_INLINE void lanes_fuse(il_lanes *l, const il_array *a, const il_robust_terms *t, const il_real *z,
+                             const il_real *reading) {
     const int32_t n = a->elements;
     if (z == reading) {
         lanes_compensate(l, n, z, z); /* turned into lanes once */
@@ -314,7 +301,7 @@ static void lanes_mend(il_lanes *l, const il_array *a, il_array_state *state, un
         lanes_suspect(l, a, &state->axis[j], j);
         out |= 1u << j;
     }
-    if (all_well(state)) {
+    if (il_robust_lanes_ready(state)) {
         l->settled = 0;
         l->most = MOST_CLEAN;
         EACH_AXIS {
@@ -328,7 +315,7 @@ static void lanes_mend(il_lanes *l, const il_array *a, il_array_state *state, un
         lanes_scatter(l, a, &state->axis[j], j);
         lanes_remember(l, a, &state->axis[j], j);
     }
-    lanes_part(l);
+    il_lanes_part(l);
 }
 
 /* Weights and flags of the axes where all is well. */
@@ -352,8 +339,8 @@ static unsigned lanes_met(const il_array *a, const il_array_state *state, unsign
     return met;
 }
 
-static unsigned lanes_step(il_lanes *l, const il_array *a, const il_robust_terms *t, il_array_state *state,
-                           const il_real *z, const il_real *reading, il_real *rate, int want_health) {
+unsigned il_robust_lanes_step(il_lanes *l, const il_array *a, const il_robust_terms *t, il_array_state *state,
+                              const il_real *z, const il_real *reading, il_real *rate, int want_health) {
     unsigned closely = 0;
     if (!l->settled) lanes_experience(l, a, state);
     lanes_fuse(l, a, t, z, reading);
@@ -380,7 +367,7 @@ static unsigned lanes_step(il_lanes *l, const il_array *a, const il_robust_terms
     return lanes_met(a, state, closely, want_health);
 }
 
-static void lanes_leave(il_lanes *l, const il_array *a, il_array_state *state) {
+void il_robust_lanes_leave(il_lanes *l, const il_array *a, il_array_state *state) {
     lanes_count(l, state);
     EACH_AXIS {
         lanes_scatter(l, a, &state->axis[j], j);
@@ -389,30 +376,4 @@ static void lanes_leave(il_lanes *l, const il_array *a, il_array_state *state) {
 }
 
 LANES_END
-
-int il_lanes_start(il_lanes *l, const il_array *a, size_t n) {
-    if (a->method != IL_ROBUST || a->axes != 3 || n < BLOCK) return 0;
-    l->together = 0;
-    l->wait = 0;
-    l->pause = PAUSE;
-    return LANES_SUPPORTED;
-}
-
-int il_lanes_ready(il_lanes *l, const il_array *a, const il_array_state *state) {
-    if (all_well(state)) {
-        lanes_enter(l, a, state);
-    } else {
-        lanes_part(l);
-    }
-    return l->together;
-}
-
-unsigned il_lanes_step(il_lanes *l, const il_array *a, const il_robust_terms *t, il_array_state *state, const il_real *z,
-                       const il_real *reading, il_real *rate, int want_health) {
-    return lanes_step(l, a, t, state, z, reading, rate, want_health);
-}
-
-void il_lanes_end(il_lanes *l, const il_array *a, il_array_state *state) {
-    if (l->together) lanes_leave(l, a, state);
-}
 #endif

@@ -16,11 +16,11 @@ static il_real noise(void) {
     return (random_real() + random_real() + random_real()) * REAL(1);
 }
 
-/* Any settings of the robust method. */
-static il_array any_settings(void) {
+/* Any settings of a method. */
+static il_array any_settings(int method) {
     il_array a;
     memset(&a, 0, sizeof a);
-    a.method = IL_ROBUST;
+    a.method = method;
     a.axes = 3;
     a.elements = 3 + one_of(MOST_GYROS - 2);
     a.initial = one_of(3);
@@ -137,10 +137,10 @@ static void check_same(const il_array *a, int samples, int health, fused *blocks
     if (health > 1) CHECK_SAME(blocks->weight, single->weight, all * n);
 }
 
-static void any_faults_in_any_axis(void) {
+static void any_faults_in_any_axis(int method, int seeds) {
     static fused blocks, single;
-    for (int seed = 0; seed < 120; seed++) {
-        const il_array a = any_settings();
+    for (int seed = 0; seed < seeds; seed++) {
+        const il_array a = any_settings(method);
         const int samples = MOST_SAMPLES - one_of(900), health = one_of(3), faults = one_of(4);
         const uint8_t *stands = one_of(3) ? NULL : still;
         any_readings(&a, samples);
@@ -151,12 +151,33 @@ static void any_faults_in_any_axis(void) {
     }
 }
 
+/* Readings whose squares are beyond all numbers leave no weight. */
+static void variances_beyond_all_numbers(void) {
+    enum { SAMPLES = 100 };
+    static fused blocks, single;
+    il_array a = any_settings(IL_LEAST_SQUARES);
+    a.matrix = NULL; /* which mixes the axes */
+    const size_t n = (size_t)a.elements;
+    any_readings(&a, SAMPLES);
+    for (size_t i = 0; i < n; i++) {
+        il_real x = i % 2 ? REAL(1e30) : REAL(-1e30);
+        for (int times = IS_FLOAT ? 1 : 6; times > 1; times--) x *= REAL(1e30);
+        reading[(50 * 3 + 1) * n + i] = x;
+    }
+    run_single(&a, SAMPLES, NULL, &single);
+    CHECK(single.rate[SAMPLES * 3 - 2] != single.rate[SAMPLES * 3 - 2]);
+    CHECK(single.rate[SAMPLES * 3 - 1] == single.rate[SAMPLES * 3 - 1]);
+    run_blocks(&a, SAMPLES, NULL, 2, &blocks);
+    CHECK(blocks.met & IL_NOT_FINITE);
+    check_same(&a, SAMPLES, 2, &blocks, &single);
+}
+
 /* Counts that are kept together for a while are brought up to date in time, and stop at the largest number. */
 static void counts_reach_their_limits(void) {
     enum { WARM = 200, SAMPLES = 400 };
     static fused blocks, single;
     for (int odd = 0; odd < 2; odd++) {
-        il_array a = any_settings();
+        il_array a = any_settings(IL_ROBUST);
         a.elements = 6 + odd;
         a.start = 1;
         a.cap = odd ? UINT32_MAX : 5000;
@@ -179,6 +200,9 @@ static void counts_reach_their_limits(void) {
 }
 
 void test_lanes(void) {
-    any_faults_in_any_axis();
+    any_faults_in_any_axis(IL_ROBUST, 120);
+    any_faults_in_any_axis(IL_LEAST_SQUARES, 40);
+    any_faults_in_any_axis(IL_MEAN, 20);
+    variances_beyond_all_numbers();
     counts_reach_their_limits();
 }

@@ -27,6 +27,7 @@ _CORE = (
     "robust.c",
     "robust_well.c",
     "robust_lanes.c",
+    "lanes.c",
     "table.c",
 )
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
