@@ -286,8 +286,7 @@ static il_real axis_step(const il_array *a, const il_robust_terms *t, il_array_a
     }
 }
 
-/* Flags of a feedback sample, and its weights in the sum of one; apart, because its speed is the recursion's. */
-static void feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
+void il_feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
     il_real total = IL_C(0.0);
     for (int32_t i = 0; i < a->elements; i++) {
         s->flags[i] = il_finite(z[i]) ? 0 : (uint8_t)IL_NOT_FINITE;
@@ -323,7 +322,7 @@ static inline unsigned step(const il_array *a, const il_robust_terms *t, il_arra
         il_count(&s->count);
         if (a->method == IL_FEEDBACK) {
             s->rate = feedback_step(a, s, mine, axis);
-            if (want_health) feedback_health(a, s, mine);
+            if (want_health) il_feedback_health(a, s, mine);
         } else {
             s->rate = axis_step(a, t, s, mine, reading + axis * a->elements, axis, want_health);
         }

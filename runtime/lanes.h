@@ -29,8 +29,8 @@ typedef int32_t il_verdict __attribute__((vector_size(16))); /* what a compariso
 typedef int64_t il_verdict __attribute__((vector_size(32)));
 #endif
 
-/* State of the robust method while all is well, or of least squares while no reading is missing, the axes beside each
- * other; and one sample at work (as in robust.h). */
+/* State of the robust method while all is well, of least squares while no reading is missing, of feedback: the axes beside
+ * each other; and one sample at work (as in robust.h). */
 struct il_lanes {
     int together;          /* not 0: the state is here, and what il_array_axis has of it is out of date */
     int settled;           /* gains and pulls do not change any more */

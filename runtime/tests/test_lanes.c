@@ -122,14 +122,24 @@ static void settle_nan(il_real *x, size_t n) {
     for (size_t i = 0; i < n; i++) x[i] = x[i] == x[i] ? x[i] : NAN_REAL;
 }
 
+static void settle_state(il_array_state *state) {
+    for (int j = 0; j < 3; j++) {
+        il_array_axis *s = &state->axis[j];
+        settle_nan(&s->rate, 1);
+        settle_nan(s->bias, LENGTH(s->bias));
+        settle_nan(s->variance, LENGTH(s->variance));
+        settle_nan(s->weight, LENGTH(s->weight));
+    }
+}
+
 static void check_same(const il_array *a, int samples, int health, fused *blocks, fused *single) {
     const size_t n = (size_t)a->elements, all = (size_t)samples * 3;
     settle_nan(blocks->rate, all);
     settle_nan(single->rate, all);
-    for (int j = 0; j < 3; j++) {
-        settle_nan(&blocks->state.axis[j].rate, 1);
-        settle_nan(&single->state.axis[j].rate, 1);
-    }
+    settle_state(&blocks->state);
+    settle_state(&single->state);
+    settle_nan(blocks->weight, all * n);
+    settle_nan(single->weight, all * n);
     CHECK_SAME(blocks->rate, single->rate, all);
     CHECK_SAME(&blocks->state, &single->state, 1);
     if (health > 0) CHECK_SAME(blocks->flags, single->flags, all * n);
@@ -202,6 +212,7 @@ static void counts_reach_their_limits(void) {
 void test_lanes(void) {
     any_faults_in_any_axis(IL_ROBUST, 120);
     any_faults_in_any_axis(IL_LEAST_SQUARES, 40);
+    any_faults_in_any_axis(IL_FEEDBACK, 40);
     any_faults_in_any_axis(IL_MEAN, 20);
     variances_beyond_all_numbers();
     counts_reach_their_limits();
