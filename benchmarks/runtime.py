@@ -28,6 +28,8 @@ NAMES = {
     "robust": "array `robust` against `feedback`",
     "feedback-three": "array `feedback`, three axes against one",
     "robust-three": "array `robust`, three axes against one",
+    "mean-three": "array `mean`, three axes against one",
+    "least-squares-three": "array `least-squares`, three axes against one",
 }
 
 
@@ -45,7 +47,7 @@ def _in_c() -> list[tuple[str, str, str]]:
         for line in done.stdout.splitlines():
             name, ratio, limit = line.split(" #")[0].split()
             found.setdefault(name, []).append(float(ratio))
-            asked[name] = "" if name == "robust-three" else f"<= {limit}"
+            asked[name] = f"<= {limit}"
     made = []
     for name, ratios in found.items():
         title = NAMES.get(name) or f"`il_warmup_block`, {name.removeprefix('warmup-')}, 6 axes, against a copy"

@@ -1,5 +1,5 @@
-/* Gyro array: the plain methods, and what all methods share; robust.c and robust_well.c hold the robust one. */
-#include "array.h"
+/* Gyro array: the plain methods, and what all methods share; the robust one is in robust.c and what goes with it. */
+#include "lanes.h"
 
 /* A reading may come with an alignment of its element over the axes; then one lost axis loses all. */
 static void aligned(const il_array *a, const il_real *reading, il_real *z) {
@@ -20,49 +20,68 @@ il_real il_array_gain(const il_array *a, uint32_t k) {
     return a->memory > IL_C(0.0) ? a->memory : IL_C(1.0) / (il_real)k;
 }
 
-/* Mean of the finite readings; flags those that are not, and counts the others. */
-static il_real finite_mean(const il_array *a, il_array_axis *s, const il_real *z, int32_t *count) {
+/* Mean of the finite readings, some of which are not; flags those, and counts the others. */
+static il_real mean_of_some(const il_array *a, il_array_axis *s, const il_real *z, int32_t *count) {
     il_real sum = IL_C(0.0);
-    *count = 0;
+    int32_t found = 0;
     for (int32_t i = 0; i < a->elements; i++) {
         int fine = il_finite(z[i]);
         s->flags[i] = fine ? 0 : (uint8_t)(IL_NOT_FINITE | IL_EXCLUDED);
         if (fine) {
             sum += z[i];
-            ++*count;
+            found++;
         }
     }
-    return *count > 0 ? sum / (il_real)*count : il_nan();
+    *count = found;
+    return found > 0 ? sum / (il_real)found : il_nan();
 }
 
-/* Sum of weight times value over the finite readings, their weights made to sum to one and kept. */
-static il_real weighted(const il_array *a, il_array_axis *s, const il_real *z) {
+/* Mean of the finite readings. Counts them, and flags the others; without a wish for health only where there are some. */
+static inline il_real finite_mean(const il_array *a, il_array_axis *s, const il_real *z, int32_t *count, int want_health) {
+    const int32_t n = a->elements;
+    il_real sum[2] = {IL_C(0.0), IL_C(0.0)};
+    int32_t i;
+    for (i = 0; i + 1 < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) sum[j] += z[i + j];
+    }
+    if (i < n) sum[0] += z[i];
+    if (!il_finite(sum[0] + sum[1])) return mean_of_some(a, s, z, count);
+    for (i = 0; want_health && i < n; i++) s->flags[i] = 0;
+    *count = n;
+    return (sum[0] + sum[1]) / (il_real)n;
+}
+
+/* Weighted mean of the finite readings; makes the weights sum to one. */
+static il_real weighted(const il_array *a, il_array_axis *s, const il_real *z, int want_health) {
     il_real total = IL_C(0.0), sum = IL_C(0.0);
     for (int32_t i = 0; i < a->elements; i++) {
         if (s->flags[i]) s->weight[i] = IL_C(0.0);
         total += s->weight[i];
-    }
-    if (total == IL_C(0.0)) return il_nan();
-    for (int32_t i = 0; i < a->elements; i++) {
-        s->weight[i] /= total;
         if (!s->flags[i]) sum += s->weight[i] * z[i];
     }
-    return sum;
+    if (total == IL_C(0.0)) return il_nan();
+    for (int32_t i = 0; want_health && i < a->elements; i++) s->weight[i] /= total;
+    return sum / total;
 }
 
-static il_real mean_step(const il_array *a, il_array_axis *s, const il_real *z) {
-    int32_t count;
-    il_real mean = finite_mean(a, s, z, &count);
+/* Equal weights of `count` gyros. */
+static void weigh_alike(const il_array *a, il_array_axis *s, int32_t count) {
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] = s->flags[i] ? IL_C(0.0) : IL_C(1.0) / (il_real)count;
+}
+
+static il_real mean_step(const il_array *a, il_array_axis *s, const il_real *z, int want_health) {
+    int32_t count;
+    il_real mean = finite_mean(a, s, z, &count, want_health);
+    if (want_health) weigh_alike(a, s, count);
     return mean;
 }
 
 /* Support degree: a reading weighs as much as the others support it, by a kernel of the distance of each pair, in
  * units of the root mean square distance so far. */
-static il_real support_step(const il_array *a, il_array_axis *s, const il_real *z) {
+static il_real support_step(const il_array *a, il_array_axis *s, const il_real *z, int want_health) {
     int32_t n = a->elements, count;
     il_real sum = IL_C(0.0);
-    finite_mean(a, s, z, &count);
+    finite_mean(a, s, z, &count, 1);
     for (int32_t i = 0; i < n; i++) {
         s->weight[i] = IL_C(0.0);
         for (int32_t j = 0; j < i; j++) sum += s->flags[i] | s->flags[j] ? IL_C(0.0) : (z[i] - z[j]) * (z[i] - z[j]);
@@ -82,33 +101,93 @@ static il_real support_step(const il_array *a, il_array_axis *s, const il_real *
             s->weight[j] += kernel;
         }
     }
-    if (count == 1) return mean_step(a, s, z);
-    return weighted(a, s, z);
+    if (count == 1) return mean_step(a, s, z, want_health);
+    return weighted(a, s, z, want_health);
 }
 
-/* Inverse-variance weights, the variance of each gyro about the mean of the array. */
-static il_real least_squares_step(const il_array *a, il_array_axis *s, const il_real *z) {
-    int32_t count;
-    il_real mean = finite_mean(a, s, z, &count);
-    for (int32_t i = 0; i < a->elements; i++) {
-        if (!s->flags[i] && count > 1) {
-            uint32_t k = il_counted(s->seen[i], a->start);
-            il_real gain = s->seen[i] == 0 ? IL_C(1.0) : il_array_gain(a, k), residual = z[i] - mean - s->bias[i];
-            s->bias[i] += gain * residual;
-            s->variance[i] += gain * ((IL_C(1.0) - gain) * residual * residual - s->variance[i]);
-            il_count(&s->seen[i]);
+/* Residuals about the mean to biases, variances and inverse-variance weights. Two gyros at a time, as in feedback. */
+static il_real least_squares_loop(int32_t n, il_real mean, const il_real *restrict z, const il_real *restrict gain,
+                                  const il_real *restrict least, il_real *restrict bias, il_real *restrict variance,
+                                  il_real *restrict weight, il_real *total) {
+    il_real all[2] = {IL_C(0.0), IL_C(0.0)}, sum[2] = {IL_C(0.0), IL_C(0.0)};
+    for (int32_t i = 0; i < n; i += 2) {
+        for (int32_t j = 0; j < 2; j++) {
+            const il_real g = gain[i + j], residual = z[i + j] - mean - bias[i + j];
+            /* Written as a step, which a float takes more exactly than (1-g) times the sum. */
+            const il_real v = variance[i + j] + g * ((IL_C(1.0) - g) * residual * residual - variance[i + j]);
+            const il_real w = IL_C(1.0) / (v + least[i + j]);
+            bias[i + j] += g * residual;
+            variance[i + j] = v;
+            weight[i + j] = w;
+            all[j] += w;
+            sum[j] += w * z[i + j];
         }
-        /* equal weights until every variance rests on two residuals */
-        s->weight[i] = s->count - a->start < 2 ? IL_C(1.0) : IL_C(1.0) / (s->variance[i] + IL_TINY);
     }
-    return weighted(a, s, z);
+    *total = all[0] + all[1];
+    return (sum[0] + sum[1]) / *total;
 }
 
-static il_real fixed_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis) {
+/* Gain of a bias and of a variance after `seen` residuals. */
+static il_real least_squares_gain(const il_array *a, uint32_t seen) {
+    return seen == 0 ? IL_C(1.0) : il_array_gain(a, il_counted(seen, a->start));
+}
+
+/* Gains and floors of the variances, and one more residual seen. A gyro without a reading has no gain and no weight. */
+static void least_squares_prepare(const il_array *a, il_array_axis *s, int32_t count, il_real *gain, il_real *least) {
+    const int32_t n = a->elements;
+    uint32_t differ = 0;
+    for (int32_t i = 0; i < n; i++) differ |= s->seen[i] ^ s->seen[0];
+    if (count == n && differ == 0) { /* nearly always: one division serves */
+        const il_real shared = least_squares_gain(a, s->seen[0]);
+        const uint32_t seen = il_counted(s->seen[0], 1);
+        for (int32_t i = 0; i < n; i += 2) {
+            gain[i] = gain[i + 1] = shared;
+            least[i] = least[i + 1] = IL_TINY;
+        }
+        for (int32_t i = 0; i < n; i++) s->seen[i] = seen;
+    } else {
+        for (int32_t i = 0; i < n; i++) {
+            const int lost = count < n && s->flags[i];
+            gain[i] = lost ? IL_C(0.0) : least_squares_gain(a, s->seen[i]);
+            least[i] = lost ? (il_real)INFINITY : IL_TINY;
+            s->seen[i] = il_counted(s->seen[i], !lost);
+        }
+    }
+    gain[n] = IL_C(0.0); /* of the last one's partner, where n is odd */
+    least[n] = (il_real)INFINITY;
+}
+
+/* Inverse-variance weights, the variance of each gyro about the mean of the array. Apart, because its stack would add to
+ * that of the robust method. */
+static IL_APART il_real least_squares_step(const il_array *a, il_array_axis *s, const il_real *z, int want_health) {
+    const int32_t n = a->elements;
+    il_real y[IL_ARRAY_ROOM], gain[IL_ARRAY_ROOM], least[IL_ARRAY_ROOM], total;
     int32_t count;
-    finite_mean(a, s, z, &count);
+    const il_real mean = finite_mean(a, s, z, &count, want_health);
+    if (count > 1) {
+        least_squares_prepare(a, s, count, gain, least);
+        if (n % 2 || count < n) {
+            for (int32_t i = 0; i < n; i++) y[i] = count < n && s->flags[i] ? mean + s->bias[i] : z[i];
+            y[n] = mean;
+            z = y;
+        }
+        const il_real rate = least_squares_loop(n, mean, z, gain, least, s->bias, s->variance, s->weight, &total);
+        /* equal weights until every variance rests on two residuals */
+        if (s->count - a->start >= 2) {
+            if (total == IL_C(0.0)) return il_nan();
+            for (int32_t i = 0; want_health && i < n; i++) s->weight[i] /= total;
+            return rate;
+        }
+    }
+    if (want_health) weigh_alike(a, s, count);
+    return mean;
+}
+
+static il_real fixed_step(const il_array *a, il_array_axis *s, const il_real *z, int32_t axis, int want_health) {
+    int32_t count;
+    finite_mean(a, s, z, &count, 1);
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] = a->weight[axis * a->elements + i];
-    return weighted(a, s, z);
+    return weighted(a, s, z, want_health);
 }
 
 /* Bias at the first sample, for the methods that estimate one. */
@@ -167,7 +246,7 @@ static il_real kalman_step(const il_array *a, il_array_axis *s, const il_real *z
     int32_t n = a->elements, count;
     const il_real *gain = a->gain + axis * (n + 1) * n;
     il_real innovation[IL_ARRAY_ELEMENTS], correction = IL_C(0.0), usual = IL_C(0.0);
-    il_real mean = finite_mean(a, s, z, &count);
+    il_real mean = finite_mean(a, s, z, &count, 1);
     if (count == 0) return il_nan();
     if (s->seen[0] == 0) { /* the first sample with a reading starts the filter at the array's mean */
         s->seen[0] = 1;
@@ -198,17 +277,16 @@ static il_real kalman_step(const il_array *a, il_array_axis *s, const il_real *z
 static il_real axis_step(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
                          const il_real *reading, int32_t axis, int want_health) {
     switch (a->method) {
-        case IL_SUPPORT: return support_step(a, s, z);
-        case IL_LEAST_SQUARES: return least_squares_step(a, s, z);
+        case IL_SUPPORT: return support_step(a, s, z, want_health);
+        case IL_LEAST_SQUARES: return least_squares_step(a, s, z, want_health);
         case IL_ROBUST: return il_robust_step(a, t, s, z, reading, want_health);
-        case IL_COVARIANCE: return fixed_step(a, s, z, axis);
+        case IL_COVARIANCE: return fixed_step(a, s, z, axis, want_health);
         case IL_KALMAN: return kalman_step(a, s, z, axis);
-        default: return mean_step(a, s, z);
+        default: return mean_step(a, s, z, want_health);
     }
 }
 
-/* Flags of a feedback sample, and its weights in the sum of one; apart, because its speed is the recursion's. */
-static void feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
+void il_feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
     il_real total = IL_C(0.0);
     for (int32_t i = 0; i < a->elements; i++) {
         s->flags[i] = il_finite(z[i]) ? 0 : (uint8_t)IL_NOT_FINITE;
@@ -218,7 +296,7 @@ static void feedback_health(const il_array *a, il_array_axis *s, const il_real *
 }
 
 static inline unsigned step(const il_array *a, const il_robust_terms *t, il_array_state *state,
-                            const il_real *reading, il_real *rate, int want_health) {
+                            const il_real *reading, il_real *rate, int want_health, il_lanes *lanes) {
     il_real moved[3 * IL_ARRAY_ELEMENTS];
     const il_real *z = reading;
     unsigned flags = 0;
@@ -226,13 +304,25 @@ static inline unsigned step(const il_array *a, const il_robust_terms *t, il_arra
         aligned(a, reading, moved);
         z = moved;
     }
+#if IL_LANES
+    if (lanes != NULL) {
+        if (lanes->wait > 0) {
+            lanes->wait--;
+        } else if ((lanes->together || il_lanes_ready(lanes, a, state)) &&
+                   il_lanes_step(lanes, a, t, state, z, reading, rate, want_health, &flags)) {
+            return flags;
+        }
+    }
+#else
+    (void)lanes;
+#endif
     for (int32_t axis = 0; axis < a->axes; axis++) {
         il_array_axis *s = &state->axis[axis];
         const il_real *mine = z + axis * a->elements;
         il_count(&s->count);
         if (a->method == IL_FEEDBACK) {
             s->rate = feedback_step(a, s, mine, axis);
-            if (want_health) feedback_health(a, s, mine);
+            if (want_health) il_feedback_health(a, s, mine);
         } else {
             s->rate = axis_step(a, t, s, mine, reading + axis * a->elements, axis, want_health);
         }
@@ -284,7 +374,7 @@ il_status il_array_start(const il_array *settings, il_array_state *state) {
 unsigned il_array_step(const il_array *settings, il_array_state *state, const il_real *reading, il_real *rate) {
     il_robust_terms t;
     if (settings->method == IL_ROBUST) t = il_robust_prepare(settings);
-    return step(settings, &t, state, reading, rate, 1);
+    return step(settings, &t, state, reading, rate, 1, NULL);
 }
 
 void il_array_still(const il_array *settings, il_array_state *state) {
@@ -304,10 +394,16 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
     unsigned all = 0;
     int want_health = flags != NULL || weight != NULL;
     il_robust_terms t;
+    il_lanes *lanes = NULL;
     if (a.method == IL_ROBUST) t = il_robust_prepare(&a);
+#if IL_LANES
+    il_lanes room;
+    if (il_lanes_start(&room, &a, n)) lanes = &room;
+#endif
     for (size_t k = 0; k < n; k++) {
         /* the last sample leaves flags and weights in the state, as single steps do */
-        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, want_health || k + 1 == n);
+        const int health = want_health || k + 1 == n;
+        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, health, lanes);
         if (still != NULL && still[k]) il_array_still(&a, state);
         for (size_t axis = 0; want_health && axis < (size_t)a.axes; axis++) {
             const il_array_axis *s = &state->axis[axis];
@@ -316,5 +412,8 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
             if (weight != NULL) memcpy(weight + place, s->weight, elements * sizeof(il_real));
         }
     }
+#if IL_LANES
+    if (lanes != NULL) il_lanes_end(lanes, &a, state);
+#endif
     return all;
 }

@@ -117,6 +117,16 @@ static il_real teach(int32_t n, const il_robust_terms *restrict t, const sample 
     return larger(far[0], far[1]) + IL_C(2.0) * t->share * (sum[0] + sum[1]);
 }
 
+/* Whether no residual is beyond full teaching; exactly, where the margin of `compare` leaves it open. */
+static int straight(int32_t n, const sample *p) {
+    int all = 1;
+    for (int32_t i = 0; i < n; i++) {
+        const il_real e = p->r[i] - p->rate;
+        all &= e * e <= MOST * MOST * larger(p->trust[i], p->mean_variance);
+    }
+    return all;
+}
+
 /* Whether all readings lie well inside the gate, with residuals that teach in full. Fuses them, and changes no state
  * but the weights. Of any numbers, the median is no further from the mean than the root mean square deviation, so that
  * |r - median|^2 <= 2 (e^2 + mean e^2); and with the fused rate d away from the mean,
@@ -134,18 +144,37 @@ int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axi
     compare(n, t->gate, floor, p->r, s->variance, s->ratio, p->pull, p->trust, s->weight, p);
     if (p->top > a->weight_cap * p->total) hold(a, s->weight, p);
     const il_real apart = p->middle - p->rate, room = IL_C(2.0) * t->gate * p->mean_variance - p->squares;
-    return (p->outside <= room * t->share) & (p->bent + IL_C(5.0) * apart * apart <= IL_C(0.0));
+    if (!(p->outside <= room * t->share)) return 0;
+    return p->bent + IL_C(5.0) * apart * apart <= IL_C(0.0) || straight(n, p);
+}
+
+/* Whether the means of a second are so near to each other that none can have jumped. As in il_robust_find_small_jumps half
+ * of the limit, because one sample moves a variance a little. */
+int il_robust_agree(int32_t n, const il_robust_terms *t, const il_real *fast, const il_real *trust) {
+    il_real sorted[IL_ARRAY_ELEMENTS];
+    int all = 1;
+    memcpy(sorted, fast, (size_t)n * sizeof *fast);
+    const il_real usual = median(sorted, n);
+    for (int32_t i = 0; i < n; i++) {
+        const il_real far = fast[i] - usual;
+        all &= far * far <= IL_C(2.0) * t->jump * trust[i];
+    }
+    return all;
+}
+
+void il_robust_suspect(const il_array *a, il_array_axis *s, sample *p) {
+    il_robust_settle(a, s);
+    p->learnt = most_seen(a, s) - 1;
+    memset(p->learns, 1, sizeof p->learns);
+    il_robust_find_small_jumps(a, s, p);
+    il_robust_muster(a, s);
 }
 
 /* What `learn` does in robust.c. */
 void il_robust_learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, sample *p) {
     /* The median of the means of a second is no further from 0 than sqrt(2) times their root mean square. */
     if (teach(a->elements, t, p, p->r, p->gain, p->trust, s->bias, s->variance, s->fast) <= IL_C(0.0)) return;
-    il_robust_settle(a, s);
-    p->learnt = most_seen(a, s) - 1;
-    memset(p->learns, 1, sizeof p->learns);
-    il_robust_find_small_jumps(a, s, p);
-    il_robust_muster(a, s);
+    if (!il_robust_agree(a->elements, t, s->fast, p->trust)) il_robust_suspect(a, s, p);
 }
 
 il_robust_terms il_robust_prepare(const il_array *a) {

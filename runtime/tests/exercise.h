@@ -36,9 +36,12 @@ static inline void exercise(const il_unit *unit) {
         il_array_state *state = malloc(sizeof *state);
         il_real *reading = malloc(width * EXERCISE_SAMPLES * sizeof *reading), rate[3 * EXERCISE_SAMPLES];
         uint8_t *flags = malloc(width * EXERCISE_SAMPLES);
-        if (state != NULL && reading != NULL && flags != NULL && il_array_start(&unit->array, state) == IL_OK) {
+        /* at first with odd readings everywhere, then with a few in one sample, so that all may be well before */
+        for (size_t few = 0; few < 2 && state != NULL && reading != NULL && flags != NULL; few++) {
+            if (il_array_start(&unit->array, state) != IL_OK) break;
             for (size_t i = 0; i < width * EXERCISE_SAMPLES; i++) {
-                reading[i] = i % 37 == 5 ? odd[i % 8] : (il_real)0.1 * (il_real)(i % 11) + (il_real)0.01 * (il_real)(i % 7);
+                reading[i] = (il_real)0.1 * (il_real)(i % 11) + (il_real)0.01 * (il_real)(i % 7);
+                if (i % 37 == 5 && (few == 0 || i / width == EXERCISE_SAMPLES - 3)) reading[i] = odd[i % 8];
             }
             (void)il_array_block(&unit->array, state, EXERCISE_SAMPLES, reading, NULL, rate, flags, NULL);
             il_array_still(&unit->array, state);

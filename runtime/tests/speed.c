@@ -12,6 +12,7 @@
 
 enum { ROUNDS = 15, N = 1000000, GYROS = 6, AXES = 6, SAMPLES = 200000 };
 #define REAL(x) ((il_real)(x))
+#define LENGTH(array) (sizeof(array) / sizeof *(array))
 
 static double now(void) {
 #if defined(CLOCK_MONOTONIC)
@@ -195,20 +196,40 @@ static void robust_three(void) {
     fuse(IL_ROBUST, 3);
 }
 
+static void mean(void) {
+    fuse(IL_MEAN, 1);
+}
+
+static void mean_three(void) {
+    fuse(IL_MEAN, 3);
+}
+
+static void least_squares(void) {
+    fuse(IL_LEAST_SQUARES, 1);
+}
+
+static void least_squares_three(void) {
+    fuse(IL_LEAST_SQUARES, 3);
+}
+
 static void arrays(void) {
-    static void (*const jobs[])(void) = {bare_loop, feedback, feedback_three, robust, robust_three};
-    double t[5];
+    static void (*const jobs[])(void) = {bare_loop,    feedback, feedback_three, robust,
+                                         robust_three, mean,     mean_three,     least_squares, least_squares_three};
+    enum { JOBS = LENGTH(jobs) };
+    double t[JOBS];
     readings = column(3 * GYROS * SAMPLES);
     rates = column(3 * SAMPLES);
     for (size_t k = 0; k < 3 * SAMPLES; k++) {
         for (size_t i = 0; i < GYROS; i++) readings[k * GYROS + i] *= REAL(0.01) * REAL(1 + i);
     }
-    race(5, jobs, t);
-    for (int j = 0; j < 5; j++) t[j] *= 1e9 / SAMPLES;
+    race(JOBS, jobs, t);
+    for (int j = 0; j < JOBS; j++) t[j] *= 1e9 / SAMPLES;
     printf("feedback %.2f 1.3 # of a bare loop: %.1f ns a sample, loop %.1f ns\n", t[1] / t[0], t[1], t[0]);
     printf("robust %.2f 5 # of feedback: %.1f ns a sample\n", t[3] / t[1], t[3]);
     printf("feedback-three %.2f 2.2 # axes against one: %.1f ns\n", t[2] / t[1], t[2]);
-    printf("robust-three %.2f 3 # axes against one: %.1f ns\n", t[4] / t[3], t[4]);
+    printf("robust-three %.2f 2.2 # axes against one: %.1f ns\n", t[4] / t[3], t[4]);
+    printf("mean-three %.2f 2.2 # axes against one: %.1f ns, one %.1f ns\n", t[6] / t[5], t[6], t[5]);
+    printf("least-squares-three %.2f 2.2 # axes against one: %.1f ns, one %.1f ns\n", t[8] / t[7], t[8], t[7]);
 }
 
 int main(void) {
