@@ -11,6 +11,7 @@ from contextlib import suppress
 
 import pytest
 
+from fleets import command, make_fleet
 from imulab.fleet import processes
 
 NAME = "OMP_NUM_THREADS"
@@ -46,6 +47,16 @@ def test_the_process_that_forks_may_end_too():
             time.sleep(0.02)
         else:
             pytest.fail("no other was started")
+
+
+def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
+    folder = tmp_path / ("x" * 120)
+    folder.mkdir()
+    manifest = make_fleet(tmp_path / "in", 3)
+    process = command("fleet", "run", manifest, "-o", tmp_path / "out", "--workers", 2, env={"TMPDIR": str(folder)})
+    out, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (0, "")
+    assert out.startswith("3 units: 3 done, 0 failed")
 
 
 @pytest.mark.parametrize("before", [None, "7"])

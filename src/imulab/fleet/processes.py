@@ -33,19 +33,24 @@ class ProcessLostError(Exception):
 
 def prepare(modules: Sequence[str]) -> None:
     """Begin to load modules in the process that others will be forked off, and do not wait for it."""
+    if _FORKS:
+        multiprocessing.set_forkserver_preload(list(modules))
+        _method()
+
+
+def _method() -> str:
+    """Return how processes are started, and start the one that is to fork if none runs."""
     if not _FORKS:
-        return
+        return "spawn"
     from multiprocessing import forkserver, resource_tracker
 
     resource_tracker.ensure_running()  # by itself: it would let interrupts through again
-    forkserver.set_forkserver_preload(list(modules))
-    # An interrupt of the terminal goes to all its processes: this one says what is to be said of it.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with _one_thread_each():
+        with _one_thread_each(), _interrupts_later():
             forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    except OSError:  # the name of the folder for temporary files is too long for a socket
+        return "spawn"
+    return "forkserver"
 
 
 def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], processes: int) -> Iterator[T]:
@@ -56,14 +61,16 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
     ProcessLostError
         A process has ended under its work; the others are ended too.
     """
-    context = multiprocessing.get_context("forkserver" if _FORKS else "spawn")
+    context = multiprocessing.get_context(_method())
     with _one_thread_each():
         pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_attend)
         over: SimpleQueue[Future[T]] = SimpleQueue()
         left = 0
         try:
             for call in calls:
-                pool.submit(function, *call).add_done_callback(over.put)
+                with _interrupts_later():
+                    future = pool.submit(function, *call)
+                future.add_done_callback(over.put)
                 left += 1
                 if left >= _AHEAD * processes:
                     yield over.get().result()
@@ -89,6 +96,19 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Start processes without being interrupted: none that nobody waits for, and none that hears of interrupts itself.
+
+    An interrupt of the terminal goes to all its processes; this one says what is to be said of it.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def keep_memory() -> None:
