@@ -104,6 +104,9 @@ def _interrupts_later() -> Iterator[None]:
 
     An interrupt of the terminal goes to all its processes; this one says what is to be said of it.
     """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -117,10 +120,12 @@ def keep_memory() -> None:
     Otherwise it goes back to the system with every recording, which clears it page by page before it gives it again: a
     seventh of the time of a unit.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        for parameter, size in _KEPT.items():
-            mallopt(parameter, size)
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # another C library, or a system that does not give its own
+        return
+    for parameter, size in _KEPT.items():
+        mallopt(parameter, size)
 
 
 def _attend() -> None:
