@@ -70,6 +70,17 @@ def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, b
     assert os.environ.get(NAME) == before
 
 
+@pytest.mark.parametrize(
+    ("text", "share"), [("max 100000", 8), ("250000 100000", 3), ("1000 100000", 1), ("9000000 100000", 8), ("", 8)]
+)
+def test_no_more_processes_than_the_control_group_has_time_for(monkeypatch, tmp_path, text, share):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(processes, "_QUOTA", tmp_path / "cpu.max")
+    assert processes.available() == 8
+    (tmp_path / "cpu.max").write_text(text)
+    assert processes.available() == share
+
+
 FAULTS = """
 import resource, sys
 from imulab.fleet import processes

@@ -181,17 +181,10 @@ def open_engine(
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: expected 1 or more")
     if kind == "local":
-        yield LocalEngine(workers or _processors(), modules)
+        yield LocalEngine(workers or processes.available(), modules)
         return
     with ExitStack() as stack:
         yield _dask(scheduler, workers, stack)
-
-
-def _processors() -> int:
-    """Return how many processors this process may use, by its affinity and its control group."""
-    import joblib
-
-    return int(joblib.cpu_count())
 
 
 def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskEngine:
@@ -203,7 +196,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
         if name.partition(".")[0] in ("asyncio", "distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what a person must know is said by the watch
     if scheduler is None:
-        count = workers or _processors()
+        count = workers or processes.available()
         cluster = stack.enter_context(
             LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"

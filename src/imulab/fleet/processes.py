@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import multiprocessing
 import os
 import signal
@@ -13,6 +14,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from queue import SimpleQueue
 from typing import TypeVar
 
@@ -27,8 +29,21 @@ _KEPT = {-3: 1 << 25, -1: 1 << 28}
 """Bytes up to which glibc is to keep memory: M_MMAP_THRESHOLD, of which that is the most, and M_TRIM_THRESHOLD."""
 
 
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+
+
 class ProcessLostError(Exception):
     """A process has ended under its work."""
+
+
+def available() -> int:
+    """Return how many processors this process may use, by its affinity and the quota of its control group."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = _QUOTA.read_text().split()
+        return count if quota == "max" else max(1, min(count, math.ceil(int(quota) / int(period))))
+    except (OSError, ValueError):
+        return count
 
 
 def prepare(modules: Sequence[str]) -> None:
