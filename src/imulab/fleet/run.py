@@ -15,7 +15,7 @@ from imulab.errors import OptionError
 from imulab.files import write_text
 from imulab.fleet.engine import Engine, WorkersLostError, open_engine
 from imulab.fleet.history import History, open_history
-from imulab.fleet.manifest import FleetManifest, Unit, load_fleet
+from imulab.fleet.manifest import FleetManifest, Unit, load_fleet, modules_of
 from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
@@ -72,7 +72,7 @@ def default_history(folder: str | Path) -> str:
 
 
 def run_fleet(
-    manifest: str,
+    manifest: str | FleetManifest,
     folder: str,
     *,
     engine: str = "local",
@@ -91,7 +91,7 @@ def run_fleet(
     Parameters
     ----------
     manifest
-        CSV or Parquet, path or URL: ``serial,procedure,file`` and options of the fits.
+        CSV or Parquet, path or URL: ``serial,procedure,file`` and options of the fits; or such a one as it was read.
     folder
         Where the records go; made if it is not there.
     engine, scheduler, workers
@@ -110,7 +110,7 @@ def run_fleet(
         The manifest, an option, the folder, the cluster or the history cannot be used.
     """
     begin = time.monotonic()
-    fleet = load_fleet(manifest)
+    fleet = load_fleet(manifest) if isinstance(manifest, str) else manifest
     store = Store(Path(folder).resolve())
     if not folder:
         raise OptionError("output '': expected the name of a folder to write to")
@@ -125,9 +125,9 @@ def run_fleet(
     with ExitStack() as stack:
         notes: list[str] = []
         past = _open_history(history, stack) if history else None
-        needed = dict.fromkeys(name for unit in fleet.units for name in TASKS[unit.procedure].modules)
-        modules = ("imulab.fleet.work", *needed)
-        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=workers, modules=modules))
+        machine = stack.enter_context(
+            open_engine(engine, scheduler=scheduler, workers=workers, modules=modules_of(fleet))
+        )
         token = stack.enter_context(store.run())
         if history is None:
             try:
