@@ -59,6 +59,18 @@ def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
     assert out.startswith("3 units: 3 done, 0 failed")
 
 
+@pytest.mark.parametrize("forks", [True, False])
+def test_a_script_needs_no_guard(tmp_path, forks):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from imulab.fleet import processes\n"
+        f"processes._FORKS &= {forks}\n"
+        "print(sorted(processes.run(pow, [(2, 3), (2, 4)], 2)))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.stdout, done.stderr) == ("[8, 16]\n", "")
+
+
 @pytest.mark.parametrize("before", [None, "7"])
 def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, before):
     monkeypatch.delenv(NAME, raising=False)

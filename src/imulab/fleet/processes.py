@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from queue import SimpleQueue
+from types import ModuleType
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -83,7 +84,7 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
         left = 0
         try:
             for call in calls:
-                with _interrupts_later():
+                with _interrupts_later(), _without_main():
                     future = pool.submit(function, *call)
                 future.add_done_callback(over.put)
                 left += 1
@@ -127,6 +128,17 @@ def _interrupts_later() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """Start processes that do not run the script again that called: nothing that it defines is sent to them."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def keep_memory() -> None:
