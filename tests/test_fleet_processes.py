@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import pytest
@@ -80,6 +81,22 @@ def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, b
     calls = processes.run(os.getenv, [(NAME,)] * 3, 2)
     assert list(calls) == ["1"] * 3
     assert os.environ.get(NAME) == before
+
+
+def test_runs_of_several_threads_leave_the_settings_of_all(monkeypatch):
+    for name in processes._THREADS:
+        monkeypatch.delenv(name, raising=False)
+    before, main = dict(os.environ), sys.modules["__main__"]
+    first, second = (processes.run(os.getenv, [(NAME,)] * 200, 1) for _ in range(2))
+    next(first)
+    assert dict(os.environ) == before  # between two results too
+    next(second)
+    assert list(first) + list(second) == ["1"] * 398
+    with ThreadPoolExecutor(3) as threads:
+        runs = [threads.submit(lambda: list(processes.run(os.getenv, [(NAME,)] * 200, 1))) for _ in range(3)]
+        assert [run.result() for run in runs] == [["1"] * 200] * 3
+    assert dict(os.environ) == before
+    assert sys.modules["__main__"] is main
 
 
 @pytest.mark.parametrize(
