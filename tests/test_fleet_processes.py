@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import pytest
 
-from fleets import command, make_fleet
+from fleets import command, make_fleet, wait_for
 from imulab.fleet import processes
 
 NAME = "OMP_NUM_THREADS"
@@ -58,6 +58,27 @@ def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
     out, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (0, "")
     assert out.startswith("3 units: 3 done, 0 failed")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such interrupts")
+def test_a_second_interrupt_does_not_wait_for_what_is_under_work(tmp_path):
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from imulab.fleet import processes\n"
+        "import sys\n"
+        "calls = [('import time, pathlib; pathlib.Path(' + repr(sys.argv[1]) + ').touch(); time.sleep(60)',)] * 8\n"
+        "list(processes.run(exec, calls, 2))\n"
+    )
+    begun = tmp_path / "begun"
+    process = subprocess.Popen([sys.executable, "-c", code, begun], stderr=subprocess.PIPE, text=True)
+    wait_for(begun.exists)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert process.returncode == -signal.SIGINT
+    assert error.rstrip().endswith("KeyboardInterrupt")
 
 
 @pytest.mark.parametrize("forks", [True, False])

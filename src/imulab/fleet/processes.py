@@ -97,7 +97,18 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
     except (BrokenProcessPool, EOFError, ConnectionError) as error:  # the latter two: of the one that is to fork
         raise ProcessLostError(str(error)) from None
     finally:
+        _end(pool)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Wait for what is under work and end the processes; a second interrupt does not wait."""
+    workers = list((pool._processes or {}).values())
+    try:
         pool.shutdown(cancel_futures=True)
+    except KeyboardInterrupt:  # which would leave them waiting for work, and this process for them
+        for worker in workers:
+            worker.kill()
+        raise
 
 
 @contextmanager
