@@ -102,6 +102,17 @@ def test_models_that_differ_are_named_and_what_scatters_from_test_to_test_is_not
     )
 
 
+def test_curves_that_differ_are_named():
+    """A centrifuge record names the curve of each axis in a set of its own."""
+
+    def record(x, y):
+        model = {"radius": {"value": 0.5, "unit": "m", "from": "manifest"}, "curve": {"x": x, "y": y}}
+        return Calibration("centrifuge", {"x_K0": Parameter(0.0, 1.0, "rad/s")}, Covariance((), ()), model, {})
+
+    found = compare_records(record("constant", "linear"), record("quadratic", "linear"))
+    assert found.models == ("curve x constant and quadratic",)
+
+
 def test_show_says_that_a_change_may_come_from_the_order(tmp_path, capsys):
     data = tmp_path / "tumble.csv"
     assert main(["tumble", "simulate", "--order", "2", "--attitudes", "18", "-o", str(data)]) == 0

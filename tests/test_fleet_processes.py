@@ -7,11 +7,12 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import pytest
 
-from fleets import command, make_fleet
+from fleets import command, make_fleet, wait_for
 from imulab.fleet import processes
 
 NAME = "OMP_NUM_THREADS"
@@ -59,6 +60,27 @@ def test_a_folder_for_temporary_files_may_have_a_long_name(tmp_path):
     assert out.startswith("3 units: 3 done, 0 failed")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such interrupts")
+def test_a_second_interrupt_does_not_wait_for_what_is_under_work(tmp_path):
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from imulab.fleet import processes\n"
+        "import sys\n"
+        "calls = [('import time, pathlib; pathlib.Path(' + repr(sys.argv[1]) + ').touch(); time.sleep(60)',)] * 8\n"
+        "list(processes.run(exec, calls, 2))\n"
+    )
+    begun = tmp_path / "begun"
+    process = subprocess.Popen([sys.executable, "-c", code, begun], stderr=subprocess.PIPE, text=True)
+    wait_for(begun.exists)
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert process.returncode == -signal.SIGINT
+    assert error.rstrip().endswith("KeyboardInterrupt")
+
+
 @pytest.mark.parametrize("forks", [True, False])
 def test_a_script_needs_no_guard(tmp_path, forks):
     script = tmp_path / "script.py"
@@ -80,6 +102,22 @@ def test_each_process_uses_one_thread_and_this_ones_settings_stay(monkeypatch, b
     calls = processes.run(os.getenv, [(NAME,)] * 3, 2)
     assert list(calls) == ["1"] * 3
     assert os.environ.get(NAME) == before
+
+
+def test_runs_of_several_threads_leave_the_settings_of_all(monkeypatch):
+    for name in processes._THREADS:
+        monkeypatch.delenv(name, raising=False)
+    before, main = dict(os.environ), sys.modules["__main__"]
+    first, second = (processes.run(os.getenv, [(NAME,)] * 200, 1) for _ in range(2))
+    next(first)
+    assert dict(os.environ) == before  # between two results too
+    next(second)
+    assert list(first) + list(second) == ["1"] * 398
+    with ThreadPoolExecutor(3) as threads:
+        runs = [threads.submit(lambda: list(processes.run(os.getenv, [(NAME,)] * 200, 1))) for _ in range(3)]
+        assert [run.result() for run in runs] == [["1"] * 200] * 3
+    assert dict(os.environ) == before
+    assert sys.modules["__main__"] is main
 
 
 @pytest.mark.parametrize(

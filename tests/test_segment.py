@@ -421,3 +421,16 @@ def test_deviations_may_be_named_by_their_axis_alone():
     units = {name.replace("std_accel_", "std_"): unit for name, unit in long.units.items()}
     short = Recording(columns, units, name="short.csv")
     np.testing.assert_array_equal(find_attitudes(short).covariance, find_attitudes(long).covariance)
+
+
+@pytest.mark.parametrize("option", ["settling", "shortest"])
+def test_times_beyond_any_recording_find_nothing(option):
+    samples, time, _ = tumble(DIRECTIONS[:4])
+    with pytest.raises(SegmentError, match="no static attitude found"):
+        find_attitudes(recording(samples, time), **{option: 1e30})
+
+
+def test_a_recording_that_takes_no_time_is_too_short():
+    samples, time, _ = tumble(DIRECTIONS[:4])
+    with pytest.raises(SegmentError, match="are too few to find static attitudes"):
+        find_attitudes(recording(samples, 1e-25 * time))

@@ -137,9 +137,13 @@ def test_buffers_that_do_not_go_together_are_refused():
     calls = (
         lambda: _segment.blocks(many, many, many[:-1], many, 10, three, three.copy(), np.zeros(4)),
         lambda: _segment.blocks(many, many, many, many, 11, three, three.copy(), np.zeros(4)),
+        lambda: _segment.blocks(many, many, many, many, 2**62, three, three.copy(), np.zeros(4)),
         lambda: _segment.windows(three, three, np.zeros(4, dtype=bool), 2, np.zeros(4)),
+        lambda: _segment.windows(three, three, np.zeros(4, dtype=bool), 2**63 - 1, np.zeros(4)),
         lambda: _segment.stretches(many, 1.0, 1, 0, 1, index, index[:2].copy()),
         lambda: _segment.stretches(np.arange(40) % 2.0, 0.5, 1, 0, 1, index, index.copy()),
+        lambda: _segment.stretches(many, 1.0, 2**63 - 1, 0, 1, index, index.copy()),
+        lambda: _segment.stretches(many, 1.0, 1, 2**62, 1, index, index.copy()),
         lambda: _segment.attitudes(three, index, index + 5, 0.1, index.copy(), three.copy()),
         lambda: _segment.attitudes(three, index, index, 0.1, index.copy(), three.copy()),
         lambda: _segment.batches(three, index, index + 2, index, 1, index.copy(), three.copy(), index, np.zeros(36)),

@@ -66,6 +66,17 @@ def test_a_time_constant_at_the_limit_of_the_search_is_said_to_be_so():
     assert said == [True, False]
 
 
+def test_an_axis_of_one_value_has_no_time_constants_to_speak_of():
+    said = []
+    for slope in (1 / 600, 0.0):
+        law = lambda t, slope=slope: 100 * HOUR * (np.exp(-t / 60) - slope * t)  # noqa: E731
+        cycles = [cycle_of(law, t, name=f"c{t}{c}") for t in (-20, 0, 20) for c in (1, 2)]
+        cycles = [r.with_columns({"gyro_y": np.full(len(r), 1e-3)}, {"gyro_y": "rad/s"}) for r in cycles]
+        fit = il.fit_warmup(cycles, temperatures=[-20, 0, 20], settling_time=END, model="exponential")
+        said.append(any("s is the longest that is sought, 3 T_M" in message for message in fit.calibration.warnings))
+    assert said == [True, False]
+
+
 def test_a_unit_that_cannot_be_is_asked_about():
     cycles = [cycle_of(lambda t: 3600 * flat(t), t, name=f"c{t}{c}") for t in (-20, 0) for c in (1, 2)]
     found = il.fit_warmup(cycles, temperatures=[-20, 0], settling_time=END).calibration.warnings

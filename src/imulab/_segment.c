@@ -59,7 +59,7 @@ static PyObject *blocks(PyObject *module, PyObject *args) {
         return NULL;
     }
     const Py_ssize_t n = v[TIME].len / ONE, count = v[LONGEST].len / ONE;
-    const int fits = length > 0 && count * length <= n && v[X].len == v[TIME].len && v[Y].len == v[TIME].len &&
+    const int fits = length > 0 && count <= n / length && v[X].len == v[TIME].len && v[Y].len == v[TIME].len &&
                      v[Z].len == v[TIME].len && v[MEAN].len == AXES * v[LONGEST].len && v[SCATTER].len == v[MEAN].len;
     if (fits) {
         const double *time = v[TIME].buf;
@@ -92,7 +92,7 @@ static PyObject *windows(PyObject *module, PyObject *args) {
     (void)module;
     if (!PyArg_ParseTuple(args, "y*y*y*nw*", &v[MEAN], &v[SCATTER], &v[BROKEN], &width, &v[VARIANCE])) return NULL;
     const Py_ssize_t count = v[VARIANCE].len / ONE;
-    const int fits = width > 0 && v[BROKEN].len == count + width - 1 && v[MEAN].len == AXES * ONE * v[BROKEN].len &&
+    const int fits = width > 0 && v[BROKEN].len - count == width - 1 && v[MEAN].len == AXES * ONE * v[BROKEN].len &&
                      v[SCATTER].len == v[MEAN].len;
     if (fits) {
         const double *mean = v[MEAN].buf, *scatter = v[SCATTER].buf;
@@ -137,7 +137,8 @@ static PyObject *stretches(PyObject *module, PyObject *args) {
         return NULL;
     }
     const Py_ssize_t count = v[VARIANCE].len / ONE, room = v[START].len / INDEX;
-    int fits = width > 0 && v[START].len == v[STOP].len;
+    const Py_ssize_t most = PY_SSIZE_T_MAX / 4; /* what can be added and doubled */
+    int fits = 0 < width && width < most && 0 <= trim && trim < most && -most < fewest && v[START].len == v[STOP].len;
     const double *variance = v[VARIANCE].buf;
     int64_t *start = v[START].buf, *stop = v[STOP].buf;
     for (Py_ssize_t i = 0; i < count && fits;) {

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -95,7 +96,7 @@ def compare_records(first: Calibration, second: Calibration) -> Comparison:
         tuple(changes),
         _joint(first, second, judged, changes),
         tuple(name for name in either if name not in shared),
-        tuple(_model_differences(first, second)),
+        tuple(_model_differences(first.model, second.model)),
     )
 
 
@@ -109,17 +110,25 @@ def _check_units(first: Calibration, second: Calibration) -> None:
             raise RecordError(f"the records have {name} in different units: {parameter.unit} and {other}")
 
 
-def _model_differences(first: Calibration, second: Calibration) -> Iterator[str]:
-    """Entries of the models that both have and that differ: words, numbers, and quantities with a unit."""
-    for key, mine in first.model.items():
-        its = second.model.get(key)
-        if isinstance(mine, dict) and isinstance(its, dict) and {"value", "unit"} <= mine.keys() & its.keys():
-            values, unit = (mine["value"], its["value"]), mine["unit"]
-            absolute, relative = _ALIKE.get(unit, (0.0, 1e-6))
-            if unit == its["unit"] and abs(values[0] - values[1]) > absolute + relative * max(map(abs, values)):
-                yield f"{key} {values[0]:.7g} and {values[1]:.7g} {unit}"
+def _model_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
+    """Entries of the models that both have and that differ: words, numbers, quantities with a unit, sets of these."""
+    for key, mine in first.items():
+        its = second.get(key)
+        if isinstance(mine, dict) and isinstance(its, dict):
+            yield from (f"{key} {text}" for text in _quantity_differences(mine, its))
         elif isinstance(mine, str | int) and isinstance(its, str | int) and mine != its:
             yield f"{key} {mine} and {its}"
+
+
+def _quantity_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
+    """The difference of two quantities with a unit, or those of two sets of entries."""
+    if not {"value", "unit"} <= first.keys() & second.keys():
+        yield from _model_differences(first, second)
+        return
+    values, unit = (first["value"], second["value"]), first["unit"]
+    absolute, relative = _ALIKE.get(unit, (0.0, 1e-6))
+    if unit == second["unit"] and abs(values[0] - values[1]) > absolute + relative * max(map(abs, values)):
+        yield f"{values[0]:.7g} and {values[1]:.7g} {unit}"
 
 
 def _same_meaning(name: str, first: Calibration, second: Calibration) -> bool:

@@ -144,8 +144,9 @@ def find_attitudes(
     if float((resolution**2).sum()) / 12 > quietest:
         resolution = _resolutions(recording, names)
     quiet = max(quietest, float((resolution**2).sum()) / 12)
-    trim = int(np.ceil(settling / blocks.duration))
-    fewest = max(2, int(np.ceil(shortest / blocks.duration)))
+    whole = len(blocks.mean) * blocks.duration
+    trim = int(np.ceil(min(settling, whole) / blocks.duration))
+    fewest = max(2, int(np.ceil(min(shortest, 2 * whole) / blocks.duration)))
     candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
     best = _choose(candidates)
     trace = _trace(variance, time, blocks, width, _THRESHOLDS[best] * quiet, quiet)
@@ -236,7 +237,8 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
     # The mean, not the median: stamps come in bursts, rates change, samples get lost; long pauses are left out.
     usual = steps[steps <= np.quantile(steps, 0.99)] if steps.size else np.ones(1)
     step = float(usual.mean())
-    length = max(_SMALLEST_BLOCK, round(min(_BLOCK_SECONDS, window / 3) / step))
+    seconds = min(_BLOCK_SECONDS, window / 3, len(time) * step)  # no block is longer than the recording
+    length = max(_SMALLEST_BLOCK, round(seconds / step))
     count = len(time) // length
     mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)

@@ -29,6 +29,8 @@ _AHEAD = 64
 _KEPT = {-3: 1 << 25, -1: 1 << 28}
 """Bytes up to which glibc is to keep memory: M_MMAP_THRESHOLD, of which that is the most, and M_TRIM_THRESHOLD."""
 
+_STARTING = threading.Lock()
+"""Held where what all threads share is changed for a process that is started: environment and main module."""
 
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
@@ -62,7 +64,7 @@ def _method() -> str:
 
     resource_tracker.ensure_running()  # by itself: it would let interrupts through again
     try:
-        with _one_thread_each(), _interrupts_later():
+        with _interrupts_later(), _STARTING, _one_thread_each():
             forkserver.ensure_running()
     except OSError:  # the name of the folder for temporary files is too long for a socket
         return "spawn"
@@ -78,25 +80,35 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
         A process has ended under its work; the others are ended too.
     """
     context = multiprocessing.get_context(_method())
-    with _one_thread_each():
-        pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_attend)
-        over: SimpleQueue[Future[T]] = SimpleQueue()
-        left = 0
-        try:
-            for call in calls:
-                with _interrupts_later(), _without_main():
-                    future = pool.submit(function, *call)
-                future.add_done_callback(over.put)
-                left += 1
-                if left >= _AHEAD * processes:
-                    yield over.get().result()
-                    left -= 1
-            for _ in range(left):
+    pool = ProcessPoolExecutor(processes, mp_context=context, initializer=_attend)
+    over: SimpleQueue[Future[T]] = SimpleQueue()
+    left = 0
+    try:
+        for call in calls:
+            with _interrupts_later(), _STARTING, _one_thread_each(), _without_main():
+                future = pool.submit(function, *call)
+            future.add_done_callback(over.put)
+            left += 1
+            if left >= _AHEAD * processes:
                 yield over.get().result()
-        except (BrokenProcessPool, EOFError, ConnectionError) as error:  # the latter two: of the one that is to fork
-            raise ProcessLostError(str(error)) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
+                left -= 1
+        for _ in range(left):
+            yield over.get().result()
+    except (BrokenProcessPool, EOFError, ConnectionError) as error:  # the latter two: of the one that is to fork
+        raise ProcessLostError(str(error)) from None
+    finally:
+        _end(pool)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    """Wait for what is under work and end the processes; a second interrupt does not wait."""
+    workers = list((pool._processes or {}).values())
+    try:
+        pool.shutdown(cancel_futures=True)
+    except KeyboardInterrupt:  # which would leave them waiting for work, and this process for them
+        for worker in workers:
+            worker.kill()
+        raise
 
 
 @contextmanager

@@ -21,7 +21,7 @@ typedef struct {
 } Work;
 
 /* Numbers of room that a Work needs, and its arrays laid out in it. */
-static size_t needed(Py_ssize_t n, Py_ssize_t p) { return (size_t)(2 * n * (p + 1) + 2 * p * p + 4 * p); }
+static size_t needed(size_t n, size_t p) { return 2 * n * (p + 1) + 2 * p * p + 4 * p; }
 
 static void lay_out(Work *w, double *room) {
     double **arrays[] = {&w->residuals, &w->new_residuals, &w->jacobian, &w->new_jacobian, &w->normal,
@@ -167,7 +167,7 @@ PyObject *fit(PyObject *module, PyObject *args) {
                      v[LENGTHENING].len == v[WEIGHTS].len && v[RESIDUALS].len == v[WEIGHTS].len &&
                      v[JACOBIAN].len == v[WEIGHTS].len * p && v[ITERATIONS].len == problems * (Py_ssize_t)sizeof(int64_t) &&
                      (v[READING].len == 3 * n * one || v[READING].len == 3 * v[WEIGHTS].len);
-    double *room = fits ? PyMem_Malloc(sizeof(double) * needed(n, p)) : NULL;
+    double *room = fits ? PyMem_Malloc(sizeof(double) * needed((size_t)n, (size_t)p)) : NULL;
     if (room != NULL) {
         const Py_ssize_t next = v[READING].len == 3 * v[WEIGHTS].len ? 3 * n : 0;
         Work w = {.n = n, .p = p, .order = order, .reading = v[READING].buf, .weights = v[WEIGHTS].buf,
@@ -242,15 +242,15 @@ PyObject *left_out(PyObject *module, PyObject *args) {
     const Py_ssize_t one = (Py_ssize_t)sizeof(double), p = 3 * ((Py_ssize_t)order + 2), n = v[ERRORS].len / one;
     const int fits = order > 0 && v[THETA].len == p * one && v[READING].len == 3 * n * one && v[ERRORS].len == n * one &&
                      v[WEIGHTS].len == v[ERRORS].len && v[LENGTHENING].len == v[ERRORS].len;
-    double *room = fits ? PyMem_Malloc(sizeof(double) * (2 * needed(n, p) + (size_t)n)) : NULL;
+    double *room = fits ? PyMem_Malloc(sizeof(double) * (2 * needed((size_t)n, (size_t)p) + (size_t)n)) : NULL;
     if (room != NULL) {
-        double *weights = room + 2 * needed(n, p);
+        double *weights = room + 2 * needed((size_t)n, (size_t)p);
         memcpy(weights, v[WEIGHTS].buf, sizeof(double) * (size_t)n);
         Work w = {.n = n, .p = p, .order = order, .reading = v[READING].buf, .weights = weights,
                   .lengthening = v[LENGTHENING].buf};
         Work all = w;
         lay_out(&w, room);
-        lay_out(&all, room + needed(n, p));
+        lay_out(&all, room + needed((size_t)n, (size_t)p));
         Py_BEGIN_ALLOW_THREADS
         leave_out_each(&w, &all, v[THETA].buf, tolerance, most, weights, v[ERRORS].buf);
         Py_END_ALLOW_THREADS

@@ -19,6 +19,7 @@ _FIT_FAILS = 1.5
 _WIDE = 20.0
 _AT_LIMIT = 1.02
 _COUNTS = 0.05
+_ROUNDING = 1e-12
 _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 """A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
 
@@ -161,9 +162,11 @@ def _constants(curves: Curves, chosen: Judged) -> list[str]:
     if chosen.model != "exponential" or chosen.solution is None:
         return []
     tau = chosen.solution.scales[-1]
-    changes = np.abs(chosen.table.coefficients[..., -1]) * (1 - np.exp(-curves.settling_time / tau))
-    share = float((changes / np.nanmax(np.abs(curves.mean), axis=(0, 1))).max())
-    if tau < SCALE_LIMIT * curves.settling_time / _AT_LIMIT or share < _COUNTS:
+    changes = np.abs(chosen.table.coefficients[..., -1]).max(axis=0) * (1 - np.exp(-curves.settling_time / tau))
+    whole = np.nanmax(np.abs(curves.mean), axis=(0, 1))
+    # An axis of one value has no curve but what rounding leaves of the difference from its reference.
+    counts = changes > np.maximum(_COUNTS * whole, _ROUNDING * np.abs(curves.reference).max(axis=0))
+    if tau < SCALE_LIMIT * curves.settling_time / _AT_LIMIT or not counts.any():
         return []
     return [
         f"the time constant {tau:.4g} s is the longest that is sought, {SCALE_LIMIT:g} T_M: the cycles only show that "
