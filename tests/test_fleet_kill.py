@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -75,7 +76,7 @@ def test_a_killed_run_is_finished_by_the_next(fleet, reference, tmp_path):
     check_complete(folder, reference, before)
     kept = int(out.partition(" done, ")[2].partition(" were")[0])
     assert len(before) <= kept <= len(before) + len(workers)  # a worker ends the record that it was at
-    wait_for(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers), 10)  # noqa: PTH110
+    wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 10)
 
 
 def test_a_killed_worker_costs_nothing_but_time(fleet, reference, tmp_path):
@@ -125,7 +126,7 @@ def test_an_interrupt_of_the_terminal_ends_all_processes_without_a_word(fleet, r
     os.killpg(process.pid, signal.SIGINT)
     out, error = process.communicate(timeout=30)
     assert (process.returncode, out, error) == (130, "", "")
-    wait_for(lambda: not any(os.path.exists(f"/proc/{worker}") for worker in workers), 10)  # noqa: PTH110
+    wait_for(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 10)
     before = records(folder)
     assert len(before) < UNITS
     done = command("fleet", "run", fleet, "-o", folder, "--workers", 2)

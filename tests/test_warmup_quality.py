@@ -55,12 +55,20 @@ def test_warnings_name_what_is_wrong_with_the_test():
     assert any("gyro still drifts in the settled part of 4 of 4" in message for message in found)
 
 
+def sloping_cycles(slope):
+    """Two cycles at each of three temperatures: an exponential, and a straight line of so much of it each second."""
+
+    def law(t):
+        return flat(t) - 100 * HOUR * slope * t
+
+    return [cycle_of(law, t, name=f"c{t}{c}") for t in (-20, 0, 20) for c in (1, 2)]
+
+
 def test_a_time_constant_at_the_limit_of_the_search_is_said_to_be_so():
     """A slope, which no exponential of these cycles is; not where the one beside the true one has nothing to do."""
     said = []
     for slope in (1 / 600, 0.0):
-        law = lambda t, slope=slope: 100 * HOUR * (np.exp(-t / 60) - slope * t)  # noqa: E731
-        cycles = [cycle_of(law, t, name=f"c{t}{c}") for t in (-20, 0, 20) for c in (1, 2)]
+        cycles = sloping_cycles(slope)
         fit = il.fit_warmup(cycles, temperatures=[-20, 0, 20], settling_time=END, model="exponential")
         said.append(any("s is the longest that is sought, 3 T_M" in message for message in fit.calibration.warnings))
     assert said == [True, False]
@@ -69,8 +77,7 @@ def test_a_time_constant_at_the_limit_of_the_search_is_said_to_be_so():
 def test_an_axis_of_one_value_has_no_time_constants_to_speak_of():
     said = []
     for slope in (1 / 600, 0.0):
-        law = lambda t, slope=slope: 100 * HOUR * (np.exp(-t / 60) - slope * t)  # noqa: E731
-        cycles = [cycle_of(law, t, name=f"c{t}{c}") for t in (-20, 0, 20) for c in (1, 2)]
+        cycles = sloping_cycles(slope)
         cycles = [r.with_columns({"gyro_y": np.full(len(r), 1e-3)}, {"gyro_y": "rad/s"}) for r in cycles]
         fit = il.fit_warmup(cycles, temperatures=[-20, 0, 20], settling_time=END, model="exponential")
         said.append(any("s is the longest that is sought, 3 T_M" in message for message in fit.calibration.warnings))
