@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all core fuzz dist lint format bench docs clean
+.PHONY: demo test test-all core fuzz dist lint format bench truth docs clean
 
 demo: $(STAMP)
 	$(BIN)/imulab demo demo
@@ -44,6 +44,10 @@ format: $(STAMP)
 
 bench: $(STAMP) $(VENV)/.bench
 	$(BIN)/python benchmarks/run.py
+
+# Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md.
+truth: $(STAMP)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/truth/run.py
 
 docs: $(STAMP) $(VENV)/.docs
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html

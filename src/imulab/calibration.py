@@ -24,6 +24,7 @@ from imulab.files import write_text
 from imulab.jsontext import content_sha256, sealed_text
 from imulab.jsontext import json_text as json_text
 from imulab.recording import Source
+from imulab.verdict import UNJUDGED, Verdict, verdict_of
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
@@ -75,6 +76,8 @@ class Calibration:
         Provenance.
     warnings
         What a user of the record must know, a sentence each.
+    verdict
+        Whether the result can be used as it is; made from the warnings if not given.
     sections
         Further top-level keys that a procedure adds (``table``, ``elements``, ``levels``, ``runs`` ...).
     version
@@ -95,6 +98,11 @@ class Calibration:
     software: str = f"imulab {VERSION}"
     sections: Mapping[str, Any] = field(default_factory=dict)
     version: int = SCHEMA_VERSION
+    verdict: Verdict = UNJUDGED
+
+    def __post_init__(self) -> None:
+        if self.verdict is UNJUDGED:
+            object.__setattr__(self, "verdict", verdict_of(self.warnings))
 
     def value(self, name: str) -> float:
         """Return the value of a parameter."""
@@ -137,6 +145,7 @@ class Calibration:
             "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},
             "options": self.options,
             "fit": self.fit,
+            "verdict": {"state": self.verdict.state, "reasons": list(self.verdict.reasons)},
             "warnings": list(self.warnings),
             **self.sections,
             "data": self.data,
