@@ -116,10 +116,7 @@ def main(wanted: list[str]) -> int:
     if not wanted:
         parts = [HEAD.format(duration=f" ({minutes:.0f} minutes on two processors)")]
         for group, lines in groups.items():
-            parts.append(
-                f"\n## {group}\n\n| disturbance | trials | coverage | warned | rms error | |\n|---|---|---|---|---|---|\n"
-            )
-            parts.append("\n".join(lines) + "\n")
+            parts.append(f"\n## {group}\n\n{TITLES}\n" + "\n".join(lines) + "\n")
         PAGE.write_text("".join(parts), encoding="utf-8")
     print(f"{minutes:.1f} minutes; " + (f"falls short: {'; '.join(short)}" if short else "every row holds"))
     return 1 if short else 0
