@@ -9,7 +9,7 @@ import pytest
 
 import imulab as il
 import madeup
-from imulab.applying import apply, apply_blocks, identity, loaded, warnings_of
+from imulab.applying import apply, apply_blocks, loaded, warnings_of
 from imulab.blob import Blob, is_blob, load_any, load_blob, make_blob, tables_of_all
 from imulab.calibration import Calibration
 from imulab.cli import main
@@ -202,10 +202,12 @@ def test_a_blob_of_another_unit_is_warned_of(blob, flight):
     assert warnings_of(load_blob(blob), flight) == []
 
 
-def test_identity_is_that_of_the_content(blob, record, data, tmp_path):
+def test_a_blob_and_its_copy_hold_the_same_and_the_record_that_they_were_made_from(blob, record, data, tmp_path):
     (tmp_path / "copy.blob").write_bytes(data)
-    assert identity(load_blob(blob)) == identity(load_blob(tmp_path / "copy.blob"))
-    assert identity(load_blob(blob)) != identity(record)
+    holds = loaded(load_blob(blob)).holds
+    assert holds == loaded(load_blob(tmp_path / "copy.blob")).holds
+    assert holds[0] != loaded(record).holds[0]
+    assert holds[1:] == loaded(record).holds
 
 
 def test_a_blob_with_a_section_that_apply_does_not_know_is_refused(tmp_path):

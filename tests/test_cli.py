@@ -188,7 +188,10 @@ def test_apply_warns_once_beyond_what_the_test_has_seen(imulab, tmp_path):
     assert done.stderr.startswith("imulab: warning: wild.csv: 1 samples beyond 2 g (up to 5.")
     assert done.stderr.count("\n") == 1
     assert imulab("apply", "t.json", "t.csv", "-o", "c.csv").stderr == ""
-    assert "applied twice" in imulab("apply", "t.json", "t.json", "t.csv", "-o", "c.csv").stderr
+    twice = imulab("apply", "t.json", "t.json", "t.csv", "-o", "twice.csv")
+    assert twice.returncode == 2
+    assert "t.csv: already corrected by t.json" in twice.stderr
+    assert not (tmp_path / "twice.csv").exists()
 
 
 def test_output_that_cannot_be_written_is_a_refusal(tmp_path):

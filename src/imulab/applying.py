@@ -6,14 +6,14 @@ Not named after its function: a submodule ``imulab.apply`` would take the place 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from typing import Any
 
 from imulab.blob import Blob
 from imulab.calibration import Calibration
 from imulab.centrifuge.apply import apply_centrifuge, beyond_levels, highest_force
-from imulab.errors import RecordError
+from imulab.errors import DataError, RecordError
 from imulab.recording import Recording
 from imulab.runtime import Unit
 from imulab.tables import tables_of
@@ -35,14 +35,40 @@ _BEYOND = {"tumble": beyond_test, "centrifuge": beyond_levels}
 
 @dataclass(frozen=True)
 class Loaded:
-    """A record or blob in the C core, ready to run: each section's kind and columns, in the order of application."""
+    """A record or blob in the C core, ready to run.
+
+    Attributes
+    ----------
+    unit
+        Its tables in the C core.
+    sections
+        Each section's kind and columns, in the order of application.
+    name
+        What the corrected recording calls it.
+    holds
+        SHA-256 of the record; for a blob its own, then those of the records it was made from.
+    again
+        Whether it is applied to a recording that it corrected before.
+    """
 
     unit: Unit
     sections: tuple[tuple[str, Mapping[str, Any]], ...]
+    name: str
+    holds: tuple[str, ...]
+    again: bool = False
 
 
-def loaded(record: Calibration | Blob) -> Loaded:
+def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool = False) -> Loaded:
     """Return a record (in double) or a blob (with its floats) ready to run.
+
+    Parameters
+    ----------
+    record
+        What corrects a recording.
+    name
+        What the corrected recording calls it; procedure and serial number, or the blob's file, if not given.
+    again
+        Whether to correct a recording a second time.
 
     Raises
     ------
@@ -59,17 +85,23 @@ def loaded(record: Calibration | Blob) -> Loaded:
             raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
         if not sections:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
-        return Loaded(Unit(record.data), tuple(sections))
+        holds = (sha256(record.data).hexdigest(), *map(str, record.text.get("records", ())))
+        return Loaded(Unit(record.data), tuple(sections), name or record.name, holds, again)
     if record.procedure == "gyro_array":
         raise RecordError("a gyro_array record cannot be applied: 'imulab array fuse --calibration' takes it")
     if record.procedure == "warmup":
         record_table(record)  # says in words what the core would refuse by a number
     tables = tables_of(record)
-    return Loaded(Unit.of(*tables), tuple((table.kind, table.columns) for table in tables))
+    known = name or f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
+    corrections = tuple((table.kind, table.columns) for table in tables)
+    return Loaded(Unit.of(*tables), corrections, known, (record.sealed()[0],), again)
 
 
-def apply(record: Calibration | Blob | Loaded, recording: Recording) -> Recording:
+def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: bool = False) -> Recording:
     """Return the recording corrected by a record; columns that it does not touch pass unchanged.
+
+    The result names the record and its SHA-256 in `corrected_by`, which its file will hold. A recording that the same
+    record corrected before is refused, unless `again`.
 
     Raises
     ------
@@ -78,21 +110,56 @@ def apply(record: Calibration | Blob | Loaded, recording: Recording) -> Recordin
     UnitError
         The recording's unit cannot be converted to the record's.
     DataError
-        The recording lacks the columns that the record corrects.
+        The recording lacks the columns that the record corrects, or was corrected by this record already.
     """
-    ready = record if isinstance(record, Loaded) else loaded(record)
-    for kind, columns in ready.sections:
-        recording = _APPLY[kind](ready.unit, columns, recording)
-    return recording
+    ready = record if isinstance(record, Loaded) else loaded(record, again=again)
+    before = {entry.rpartition("sha256:")[2] for entry in recording.corrected_by}
+    if not ready.again and before.intersection(ready.holds):
+        raise DataError(
+            f"{recording.name}: already corrected by {ready.name}: a second time would take its errors off twice; "
+            "expected the recording as it was measured, or --again (again=True)"
+        )
+    corrected = recording
+    for kind, columns in sections_for(ready.sections, recording):
+        corrected = _APPLY[kind](ready.unit, columns, corrected)
+    if corrected is recording:
+        return recording
+    return replace(corrected, corrected_by=(*recording.corrected_by, f"{ready.name} sha256:{ready.holds[0]}"))
 
 
-def apply_blocks(records: Iterable[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
+def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Correct consecutive blocks of a recording by several records in the order given."""
-    chain = [loaded(record) for record in records]
+    chain = [record if isinstance(record, Loaded) else loaded(record) for record in records]
     for block in blocks:
         for ready in chain:
             block = apply(ready, block)
         yield block
+
+
+def sections_for(
+    sections: Iterable[tuple[str, Mapping[str, Any]]], recording: Recording
+) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return the sections that a recording has the columns for, where it has those of one triad of two."""
+    absent = {kind for kind, triad in (("tumble", "accel"), ("gyro", "gyro")) if not _has_any(recording, triad)}
+    kept = [section for section in sections if section[0] not in absent]
+    return kept or list(sections)  # with nothing to correct, the section itself says which columns it expects
+
+
+def _has_any(recording: Recording, triad: str) -> bool:
+    return any(f"{triad}_{axis}" in recording for axis in "xyz")
+
+
+def _missing_triad(record: Calibration | Blob, recording: Recording) -> list[str]:
+    if isinstance(record, Blob):
+        kinds = {str(section["kind"]) for section in record.text["sections"]}
+    else:
+        kinds = {"tumble", "gyro"} if "gyro_bias_x" in record.parameters else set()
+    triads = {"accel": "accelerometers", "gyro": "gyroscopes"}
+    absent = [triad for triad in triads if not _has_any(recording, triad)]
+    if not {"tumble", "gyro"} <= kinds or len(absent) != 1:
+        return []
+    (there,) = triads.keys() - set(absent)
+    return [f"{recording.name}: no {triads[absent[0]]} in it: its {triads[there]} alone are corrected"]
 
 
 def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
@@ -102,6 +169,7 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     mine, its = sensor.get("serial"), recording.metadata.get("serial")
     if mine and its and mine != its:
         found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
+    found += _missing_triad(record, recording)
     tables = _warmup_ranges(record)
     messages = [message for low, high in tables if (message := temperature_warning(low, high, recording))]
     if isinstance(record, Blob) or record.procedure == "warmup":
@@ -124,11 +192,6 @@ def _warmup_ranges(record: Calibration | Blob) -> list[tuple[float, float]]:
     else:
         ranges = [record_table(record).temperatures[[0, -1]]] if record.procedure == "warmup" else []
     return [(float(low), float(high)) for low, high in ranges]
-
-
-def identity(record: Calibration | Blob) -> str:
-    """Return what two copies of one record or blob share."""
-    return sha256(record.data).hexdigest() if isinstance(record, Blob) else record.to_dict()["content_sha256"]
 
 
 def beyond_test_of(record: Calibration | Blob, recording: Recording) -> tuple[int, float]:

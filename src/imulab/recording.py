@@ -15,6 +15,8 @@ from imulab.units import parse_unit, to_si
 
 Array = NDArray[np.float64]
 
+CORRECTED_BY = "corrected_by"
+"""Key, in the head of a file, of each record that its samples were corrected by."""
 _QUANTITIES = {
     "time": ("time",),
     "accel": ("acceleration", "output"),
@@ -67,6 +69,8 @@ class Recording:
         Lines of the file above data row 1; None where rows are not lines of text.
     notes
         What the reader did to the data that a user should know.
+    corrected_by
+        The records that the samples were corrected by, ``NAME sha256:HASH`` each.
     """
 
     columns: Mapping[str, Array]
@@ -77,6 +81,7 @@ class Recording:
     first_row: int = 1
     lines_before: int | None = None
     notes: tuple[str, ...] = ()
+    corrected_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         lengths = {len(column) for column in self.columns.values()}

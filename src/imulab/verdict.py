@@ -36,6 +36,12 @@ class Verdict:
 UNJUDGED = Verdict("good")
 """Stands for a verdict that has not been formed yet."""
 
+SENTENCES: dict[State, str] = {
+    "good": "nothing in the data speaks against this result",
+    "look": "look at this before you use the result",
+    "bad": "do not use this result as it is",
+}
+
 
 def verdict_of(findings: Iterable[str]) -> Verdict:
     """Return the verdict that a procedure's findings lead to."""

@@ -11,7 +11,7 @@ import numpy as np
 from imulab.digits import decimal_rows
 from imulab.errors import OptionError
 from imulab.files import replacing
-from imulab.recording import Recording
+from imulab.recording import CORRECTED_BY, Recording
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -97,7 +97,7 @@ def write_parquet_to(blocks: Recording | Iterable[Recording], stream: BinaryIO) 
             titles = [_title(name, unit) for name, unit in block.units.items()]
             table = arrow.table([arrow.array(column) for column in block.columns.values()], names=titles)
             if writer is None:
-                table = table.replace_schema_metadata(_clean(block.metadata))
+                table = table.replace_schema_metadata(_clean(block.metadata) | _corrected_by(block))
                 # Measured doubles hardly repeat: a dictionary costs time and saves nothing.
                 writer = parquet.ParquetWriter(stream, table.schema, compression="zstd", use_dictionary=False)
             waiting.append(table.replace_schema_metadata(writer.schema.metadata))
@@ -131,11 +131,16 @@ def _clean(metadata: Mapping[str, str]) -> dict[str, str]:
     return {_one_line(key): _one_line(value) for key, value in metadata.items()}
 
 
+def _corrected_by(recording: Recording) -> dict[str, str]:
+    return {CORRECTED_BY: "\n".join(map(_one_line, recording.corrected_by))} if recording.corrected_by else {}
+
+
 def _head(recording: Recording) -> str:
     for name in recording.columns:
         if not name or set(name) & set(',"[]#\r\n') or name != name.strip():
             raise OptionError(f"{recording.name}: column name {name!r} cannot be written to CSV")
-    comments = "".join(f"# {key}: {value}\n" for key, value in _clean(recording.metadata).items())
+    pairs = [*_clean(recording.metadata).items(), *((CORRECTED_BY, _one_line(one)) for one in recording.corrected_by)]
+    comments = "".join(f"# {key}: {value}\n" for key, value in pairs)
     titles = ",".join(_title(name, unit) for name, unit in recording.units.items())
     return f"{comments}{titles}\n"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from json import dumps
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -44,6 +45,7 @@ def apply(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    again: Annotated[bool, typer.Option("--again", help="Correct a recording that a record corrected before.")] = False,
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
@@ -64,16 +66,17 @@ def apply(
                 f"{file}: expected a recording as the last file, found a record: records go first"
             ) from None
         raise
+    chain = []
     for name, record in zip(names, records, strict=True):
         with naming(name):
-            loaded(record)
+            chain.append(loaded(record, Path(name).name, again=again))
     blocks = heard(read_blocks(file, layout, **part), notes=False)
-    write_out(apply_blocks(records, _warned(records, blocks)), output)
+    write_out(apply_blocks(chain, _warned(records, blocks)), output)
 
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.applying import beyond_message, beyond_test_of, identity, warnings_of
+    from imulab.applying import beyond_message, beyond_test_of, warnings_of
 
     counts, largest, name = [0] * len(records), [0.0] * len(records), ""
     for number, block in enumerate(blocks):
@@ -86,8 +89,7 @@ def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> I
         yield block
         if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
             messages = [message for record in records for message in warnings_of(record, block)]
-            if len({identity(record) for record in records}) < len(records):
-                messages.append("the same record is applied twice")
+            messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]
             for message in dict.fromkeys(messages):
                 warn(message)
     for record, count, most in zip(records, counts, largest, strict=True):

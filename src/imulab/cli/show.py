@@ -14,15 +14,17 @@ from imulab.errors import ReadError
 from imulab.exhibit import Table, format_uncertain, plain_number
 from imulab.present import change_unit, exhibits_of
 from imulab.recording import Array, Recording
+from imulab.verdict import SENTENCES, Verdict
 
 _GAP = 1.5
 
 
 def describe_record(record: Calibration, *, provenance: bool = True) -> str:
-    """Return what a record holds: its headline, its tables, and where it comes from."""
+    """Return what a record holds: its verdict, its headline, its tables, and where it comes from."""
     exhibits = exhibits_of(record)
     serial = record.sensor.get("serial", "unit without serial number")
-    lines = [f"{record.procedure} calibration of {serial}", exhibits.headline, ""]
+    lines = [verdict_line(record.verdict)]
+    lines += [f"{record.procedure} calibration of {serial}", exhibits.headline, ""]
     for item in exhibits.items:
         if isinstance(item, Table):
             mark = [["*" if i == item.highlight else "", *row] for i, row in enumerate(item.rows)]
@@ -31,8 +33,19 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
     if provenance:
         lines += [f"created {record.created} by {record.software}"]
         lines += [f"source {source.file} SHA-256 {source.sha256}" for source in record.sources]
-        lines += [f"warning: {message}" for message in record.warnings]
+        lines += [
+            f"{'warning' if message in record.verdict.reasons else 'note'}: {message}" for message in record.warnings
+        ]
     return "\n".join(lines).rstrip()
+
+
+def verdict_line(verdict: Verdict) -> str:
+    """Return a verdict in one line: its state, the gravest reason, and how many more there are."""
+    if not verdict.reasons:
+        return f"{verdict.state}: {SENTENCES[verdict.state]}"
+    more = len(verdict.reasons) - 1
+    others = f" (and {more} more: see the warnings)" if more else ""
+    return f"{verdict.state}: {SENTENCES[verdict.state]}: {verdict.reasons[0]}{others}"
 
 
 def describe_blob(blob: Blob) -> str:

@@ -24,6 +24,7 @@ from imulab.fleet.statistics import (
 from imulab.fleet.store import Store
 from imulab.fleet.work import Summary
 from imulab.report import render_page
+from imulab.verdict import verdict_of
 
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
@@ -59,7 +60,8 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
         ("software", ", ".join(sorted({summary.software for summary in found}))),
     ]
     write_text(
-        output, render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, warnings=_warnings(state))
+        output,
+        render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, verdict=verdict_of(_warnings(state))),
     )
 
 

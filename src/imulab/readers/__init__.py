@@ -77,6 +77,7 @@ def read(
         first_row=first.first_row,
         lines_before=first.lines_before,
         notes=tuple(dict.fromkeys(note for block in blocks for note in block.notes)),
+        corrected_by=first.corrected_by,
     )
 
 

@@ -12,7 +12,7 @@ from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
 from imulab.readers.layout import Layout
-from imulab.recording import Array, Recording, parse_column_title
+from imulab.recording import CORRECTED_BY, Array, Recording, parse_column_title
 
 _NOT_OURS = ("ARROW:", "org.apache.")
 _OTHERS_JSON = ("pandas", "huggingface", "geo")  # what other writers leave under these names begins with a brace
@@ -36,7 +36,9 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         with parquet.ParquetFile(path, memory_map=False, pre_buffer=False, buffer_size=1 << 20) as file:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout)
-            metadata = {**_metadata(file.schema_arrow.metadata), **((layout and layout.metadata) or {})}
+            stored = file.schema_arrow.metadata or {}
+            metadata = {**_metadata(stored), **((layout and layout.metadata) or {})}
+            corrected = tuple(stored.get(CORRECTED_BY.encode(), b"").decode("utf-8", "replace").splitlines())
             for batch in file.iter_batches(
                 batch_size=ROWS, columns=list(dict.fromkeys(columns.values())), use_threads=False
             ):
@@ -46,7 +48,9 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
                 if layout is not None and layout.sample_rate is not None:
                     stamps = np.arange(row - 1, row - 1 + batch.num_rows) / layout.sample_rate
                     values = {"time": stamps, **values}
-                yield Recording(columns=values, units=units, metadata=metadata, name=name, first_row=row)
+                yield Recording(
+                    columns=values, units=units, metadata=metadata, name=name, first_row=row, corrected_by=corrected
+                )
                 row += batch.num_rows
     except (arrow.ArrowException, OSError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: not a whole Parquet file: {' '.join(str(error).split())[:160]}") from None
@@ -75,12 +79,12 @@ def _columns(there: list[str], name: str, layout: Layout | None) -> tuple[dict[s
     return columns, units
 
 
-def _metadata(pairs: dict[bytes, bytes] | None) -> dict[str, str]:
-    texts = {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in (pairs or {}).items()}
+def _metadata(pairs: dict[bytes, bytes]) -> dict[str, str]:
+    texts = {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in pairs.items()}
     return {
         key: " ".join(value.splitlines())
         for key, value in texts.items()
-        if not key.startswith(_NOT_OURS) and not (key in _OTHERS_JSON and value.startswith("{"))
+        if key != CORRECTED_BY and not key.startswith(_NOT_OURS) and not (key in _OTHERS_JSON and value.startswith("{"))
     }
 
 

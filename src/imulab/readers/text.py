@@ -22,7 +22,7 @@ import numpy as np
 from imulab.errors import ReadError
 from imulab.readers import _text
 from imulab.readers.layout import Layout
-from imulab.recording import Recording, parse_column_title
+from imulab.recording import CORRECTED_BY, Recording, parse_column_title
 from imulab.tens import powers_of_five
 
 _BLOCK_BYTES = 1 << 21
@@ -97,6 +97,7 @@ class TextFile:
         self._size = os.fstat(stream.fileno()).st_size if whole and not self._live and _is_file(stream) else 0
         self._room: np.ndarray | None = None
         self._used = 0
+        self._corrected_by: list[str] = []
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
         self._lines_before = 0
         self._read_more()
@@ -224,7 +225,10 @@ class TextFile:
         """Keep a comment ``# key: value``; what a layout says goes before."""
         key, colon, value = comment.lstrip("# ").partition(":")
         if colon and key.strip() and not (self._layout and key.strip() in (self._layout.metadata or {})):
-            self._metadata[key.strip()] = value.strip()
+            if key.strip() == CORRECTED_BY:
+                self._corrected_by.append(value.strip())
+            else:
+                self._metadata[key.strip()] = value.strip()
 
     def _native_head(self) -> tuple[list[str], dict[str, str], np.ndarray]:
         line = self._comments()
@@ -337,6 +341,7 @@ class TextFile:
             name=self._name,
             first_row=row,
             lines_before=self._lines_before,
+            corrected_by=tuple(self._corrected_by),
         )
 
     def _refuse(self, block: bytes, row: int, index: int, problem: int, field: int) -> None:

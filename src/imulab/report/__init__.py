@@ -14,6 +14,7 @@ from typing import Any
 from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure, Table
 from imulab.files import write_text
+from imulab.verdict import SENTENCES, Verdict
 
 _TITLES = {
     "tumble": "Tumble calibration",
@@ -30,7 +31,8 @@ def render(record: Calibration, exhibits: Exhibits) -> str:
         _TITLES.get(record.procedure, record.procedure.capitalize()),
         record.sensor.get("serial", "unit without serial number"),
         exhibits,
-        warnings=record.warnings,
+        verdict=record.verdict,
+        notes=[warning for warning in record.warnings if warning not in record.verdict.reasons],
         provenance=_provenance(record),
     )
 
@@ -40,16 +42,19 @@ def render_page(
     subject: str,
     exhibits: Exhibits,
     *,
-    warnings: Sequence[str] = (),
+    verdict: Verdict | None = None,
+    notes: Sequence[str] = (),
     provenance: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """Return exhibits as HTML text: subject, result, warnings, figures and tables, provenance."""
+    """Return exhibits as HTML text: subject, verdict, result, notes, figures and tables, provenance."""
     plots = [item for item in exhibits.items if isinstance(item, Figure)]
     return str(
         _template("page.html.j2").render(
             title=title,
             subject=subject,
-            warnings=warnings,
+            verdict=verdict,
+            sentence=None if verdict is None else SENTENCES[verdict.state],
+            notes=notes,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
             column_kinds=_column_kinds,

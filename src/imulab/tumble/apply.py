@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.errors import UnitError
+from imulab.errors import DataError, UnitError
 from imulab.recording import Array, Recording
 from imulab.runtime import Unit
 from imulab.tables import tables_of
@@ -39,19 +39,27 @@ def apply_tumble(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
 def apply_gyro(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
     """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s.
 
-    accel_* are the specific force (already corrected); a recording without gyroscopes passes unchanged.
+    accel_* are the specific force (already corrected), which the g-sensitivity needs.
 
     Raises
     ------
     UnitError
         The columns' unit cannot be converted to the record's.
+    DataError
+        The recording lacks a gyroscope, or the accelerometers that the record's g-sensitivity needs.
     """
-    if not all(name in recording for name in _GYRO):
-        return recording
     outputs = _outputs(recording, "gyro", str(columns["output_unit"]))
     kept = parse_unit(recording.triad_unit("gyro"))
     kept_unit = kept.symbol if kept.quantity == "rate" else "rad/s"
-    rate, _ = unit.gyro(outputs, [to_si(recording.column(name), recording.units[name]) for name in _ACCEL])
+    force = None
+    if any(name in recording for name in _ACCEL):
+        force = [to_si(recording.column(name), recording.units[name]) for name in _ACCEL]
+    elif np.isnan(unit.gyro([np.zeros(1)] * 3, None)[0][0][0]):
+        raise DataError(
+            f"{recording.name}: the record corrects the gyroscopes' g-sensitivity, which needs accel_x, accel_y and "
+            f"accel_z; found {' '.join(recording.columns)}"
+        )
+    rate, _ = unit.gyro(outputs, force)
     return recording.with_columns(
         {name: from_si(values, kept_unit) for name, values in zip(_GYRO, rate, strict=True)},
         dict.fromkeys(_GYRO, kept_unit),

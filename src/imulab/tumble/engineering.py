@@ -10,6 +10,9 @@ from imulab.exhibit import format_uncertain, plain_number
 from imulab.tumble.record import zero_outputs
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
+_OFF_NOMINAL = "ppm off nominal"
+"""A scale factor whose nominal value is known is read as its difference from it."""
+
 
 @dataclass(frozen=True)
 class EngineeringRow:
@@ -29,7 +32,7 @@ def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     """Return the factor and the unit in which the change of a parameter is read."""
     output = str(record.model["output_unit"])
     factor, _, unit = _converted(change.name, change.unit, output, parse_unit(output).quantity == "acceleration")
-    return factor, unit
+    return factor, "ppm" if unit == _OFF_NOMINAL else unit
 
 
 def propagated_rows(record: Calibration) -> list[list[str]]:
@@ -75,7 +78,7 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
         factor, offset, unit = _converted(name, parameter.unit, output, physical)
         rows.append(
             EngineeringRow(
-                name.replace("scale_factor", "scale_factor_error") if unit == "ppm" else name,
+                name,
                 parameter.value * factor + offset,
                 None if parameter.standard_uncertainty is None else parameter.standard_uncertainty * abs(factor),
                 unit,
@@ -98,7 +101,7 @@ def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float
     if stem == "gyro_scale_factor":
         sensed = unit.removesuffix("/(rad/s)")
         if parse_unit(sensed).quantity == "rate":
-            return 1e6 / from_si(1.0, sensed), -1e6, "ppm"
+            return 1e6 / from_si(1.0, sensed), -1e6, _OFF_NOMINAL
         return 1.0, 0.0, unit
     if stem == "gyro_misalignment":
         return 1e3, 0.0, "mrad"
@@ -111,7 +114,7 @@ def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, 
         return from_si(1.0, "mg"), 0.0, "mg"
     if stem == "scale_factor":
         if physical:
-            return 1e6 / from_si(1.0, output), -1e6, "ppm"
+            return 1e6 / from_si(1.0, output), -1e6, _OFF_NOMINAL
         return 1.0, 0.0, f"{output}/(m/s²)"
     if stem == "misalignment":
         return 1e3, 0.0, "mrad"
