@@ -1,5 +1,5 @@
 /* Gyro array: the plain methods, and what all methods share; the robust one is in robust.c and what goes with it. */
-#include "lanes.h"
+#include "array.h"
 
 /* A reading may come with an alignment of its element over the axes; then one lost axis loses all. */
 static void aligned(const il_array *a, const il_real *reading, il_real *z) {
@@ -16,7 +16,8 @@ static void aligned(const il_array *a, const il_real *reading, il_real *z) {
     }
 }
 
-il_real il_array_gain(const il_array *a, uint32_t k) {
+/* Gain of the running estimates at sample k, k >= 1. */
+static il_real array_gain(const il_array *a, uint32_t k) {
     return a->memory > IL_C(0.0) ? a->memory : IL_C(1.0) / (il_real)k;
 }
 
@@ -87,7 +88,7 @@ static il_real support_step(const il_array *a, il_array_axis *s, const il_real *
         for (int32_t j = 0; j < i; j++) sum += s->flags[i] | s->flags[j] ? IL_C(0.0) : (z[i] - z[j]) * (z[i] - z[j]);
     }
     if (count > 1) {
-        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : il_array_gain(a, il_counted(s->seen[0], a->start));
+        il_real gain = s->seen[0] == 0 ? IL_C(1.0) : array_gain(a, il_counted(s->seen[0], a->start));
         s->spread += gain * (sum / ((il_real)count * (il_real)(count - 1) / IL_C(2.0)) - s->spread);
         il_count(&s->seen[0]);
     }
@@ -129,7 +130,7 @@ static il_real least_squares_loop(int32_t n, il_real mean, const il_real *restri
 
 /* Gain of a bias and of a variance after `seen` residuals. */
 static il_real least_squares_gain(const il_array *a, uint32_t seen) {
-    return seen == 0 ? IL_C(1.0) : il_array_gain(a, il_counted(seen, a->start));
+    return seen == 0 ? IL_C(1.0) : array_gain(a, il_counted(seen, a->start));
 }
 
 /* Gains and floors of the variances, and one more residual seen. A gyro without a reading has no gain and no weight. */
@@ -209,8 +210,8 @@ static il_real start_bias(const il_array *a, il_array_axis *s, const il_real *z,
  *   b = (1-g) b + g (Z - Zr'),  Y = Z - b,  D = (1-g) D + g (Y - Zr')^2,  Zr = sum Y/D / sum 1/D,  Zr' one sample old
  * Two gyros at a time, each with sums of its own: compilers make one instruction of both. Of an odd number the last
  * one's partner has an infinite variance. */
-il_real il_feedback_loop(int32_t n, il_real gain, il_real before, il_real least, const il_real *restrict z,
-                         il_real *restrict bias, il_real *restrict variance, il_real *restrict weight) {
+static il_real feedback_loop(int32_t n, il_real gain, il_real before, il_real least, const il_real *restrict z,
+                             il_real *restrict bias, il_real *restrict variance, il_real *restrict weight) {
     const il_real keep = IL_C(1.0) - gain;
     il_real total[2] = {IL_C(0.0), IL_C(0.0)}, sum[2] = {IL_C(0.0), IL_C(0.0)};
     for (int32_t i = 0; i < n; i += 2) {
@@ -238,7 +239,7 @@ static il_real feedback_step(const il_array *a, il_array_axis *s, const il_real 
         even[n] = s->rate;
         z = even;
     }
-    return il_feedback_loop(n, il_array_gain(a, s->count), s->rate, IL_TINY, z, s->bias, s->variance, s->weight);
+    return feedback_loop(n, array_gain(a, s->count), s->rate, IL_TINY, z, s->bias, s->variance, s->weight);
 }
 
 /* Virtual gyro: state (rate, bias_1 .. bias_n), a random walk each, with the steady-state gain. */
@@ -286,7 +287,8 @@ static il_real axis_step(const il_array *a, const il_robust_terms *t, il_array_a
     }
 }
 
-void il_feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
+/* Flags of such a sample, and its weights in the sum of one; apart, because its speed is the recursion's. */
+static void feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
     il_real total = IL_C(0.0);
     for (int32_t i = 0; i < a->elements; i++) {
         s->flags[i] = il_finite(z[i]) ? 0 : (uint8_t)IL_NOT_FINITE;
@@ -296,7 +298,7 @@ void il_feedback_health(const il_array *a, il_array_axis *s, const il_real *z) {
 }
 
 static inline unsigned step(const il_array *a, const il_robust_terms *t, il_array_state *state,
-                            const il_real *reading, il_real *rate, int want_health, il_lanes *lanes) {
+                            const il_real *reading, il_real *rate, int want_health) {
     il_real moved[3 * IL_ARRAY_ELEMENTS];
     const il_real *z = reading;
     unsigned flags = 0;
@@ -304,25 +306,13 @@ static inline unsigned step(const il_array *a, const il_robust_terms *t, il_arra
         aligned(a, reading, moved);
         z = moved;
     }
-#if IL_LANES
-    if (lanes != NULL) {
-        if (lanes->wait > 0) {
-            lanes->wait--;
-        } else if ((lanes->together || il_lanes_ready(lanes, a, state)) &&
-                   il_lanes_step(lanes, a, t, state, z, reading, rate, want_health, &flags)) {
-            return flags;
-        }
-    }
-#else
-    (void)lanes;
-#endif
     for (int32_t axis = 0; axis < a->axes; axis++) {
         il_array_axis *s = &state->axis[axis];
         const il_real *mine = z + axis * a->elements;
         il_count(&s->count);
         if (a->method == IL_FEEDBACK) {
             s->rate = feedback_step(a, s, mine, axis);
-            if (want_health) il_feedback_health(a, s, mine);
+            if (want_health) feedback_health(a, s, mine);
         } else {
             s->rate = axis_step(a, t, s, mine, reading + axis * a->elements, axis, want_health);
         }
@@ -374,7 +364,7 @@ il_status il_array_start(const il_array *settings, il_array_state *state) {
 unsigned il_array_step(const il_array *settings, il_array_state *state, const il_real *reading, il_real *rate) {
     il_robust_terms t;
     if (settings->method == IL_ROBUST) t = il_robust_prepare(settings);
-    return step(settings, &t, state, reading, rate, 1, NULL);
+    return step(settings, &t, state, reading, rate, 1);
 }
 
 void il_array_still(const il_array *settings, il_array_state *state) {
@@ -394,16 +384,11 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
     unsigned all = 0;
     int want_health = flags != NULL || weight != NULL;
     il_robust_terms t;
-    il_lanes *lanes = NULL;
     if (a.method == IL_ROBUST) t = il_robust_prepare(&a);
-#if IL_LANES
-    il_lanes room;
-    if (il_lanes_start(&room, &a, n)) lanes = &room;
-#endif
     for (size_t k = 0; k < n; k++) {
         /* the last sample leaves flags and weights in the state, as single steps do */
         const int health = want_health || k + 1 == n;
-        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, health, lanes);
+        all |= step(&a, &t, state, reading + k * width, rate + k * (size_t)a.axes, health);
         if (still != NULL && still[k]) il_array_still(&a, state);
         for (size_t axis = 0; want_health && axis < (size_t)a.axes; axis++) {
             const il_array_axis *s = &state->axis[axis];
@@ -412,8 +397,5 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
             if (weight != NULL) memcpy(weight + place, s->weight, elements * sizeof(il_real));
         }
     }
-#if IL_LANES
-    if (lanes != NULL) il_lanes_end(lanes, &a, state);
-#endif
     return all;
 }

@@ -10,16 +10,6 @@
 #define IL_APART
 #endif
 
-/* Gain of the running estimates at sample k, k >= 1. */
-il_real il_array_gain(const il_array *a, uint32_t k);
-
-/* One sample of one axis by the source's recursion; least: floor of a variance. Apart, for restrict to hold. */
-il_real il_feedback_loop(int32_t n, il_real gain, il_real before, il_real least, const il_real *restrict z,
-                         il_real *restrict bias, il_real *restrict variance, il_real *restrict weight);
-
-/* Flags of such a sample, and its weights in the sum of one; apart, because its speed is the recursion's. */
-void il_feedback_health(const il_array *a, il_array_axis *s, const il_real *z);
-
 /* What the robust method makes of its settings, once for many samples. */
 typedef struct {
     il_real share;      /* 1/n */

@@ -396,17 +396,6 @@ void il_robust_settle(const il_array *a, il_array_axis *s) {
     s->clean = 0;
 }
 
-int il_robust_examine(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, sample *p) {
-    il_robust_settle(a, s);
-    return examine(a, s, z, reading, p);
-}
-
-il_real il_robust_look_closely(const il_array *a, il_array_axis *s, const il_real *z, sample *p, int closer) {
-    const il_real rate = look_closely(a, s, z, p, closer);
-    il_robust_muster(a, s);
-    return rate;
-}
-
 il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,
                        const il_real *reading, int want_health) {
     sample p;
@@ -416,8 +405,13 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         s->resolution = smaller(p.change, s->resolution);
         memcpy(s->last, reading, (size_t)a->elements * sizeof(il_real));
     } else {
-        int closer = il_robust_examine(a, s, z, reading, &p);
-        if (closer || !well) return il_robust_look_closely(a, s, z, &p, closer);
+        il_robust_settle(a, s);
+        int closer = examine(a, s, z, reading, &p);
+        if (closer || !well) {
+            const il_real rate = look_closely(a, s, z, &p, closer);
+            il_robust_muster(a, s);
+            return rate;
+        }
         for (int32_t i = 0; i < a->elements; i++) il_count(&s->seen[i]);
     }
     if (want_health) {

@@ -1,4 +1,4 @@
-/* What robust.c, robust_well.c and robust_lanes.c share: constants, one sample at work, the median, gains. */
+/* What robust.c and robust_well.c share: constants, one sample at work, the median, gains. */
 #ifndef IL_ROBUST_H
 #define IL_ROBUST_H
 
@@ -101,15 +101,6 @@ void il_robust_find_small_jumps(const il_array *a, il_array_axis *s, sample *p);
 /* robust.c: decide whether the next sample may go the short way; bring the counts of each gyro up to date. */
 void il_robust_muster(const il_array *a, il_array_axis *s);
 void il_robust_settle(const il_array *a, il_array_axis *s);
-
-/* robust.c: repeated and missing readings of a sample that is not plainly well. Returns whether these ask for the long
- * way, and that. */
-int il_robust_examine(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, sample *p);
-il_real il_robust_look_closely(const il_array *a, il_array_axis *s, const il_real *z, sample *p, int closer);
-
-/* robust_well.c: whether no mean of a second can have jumped in a sample in which all was well; the search if one can. */
-int il_robust_agree(int32_t n, const il_robust_terms *t, const il_real *fast, const il_real *trust);
-void il_robust_suspect(const il_array *a, il_array_axis *s, sample *p);
 
 /* robust_well.c: whether all is well in a sample, which is then fused, and what it teaches. */
 int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z,

@@ -150,7 +150,7 @@ int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axi
 
 /* Whether the means of a second are so near to each other that none can have jumped. As in il_robust_find_small_jumps half
  * of the limit, because one sample moves a variance a little. */
-int il_robust_agree(int32_t n, const il_robust_terms *t, const il_real *fast, const il_real *trust) {
+static int agree(int32_t n, const il_robust_terms *t, const il_real *fast, const il_real *trust) {
     il_real sorted[IL_ARRAY_ELEMENTS];
     int all = 1;
     memcpy(sorted, fast, (size_t)n * sizeof *fast);
@@ -162,7 +162,7 @@ int il_robust_agree(int32_t n, const il_robust_terms *t, const il_real *fast, co
     return all;
 }
 
-void il_robust_suspect(const il_array *a, il_array_axis *s, sample *p) {
+static void suspect(const il_array *a, il_array_axis *s, sample *p) {
     il_robust_settle(a, s);
     p->learnt = most_seen(a, s) - 1;
     memset(p->learns, 1, sizeof p->learns);
@@ -174,7 +174,7 @@ void il_robust_suspect(const il_array *a, il_array_axis *s, sample *p) {
 void il_robust_learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, sample *p) {
     /* The median of the means of a second is no further from 0 than sqrt(2) times their root mean square. */
     if (teach(a->elements, t, p, p->r, p->gain, p->trust, s->bias, s->variance, s->fast) <= IL_C(0.0)) return;
-    if (!il_robust_agree(a->elements, t, s->fast, p->trust)) il_robust_suspect(a, s, p);
+    if (!agree(a->elements, t, s->fast, p->trust)) suspect(a, s, p);
 }
 
 il_robust_terms il_robust_prepare(const il_array *a) {

@@ -37,7 +37,6 @@ void test_triads(void);
 void test_warmup(void);
 void test_array(void);
 void test_robust(void);
-void test_lanes(void);
 void test_table(void);
 
 #endif

@@ -226,10 +226,8 @@ static void arrays(void) {
     for (int j = 0; j < JOBS; j++) t[j] *= 1e9 / SAMPLES;
     printf("feedback %.2f 1.3 # of a bare loop: %.1f ns a sample, loop %.1f ns\n", t[1] / t[0], t[1], t[0]);
     printf("robust %.2f 5 # of feedback: %.1f ns a sample\n", t[3] / t[1], t[3]);
-    printf("feedback-three %.2f 2.2 # axes against one: %.1f ns\n", t[2] / t[1], t[2]);
-    printf("robust-three %.2f 2.2 # axes against one: %.1f ns\n", t[4] / t[3], t[4]);
-    printf("mean-three %.2f 2.2 # axes against one: %.1f ns, one %.1f ns\n", t[6] / t[5], t[6], t[5]);
-    printf("least-squares-three %.2f 2.2 # axes against one: %.1f ns, one %.1f ns\n", t[8] / t[7], t[8], t[7]);
+    printf("robust-three %.0f 250 # ns a sample of three axes; feedback %.1f, mean %.1f (one %.1f), least squares %.1f (one %.1f)\n",
+           t[4], t[2], t[6], t[5], t[8], t[7]);
 }
 
 int main(void) {

@@ -35,6 +35,20 @@ static void plain_methods_equal_the_equations(void) {
     }
 }
 
+/* Readings whose squares are beyond all numbers leave no weight. */
+static void no_weight_is_no_rate(void) {
+    il_array a = settings_of(IL_LEAST_SQUARES);
+    il_array_state state;
+    il_real out = REAL(0);
+    CHECK(il_array_start(&a, &state) == IL_OK);
+    for (int k = 0; k < 4; k++) {
+        il_real reading[V_ELEMENTS];
+        for (int i = 0; i < V_ELEMENTS; i++) reading[i] = ((i + k) % 2 ? REAL(1) : REAL(-1)) * (IS_FLOAT ? REAL(1e30) : REAL(1e200));
+        CHECK(((il_array_step(&a, &state, reading, &out) & IL_NOT_FINITE) != 0) == (isnan(out) != 0));
+    }
+    CHECK(isnan(out));
+}
+
 static void kalman_starts_with_what_is_there(void) {
     il_array a = settings_of(IL_KALMAN);
     il_real rate[V_SAMPLES];
@@ -334,6 +348,7 @@ static void the_largest_array_fits(void) {
 
 void test_array(void) {
     plain_methods_equal_the_equations();
+    no_weight_is_no_rate();
     kalman_starts_with_what_is_there();
     feedback_equals_the_source();
     alignment_comes_first();

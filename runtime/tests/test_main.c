@@ -29,7 +29,6 @@ int main(void) {
     test_array();
     test_robust();
     test_table();
-    test_lanes();
     printf("C core, %s: %lu checks, %lu failed\n", IS_FLOAT ? "float" : "double", checks, failures);
     return failures == 0 ? EXIT_SUCCESS : EXIT_FAILURE;
 }

@@ -26,12 +26,10 @@ _CORE = (
     "array.c",
     "robust.c",
     "robust_well.c",
-    "robust_lanes.c",
-    "lanes.c",
     "table.c",
 )
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
-_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust|lanes)\.h"\n', re.MULTILINE)
+_OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust)\.h"\n', re.MULTILINE)
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
@@ -95,7 +93,7 @@ def _header(tables: Sequence[Table]) -> str:
 def _amalgamation() -> str:
     """The core's sources as one file, so that a project has one to add."""
     parts = ["/* The core of imulab in one file; the same for every unit. */\n", '#include "imulab.h"\n']
-    for name in ("real.h", "array.h", "robust.h", "lanes.h", *_CORE):
+    for name in ("real.h", "array.h", "robust.h", *_CORE):
         parts += [f"\n/* ==== {name} ==== */\n", _OWN_INCLUDE.sub("", _source(name))]
     return "".join(parts)
 
