@@ -31,7 +31,7 @@ def record(**changes) -> Calibration:
         model={"order": 2, "gravity": {"value": 9.81362, "unit": "m/s^2", "from": "argument"}, "output_unit": "count"},
         fit={"method": "norm", "attitudes": 38, "reduced_chi_square": None, "converged": True},
         options={"order": "auto", "gravity": 9.81362},
-        data={"mean": [[1.5, -2.5e-300], [1e22, 0.1]], "note": 'quote " backslash \\ tab \t \x01 é \U0001f6f0'},
+        data={"mean": [[1.5, -2.5e-300], [1e22, 0.1]], "note": 'quote " backslash \\ é \U0001f6f0'},
         sensor={"serial": "SN42", "model": "Würfel"},
         sources=(Source("tumble.csv", "0" * 64),),
         warnings=("first.", "second."),
@@ -106,7 +106,7 @@ def test_a_record_comes_back_as_it_was_saved(tmp_path):
 
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-WORDS = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
+WORDS = st.text(st.characters(exclude_categories=["Cs", "Cc", "Cf", "Zl", "Zp"]), max_size=12)  # hidden ones: test_forged
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**60), 2**60) | FINITE | WORDS,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(WORDS, inner, max_size=3),

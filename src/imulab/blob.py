@@ -12,6 +12,7 @@ from typing import Any
 from imulab.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.errors import RecordError
 from imulab.packing import TEXT, Table, pack
+from imulab.printable import first_hidden
 from imulab.runtime import Unit
 from imulab.tables import tables_of
 
@@ -97,6 +98,8 @@ def load_blob(path: str | Path) -> Blob:
             raise ValueError
     except (ValueError, KeyError, TypeError):
         raise RecordError(f"{path}: the blob has no description of its units: it is for firmware only") from None
+    if place := first_hidden(content):
+        raise RecordError(f"{path}: {place} holds a control or bidirectional character; expected plain text")
     return Blob(str(path), data, content)
 
 

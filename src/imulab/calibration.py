@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
@@ -23,12 +24,14 @@ from imulab.errors import RecordError
 from imulab.files import write_text
 from imulab.jsontext import content_sha256, sealed_text
 from imulab.jsontext import json_text as json_text
+from imulab.printable import first_hidden, has_hidden, printable
 from imulab.recording import Source
 from imulab.verdict import UNJUDGED, Verdict, verdict_of
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
 BLOB_MAGIC = b"\x89IMULAB\n"
+_CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
 PROCEDURES = ("tumble", "gyro_array", "warmup", "centrifuge")
 
 
@@ -123,9 +126,11 @@ class Calibration:
         """Return the record's ``content_sha256`` and its JSON text, which ends with it; errors as for `to_dict`."""
         content = self._content()
         try:
-            return sealed_text(content)
+            sealed = sealed_text(content)
         except (TypeError, ValueError):  # arrays, or a number that is not finite, which gets its name here
-            return sealed_text(plain_values(content, ""))
+            content = plain_values(content, "")
+            sealed = sealed_text(content)
+        return sealed if first_hidden(content) is None else sealed_text(plain_values(content, ""))
 
     def _content(self) -> dict[str, Any]:
         """Return the record as it goes into its file, without ``content_sha256``."""
@@ -271,6 +276,10 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise RecordError(f"{name}: {where}: {first['msg']}, found {_short(first['input'])}") from None
+    if place := first_hidden(content):
+        raise RecordError(f"{name}: {place} holds a control or bidirectional character; expected plain text")
+    if not _CREATED.fullmatch(record.created):
+        raise RecordError(f"{name}: created: expected a time such as 2026-11-20T12:00:00Z, found {record.created!r}")
     if record.procedure not in PROCEDURES:
         raise RecordError(f"{name}: unknown procedure {record.procedure!r}; known procedures: {' '.join(PROCEDURES)}")
     size = len(record.covariance.names)
@@ -282,8 +291,10 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
 def plain_values(value: Any, where: str) -> Any:
     """Return `value` as plain JSON types; refuse numbers that are not finite."""
     kind = type(value)
-    if kind is str or value is None or (kind is float and math.isfinite(value)):
+    if value is None or (kind is str and not has_hidden(value)) or (kind is float and math.isfinite(value)):
         return value  # as most are
+    if isinstance(value, str):
+        return printable(value)
     if isinstance(value, np.ndarray):
         value = value.tolist()
     elif isinstance(value, np.generic):
@@ -291,7 +302,7 @@ def plain_values(value: Any, where: str) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise RecordError(f"record: {where.lstrip('.')} is {value}; a record holds finite numbers only")
     if kind is dict or isinstance(value, Mapping):
-        return {str(key): plain_values(item, f"{where}.{key}") for key, item in value.items()}
+        return {printable(str(key)): plain_values(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
         if set(map(type, value)) == {float} and all(map(math.isfinite, value)):
             return list(value)

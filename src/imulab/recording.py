@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
+from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
 
 Array = NDArray[np.float64]
@@ -88,7 +89,12 @@ class Recording:
         if len(lengths) > 1:
             raise DataError(f"{self.name}: columns of different length: {sorted(lengths)}")
         for name in self.columns:
+            if has_hidden(name):
+                raise DataError(f"{self.name}: column name {printable(name)!r} holds a control character")
             check_unit(name, self.units.get(name, ""), self.name)
+        if any(has_hidden(text) for pair in self.metadata.items() for text in pair):
+            clean = {printable(key): printable(value) for key, value in self.metadata.items()}
+            object.__setattr__(self, "metadata", clean)
         object.__setattr__(self, "units", {name: self.units.get(name, "1") for name in self.columns})
 
     def __repr__(self) -> str:

@@ -38,7 +38,7 @@ UNJUDGED = Verdict("good")
 
 SENTENCES: dict[State, str] = {
     "good": "nothing in the data speaks against this result",
-    "look": "look at this before you use the result",
+    "look": "understand this before you use the result",
     "bad": "do not use this result as it is",
 }
 

@@ -6,6 +6,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+from imulab.printable import printable
+
 _INTERRUPTED_PIPE = 141  # 128 + SIGPIPE, as a shell reports it
 
 
@@ -63,7 +65,7 @@ def _refuse(message: str) -> int:
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split())
+    return printable(" ".join(text.split()))
 
 
 def _usage(error: object) -> str:

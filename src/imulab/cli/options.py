@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.printable import printable
 from imulab.texts import chosen as chosen
 from imulab.texts import quantity as quantity
 from imulab.texts import whole_number as whole_number
@@ -60,7 +61,7 @@ def heard(
             if kind not in said and note.startswith("truncated"):
                 tell(block.name, note) if tell else warn(f"{block.name}: {note}")
             elif note not in said and notes and not note.startswith("truncated"):
-                print(f"imulab: note: {block.name}: {note}", file=sys.stderr)
+                print(printable(f"imulab: note: {block.name}: {note}"), file=sys.stderr)
             said |= {kind, note}
 
 
@@ -166,7 +167,7 @@ def warn(message: str) -> None:
     """Print one line on standard error, after what was held."""
     release()
     if message not in _released:
-        print(f"imulab: warning: {message}", file=sys.stderr)
+        print(printable(f"imulab: warning: {message}"), file=sys.stderr)
 
 
 def release() -> None:
@@ -174,7 +175,7 @@ def release() -> None:
     for name in list(_held):
         message = f"{name}: {_held.pop(name)}"
         _released.add(message)
-        print(f"imulab: warning: {message}", file=sys.stderr)
+        print(printable(f"imulab: warning: {message}"), file=sys.stderr)
 
 
 def forget() -> None:

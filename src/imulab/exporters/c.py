@@ -18,6 +18,7 @@ from imulab.exporters import ExportOptions
 from imulab.exporters.golden import golden_of
 from imulab.files import replacing
 from imulab.packing import KINDS, Field, Table
+from imulab.printable import printable
 
 _CORE = (
     "tumble.c",
@@ -105,7 +106,8 @@ def _who(records: Sequence[Calibration]) -> str:
 
 def _harmless(text: str) -> str:
     """Text that neither ends a C comment nor makes a compiler warn in one."""
-    for wrong, right in (("\\", "|"), ("\n", " "), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
+    text = printable(text)
+    for wrong, right in (("\\", "|"), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
         text = text.replace(wrong, right)
     return text
 
@@ -135,7 +137,7 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
 
 def _unit_c(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
     lines = [f"/* The numbers of {_who(records)}; made from the records"]
-    lines += [f" *   {record.procedure} {record.created} SHA-256 {_digest(record)}" for record in records]
+    lines += [f" *   {record.procedure} {_harmless(record.created)} SHA-256 {_digest(record)}" for record in records]
     lines += [
         " * by " + _harmless(records[0].software) + ". */",
         '#include "unit.h"',
@@ -223,7 +225,7 @@ def _readme(records: Sequence[Calibration], tables: Sequence[Table], blob_size: 
     environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
     text: str = environment.from_string(_firmware("README.md.j2")).render(
         serial=_who(records),
-        software=records[0].software,
+        software=_harmless(records[0].software),
         blob_size=blob_size,
         kinds={table.kind: table.columns for table in tables},
         first=tables[0].kind,

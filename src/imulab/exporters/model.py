@@ -17,6 +17,7 @@ from imulab._version import VERSION
 from imulab.calibration import Calibration
 from imulab.errors import OptionError, RecordError
 from imulab.files import write_text
+from imulab.printable import printable
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
@@ -81,10 +82,10 @@ class Unit:
     def origin(self) -> list[str]:
         """Where the numbers come from, for the comments of a file."""
         content = self.record.to_dict()["content_sha256"]
-        serial = " ".join(str(self.record.sensor.get("serial", "without serial number")).split())
+        serial = printable(str(self.record.sensor.get("serial", "without serial number")))
         return [
             f"written by imulab {VERSION} for unit {serial}",
-            f"from the record of {self.record.created}, content_sha256 {content}",
+            f"from the record of {printable(self.record.created)}, content_sha256 {content}",
         ]
 
 

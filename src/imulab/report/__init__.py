@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ _TITLES = {
     "warmup": "Warm-up table",
     "centrifuge": "Centrifuge test",
 }
+_LINK = re.compile(r"<(?=\s*/?\s*a\b)", re.IGNORECASE)
 _NUMBER = re.compile(r"[<>±+−-]?\s?\d[\d.,]*(?:e[-+]?\d+)?(?![\w.-])|nan\b")
 
 
@@ -121,7 +124,15 @@ def _template(name: str) -> Any:
     from jinja2 import Environment, StrictUndefined
 
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.globals["policy"] = _policy
     return environment.from_string((files("imulab.report") / name).read_text(encoding="utf-8"))
+
+
+def _policy(*scripts: str) -> str:
+    """Return the content security policy of a page: its own scripts, by their SHA-256, and nothing from elsewhere."""
+    digests = [b64encode(sha256(script.encode("utf-8")).digest()).decode("ascii") for script in scripts]
+    own = " ".join(f"'sha256-{digest}'" for digest in digests)
+    return f"default-src 'none'; script-src {own}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
 
 
 @cache
@@ -133,10 +144,10 @@ def _plotly() -> Any:
 
 
 def _json_for_script(value: Any) -> Any:
-    """Return JSON that cannot end the script element it stands in."""
+    """Return JSON that cannot end the script element it stands in, and whose texts Plotly makes no links of."""
     from markupsafe import Markup
 
-    text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    text = _LINK.sub("&lt;", json.dumps(value, ensure_ascii=False, allow_nan=False))
     return Markup(text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
 
 
