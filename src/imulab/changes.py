@@ -144,7 +144,19 @@ def _same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
 def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | None:
     """Return the uncertainty of a difference; None where one of the two is not stated."""
     a, b = (record.parameters[name].standard_uncertainty for record in (first, second))
-    return None if a is None or b is None else float(np.hypot(a, b)) or None
+    if a is None or b is None:
+        return None
+    return float(np.sqrt(max(a**2 + b**2 - _shared(first, second, [name])[0, 0], 0.0))) or None
+
+
+def _shared(first: Calibration, second: Calibration, names: list[str]) -> Array:
+    """Covariance that a difference does not have, since both records have the error in common (gravity of a place)."""
+    found = np.zeros((len(names), len(names)))
+    mine, its = (record.fit.get("shared", {}) for record in (first, second))
+    for what in mine.keys() & its.keys():
+        one, other = (np.array([terms[what].get(name, 0.0) for name in names]) for terms in (mine, its))
+        found += np.outer(one, other) + np.outer(other, one)
+    return found
 
 
 def _freedom(record: Calibration, name: str) -> float | None:
@@ -161,7 +173,7 @@ def _freedom(record: Calibration, name: str) -> float | None:
 def _joint(first: Calibration, second: Calibration, judged: list[str], changes: Sequence[Change]) -> float | None:
     if any(name not in record.covariance.names for record in (first, second) for name in judged):
         return None
-    total = sum(_block(record, judged) for record in (first, second))
+    total = sum(_block(record, judged) for record in (first, second)) - _shared(first, second, judged)
     scale = np.sqrt(np.diag(total))
     vector = np.array([change.difference for change in changes if change.name in judged]) / scale
     values, vectors = np.linalg.eigh(total / np.outer(scale, scale))

@@ -1,4 +1,4 @@
-"""Normal gravity on and above the WGS 84 ellipsoid.
+"""Local gravity: as stated, as normal gravity on and above the WGS 84 ellipsoid, or as a recording's head says.
 
 Source: NIMA TR8350.2 (World Geodetic System 1984), third edition, equations 4-1 (Somigliana) and 4-3
 (second-order free-air); constants from its tables 3.3 and 3.4.
@@ -7,8 +7,17 @@ Source: NIMA TR8350.2 (World Geodetic System 1984), third edition, equations 4-1
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
+from imulab.texts import quantity
+from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.verdict import Note
+
+if TYPE_CHECKING:
+    from imulab.recording import Recording
 
 _EQUATORIAL_GRAVITY = 9.7803253359  # m/s^2
 _SOMIGLIANA_K = 0.00193185265241
@@ -17,13 +26,187 @@ _SEMI_MAJOR_AXIS = 6378137.0  # m
 _FLATTENING = 1.0 / 298.257223563
 _M = 0.00344978650684  # omega^2 a^2 b / GM
 
+ANOMALY = 3.5e-4
+"""Standard uncertainty of normal gravity, m/s^2: 35 mGal, about the rms of free-air anomalies over the Earth."""
+_UNKNOWN_HEIGHT = 400.0
+"""Standard uncertainty of a height that is not given, m: most people live lower than 500 m."""
+_FREE_AIR = 3.086e-6  # 1/s^2
+_ANYWHERE = 0.0265 / math.sqrt(3)
+"""Standard uncertainty of standard gravity, m/s^2: all values from equator to pole (9.780 to 9.832) are possible."""
+_TOLD_APART = 3e-6
+"""Relative; far below any scale factor's uncertainty; a height of 10 m."""
+_ON_EARTH = (9.76, 9.84)
+_ROUNDED = 1e-5
+"""Half of the last digit, m/s^2, above which a stated value counts as rounded."""
+_TO_MICRO = 1e6
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Local gravity and its standard uncertainty, m/s^2, where the value comes from, and what is to be said of it."""
+
+    value: float
+    origin: str
+    standard_uncertainty: float = 0.0
+    note: str = ""
+
+    def entry(self) -> dict[str, Any]:
+        """Return it as it stands in a record's model."""
+        return {
+            "value": self.value,
+            "unit": "m/s^2",
+            "standard_uncertainty": self.standard_uncertainty,
+            "from": self.origin,
+        }
+
+
+def local_gravity(given: float | str | Gravity | None, recording: Recording) -> Gravity:
+    """Return what was given, else what the head of the recording says, else standard gravity.
+
+    Raises
+    ------
+    OptionError
+        The value cannot be the gravity of any place.
+    """
+    if given is None:
+        local = _of_head(recording) or Gravity(
+            STANDARD_GRAVITY,
+            "standard gravity, none given",
+            _ANYWHERE,
+            f"no local gravity was given: standard gravity {STANDARD_GRAVITY} m/s^2 was used, and every scale factor "
+            f"inherits its difference from the local value (0.5 % from pole to equator; {100 * _ANYWHERE / 9.8:.2g} % "
+            "is in its uncertainty); give --gravity, or --latitude and --height",
+        )
+    elif isinstance(given, str):
+        local = stated_gravity(given, "gravity")
+    else:
+        local = given if isinstance(given, Gravity) else Gravity(float(given), "argument")
+    if not 0.5 < local.value < 50.0:
+        raise OptionError(f"gravity {local.value:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
+    return local
+
+
+def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
+    """Return what a user must know of the gravity that was used, a sentence each."""
+    head = _of_head(recording)
+    if head is not None:
+        allowed = _TOLD_APART * head.value + 2 * math.hypot(head.standard_uncertainty, gravity.standard_uncertainty)
+        if abs(gravity.value - head.value) > allowed:
+            return [
+                f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says {head.value:.6g} "
+                f"m/s^2: scale factors differ by {_TO_MICRO * (head.value / gravity.value - 1):+.0f} ppm between the "
+                "two"
+            ]
+    low, high = _ON_EARTH
+    if not low <= gravity.value <= high:
+        return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
+    return [gravity.note] if gravity.note else []
+
+
+def gravity_option(gravity: str | None, latitude: str | None, height: str | None, label: str) -> Gravity | None:
+    """Return the gravity that options state, or None; `label` is how messages call an option (``"--{}"``).
+
+    Raises
+    ------
+    OptionError
+        An option is no quantity of its kind, is out of range, or does not go with another.
+    """
+    names = {name: label.format(name) for name in ("gravity", "latitude", "height")}
+    if gravity is not None:
+        if latitude is not None or height is not None:
+            raise OptionError(
+                f"{names['gravity']} together with {names['latitude']} or {names['height']}: expected one or the other"
+            )
+        return stated_gravity(gravity, names["gravity"])
+    if latitude is None:
+        if height is not None:
+            raise OptionError(f"{names['height']} without {names['latitude']}: expected both")
+        return None
+    angle = quantity(latitude, names["latitude"], "angle", "deg")
+    above = quantity(height, names["height"], "length", "m") if height is not None else 0.0
+    value = normal_gravity(angle, above)
+    half = min(_half_digit(latitude, "angle", "deg"), math.pi / 2 - abs(angle))
+    rounding = abs(normal_gravity(angle + half) - normal_gravity(angle - half)) / math.sqrt(12)
+    unknown = 0.0 if height is not None else _UNKNOWN_HEIGHT * _FREE_AIR
+    uncertainty = math.hypot(ANOMALY, rounding, unknown)
+    where = f"{above:g} m" if height is not None else f"not given: 0 m ± {_UNKNOWN_HEIGHT:g} m"
+    return Gravity(
+        value,
+        f"normal gravity at latitude {math.degrees(angle):.6g} deg, height {where} (WGS 84)",
+        uncertainty,
+        Note(
+            f"gravity {value:.6g} m/s^2 is normal gravity, from which that of a place differs: "
+            f"{from_si(uncertainty, 'ug'):.2g} µg"
+            + (f" (the height was not given; {names['height']} lowers it)" if unknown else "")
+            + f" are part of every scale factor's uncertainty; a surveyed value ({names['gravity']} "
+            "9.81362+-0.00002) does without"
+        ),
+    )
+
+
+def stated_gravity(text: str, option: str) -> Gravity:
+    """Return a text such as ``9.81362``, ``9.81362+-0.00002`` or ``9.81362 m/s^2 ± 20 ug`` as gravity.
+
+    A value of fewer than five decimals without an uncertainty of its own counts as rounded: half of its last digit over
+    the square root of 3 is its standard uncertainty.
+
+    Raises
+    ------
+    OptionError
+        It is none; the message begins with `option`.
+    """
+    first, sign, second = re.sub(r"\+/?-|±", "±", text).partition("±")
+    value = quantity(first, option, "acceleration", "m/s^2")
+    if sign:
+        uncertainty = quantity(second, f"{option} {text!r}, uncertainty", "acceleration", "m/s^2")
+        if not 0 <= uncertainty < 0.1 * abs(value):
+            raise OptionError(
+                f"{option} {text!r}: expected a standard uncertainty of 0 or more, below a tenth of the value"
+            )
+        return Gravity(value, "argument", uncertainty)
+    half = _half_digit(first, "acceleration", "m/s^2")
+    if half <= _ROUNDED:
+        return Gravity(value, "argument")
+    uncertainty = half / math.sqrt(3)
+    return Gravity(
+        value,
+        "argument, rounded",
+        uncertainty,
+        Note(
+            f"gravity {value:.6g} m/s^2 counts as rounded: {_TO_MICRO * uncertainty / value:.2g} ppm are part of every "
+            f"scale factor's uncertainty; give five decimals, or say how well it is known ({option} "
+            f"{value:.6g}+-0.0001, +-0 if exact)"
+        ),
+    )
+
+
+def _half_digit(text: str, kind: str, unit: str) -> float:
+    """Half of the last digit of a number with a unit, in SI; 0 for one with an exponent."""
+    match = re.fullmatch(r"\s*[-+]?\d*\.?(\d*)\s*([^\d\s].*)?", text)
+    if match is None:
+        return 0.0
+    return quantity(f"{0.5 * 10.0 ** -len(match[1]):.20f}{match[2] or ''}", "", kind, unit)
+
+
+def _of_head(recording: Recording) -> Gravity | None:
+    """Return what a comment ``# gravity: 9.81362 m/s^2`` of the recording says."""
+    text = recording.metadata.get("gravity")
+    if text is None:
+        return None
+    try:
+        found = stated_gravity(text, "gravity")
+    except OptionError:
+        return None
+    said = f"gravity {found.value:.6g} m/s^2 was taken from the head of {recording.name}, as no option gave another"
+    return Gravity(found.value, f"head of {recording.name}", found.standard_uncertainty, Note(said))
+
 
 def normal_gravity(latitude: float, height: float = 0.0) -> float:
     """Return the magnitude of normal gravity.
 
     ``gamma = gamma_e (1 + k sin^2 phi) / sqrt(1 - e^2 sin^2 phi)``, continued to the height h by
     ``1 - 2 (1 + f + m - 2 f sin^2 phi) h / a + 3 (h / a)^2``. The real gravity of a place differs from it by the
-    local anomaly, typically 10 to 50 ug, rarely more than 200 ug.
+    local anomaly, typically 10 to 50 ug, rarely more than 200 ug (`ANOMALY` stands for it where it is not known).
 
     Parameters
     ----------

@@ -118,7 +118,10 @@ def fit(
     order: Annotated[str, typer.Option(help="auto, or 1 to 5.")] = "auto",
     method: Annotated[str, typer.Option(help="norm or linearised.")] = "norm",
     loss: Annotated[str, typer.Option(help="square, or huber against single disturbed attitudes.")] = "square",
-    gravity: Annotated[str | None, typer.Option(help="Local gravity, m/s^2.")] = None,
+    gravity: Annotated[
+        str | None,
+        typer.Option(help="Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head."),
+    ] = None,
     latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
     height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
     prior: Annotated[

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import DataError, OptionError, RecordError
+from imulab.errors import DataError, RecordError
 from imulab.tasks.task import Files, Task
-from imulab.texts import chosen, quantity, whole_number
+from imulab.texts import chosen, whole_number
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
     from imulab.recording import Recording
-    from imulab.tumble.record import Gravity
 
 
 def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.gravity import gravity_option
     from imulab.tumble.fit import check_options
 
     order = texts.get("order", "auto")
@@ -25,7 +24,7 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "order": int(order) if order.isascii() and order.isdecimal() and len(order) < 3 else order,
         "method": texts.get("method", "norm"),
         "loss": texts.get("loss", "square"),
-        "gravity": _gravity(texts.get("gravity"), texts.get("latitude"), texts.get("height"), label),
+        "gravity": gravity_option(texts.get("gravity"), texts.get("latitude"), texts.get("height"), label),
         "monte_carlo": None if trials is None else whole_number(trials, label.format("monte-carlo")),
         "prior": texts.get("prior"),
         "layout": texts.get("layout"),
@@ -75,27 +74,6 @@ def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     if own is not None and own.sha256 in [source.sha256 for source in record.sources]:
         raise DataError(f"{recording.name}: the prior {file} was made from this recording, which would count twice")
     return record
-
-
-def _gravity(gravity: str | None, latitude: str | None, height: str | None, label: str) -> Gravity | float | None:
-    from imulab.gravity import normal_gravity
-    from imulab.tumble.record import Gravity
-
-    names = {name: label.format(name) for name in ("gravity", "latitude", "height")}
-    if gravity is not None:
-        if latitude is not None or height is not None:
-            raise OptionError(
-                f"{names['gravity']} together with {names['latitude']} or {names['height']}: expected one or the other"
-            )
-        return quantity(gravity, names["gravity"], "acceleration", "m/s^2")
-    if latitude is None:
-        if height is not None:
-            raise OptionError(f"{names['height']} without {names['latitude']}: expected both")
-        return None
-    angle = quantity(latitude, names["latitude"], "angle", "deg")
-    above = quantity(height, names["height"], "length", "m") if height is not None else 0.0
-    value = normal_gravity(angle, above)
-    return Gravity(value, f"normal gravity at latitude {math.degrees(angle):.6g} deg, height {above:g} m (WGS 84)")
 
 
 TASK = Task(

@@ -18,6 +18,7 @@ from imulab.estimate import (
     huber_inflation,
     observability,
 )
+from imulab.gravity import Gravity, local_gravity
 from imulab.recording import Array
 from imulab.tumble.advice import helpful_attitudes
 from imulab.tumble.axes import check_axes
@@ -25,9 +26,9 @@ from imulab.tumble.checks import check_attitudes, check_residuals
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
 from imulab.tumble.montecarlo import check_trials, propagate
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
-from imulab.tumble.record import Gravity, Scaling, make_record, prior_of
+from imulab.tumble.record import Scaling, make_record, prior_of
 from imulab.tumble.solve import Problem, Solution, data_freedom, forces, informed_rows, solve_linearised, solve_norm
-from imulab.units import STANDARD_GRAVITY, parse_unit, to_si
+from imulab.units import parse_unit, to_si
 
 METHODS = ("norm", "linearised")
 LOSSES = ("square", "huber")
@@ -65,7 +66,7 @@ def fit_tumble(
     attitudes: Attitudes,
     *,
     order: int | str = "auto",
-    gravity: float | Gravity | None = None,
+    gravity: float | str | Gravity | None = None,
     method: str = "norm",
     loss: str = "square",
     prior: Calibration | None = None,
@@ -84,7 +85,8 @@ def fit_tumble(
     order
         1 to 5, or ``"auto"``: the order that predicts best among those that the attitudes can see.
     gravity
-        Local gravity, m/s^2. Without it standard gravity is used, with a warning.
+        Local gravity, m/s^2, or a text such as ``"9.81362+-0.00002"``, whose standard uncertainty enters that of the
+        scale factors. Without it that of the recording's head is used, or standard gravity, with a warning.
     method
         ``"norm"`` or ``"linearised"``.
     loss
@@ -109,7 +111,7 @@ def fit_tumble(
         The prior lacks a parameter, or has outputs in another unit.
     """
     check_options(order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None)
-    local = _gravity(gravity)
+    local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
     reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
@@ -207,15 +209,6 @@ def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> 
     if order not in ("auto", own):
         raise OptionError(f"order {order} with a prior of order {own}: expected order {own} or auto")
     return own
-
-
-def _gravity(gravity: float | Gravity | None) -> Gravity:
-    if gravity is None:
-        return Gravity(STANDARD_GRAVITY, "standard gravity, none given")
-    local = gravity if isinstance(gravity, Gravity) else Gravity(float(gravity), "argument")
-    if not 0.5 < local.value < 50.0:
-        raise OptionError(f"gravity {local.value:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
-    return local
 
 
 def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:

@@ -45,6 +45,18 @@ def parameter_units(order: int, output: str) -> list[str]:
     return ["m/s^2"] * 3 + [f"{output}/(m/s^2)"] * 3 + ["rad"] * 3 + [unit for unit in nonlinearity for _ in AXES]
 
 
+def gravity_slope(values: Array) -> Array:
+    """Return the derivatives of the parameters, in SI, by the logarithm of gravity, shapes (p,).
+
+    Outputs say how large the parameters are in units of gravity: ``dS/S = -dg/g``, ``db/b = dg/g``,
+    ``dk_j/k_j = -(j - 1) dg/g``, and misalignment stays.
+    """
+    slope = np.zeros_like(values)
+    slope[:3], slope[3:6] = values[:3], -values[3:6]
+    slope[9:] = -np.repeat(np.arange(1.0, len(values) // 3 - 2), 3) * values[9:]
+    return slope
+
+
 @dataclass(frozen=True)
 class Inversion:
     """Specific force of a batch of outputs, shape (..., 3); NaN where no specific force gives this output."""

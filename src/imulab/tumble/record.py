@@ -10,12 +10,12 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import OptionError, RecordError
+from imulab.errors import RecordError
 from imulab.estimate import Observability, coverage_factor, leverage
-from imulab.recording import Array, Recording
-from imulab.texts import quantity
+from imulab.gravity import Gravity, gravity_findings
+from imulab.recording import Array
 from imulab.tumble.checks import check_prior
-from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, parameter_names, parameter_units
+from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, gravity_slope, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
 from imulab.tumble.solve import Prior, Problem, Solution, data_freedom, forces
@@ -24,23 +24,12 @@ from imulab.units import parse_unit
 _STANDS_OUT = 5.0
 _MOST_NAMED = 8
 _ENOUGH_DEGREES = 9
-_ON_EARTH = (9.76, 9.84)
-_SAME_GRAVITY = 3e-6
-"""Far below any scale factor's uncertainty; a height of 10 m."""
 _WORST_SCALE = 0.1
 _WORST_MISALIGNMENT = 0.1
 _DOWN_WEIGHTED = 0.5
 _HIGH_CONDITION = 300.0
 _FEW_DEGREES = 5
 _TO_MICRO = 1e6
-
-
-@dataclass(frozen=True)
-class Gravity:
-    """Local gravity, m/s^2, and where the value comes from."""
-
-    value: float
-    origin: str
 
 
 @dataclass(frozen=True)
@@ -69,12 +58,14 @@ def make_record(
     """Turn a solution in units of g into the record.
 
     ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; `covariance` is carried along by
-    their derivatives. `coverage` is the factor of a 95 % interval.
+    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `coverage` is
+    the factor of a 95 % interval.
     """
     g, order = gravity.value, problem.order
     names = parameter_names(order)
     values, derivative = _to_si(solution.theta[0], scaling, g, order)
-    matrix = None if covariance is None else derivative @ covariance @ derivative.T
+    shared = gravity.standard_uncertainty / g * gravity_slope(values)
+    matrix = None if covariance is None else derivative @ covariance @ derivative.T + np.outer(shared, shared)
     recording = attitudes.recording
     n, size = len(attitudes), len(names)
     chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
@@ -84,7 +75,7 @@ def make_record(
         chi_square *= g**2
     model: dict[str, Any] = {
         "order": order,
-        "gravity": {"value": g, "unit": "m/s^2", "from": gravity.origin},
+        "gravity": gravity.entry(),
         "output_unit": attitudes.unit,
         "gauge": GAUGE,
     }
@@ -115,7 +106,8 @@ def make_record(
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
             "orders": [dict(vars(row)) for row in orders],
-            **_propagated(monte_carlo, scaling, g, order),
+            **_shared(gravity, names, shared),
+            **_propagated(monte_carlo, scaling, gravity, order),
             **_prior_shares(prior, names, matrix),
         },
         options=dict(options),
@@ -143,11 +135,20 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
     return found
 
 
-def _propagated(trials: MonteCarlo | None, scaling: Scaling, g: float, order: int) -> dict[str, Any]:
+def _shared(gravity: Gravity, names: list[str], shared: Array) -> dict[str, Any]:
+    """Errors that records have in common where they rest on the same gravity, for whoever compares them."""
+    if not gravity.standard_uncertainty:
+        return {}
+    what = f"gravity {gravity.value!r} +- {gravity.standard_uncertainty!r} m/s^2"
+    return {"shared": {what: dict(zip(names, shared.tolist(), strict=True))}}
+
+
+def _propagated(trials: MonteCarlo | None, scaling: Scaling, gravity: Gravity, order: int) -> dict[str, Any]:
     """Mean, standard deviation and 95 % interval of every parameter over the trials, in SI."""
     if trials is None:
         return {}
-    values = _si_values(trials.theta, scaling, g, order)
+    drawn = np.random.default_rng(2).standard_normal((len(trials.theta), 1))
+    values = _si_values(trials.theta, scaling, gravity.value + gravity.standard_uncertainty * drawn, order)
     low, high = np.quantile(values, [0.025, 0.975], axis=0)
     columns = zip(parameter_names(order), values.mean(axis=0), values.std(axis=0, ddof=1), low, high, strict=True)
     return {
@@ -162,8 +163,8 @@ def _propagated(trials: MonteCarlo | None, scaling: Scaling, g: float, order: in
     }
 
 
-def _si_values(theta: Array, scaling: Scaling, g: float, order: int) -> Array:
-    """Parameter vectors in SI, shape (b, p)."""
+def _si_values(theta: Array, scaling: Scaling, g: float | Array, order: int) -> Array:
+    """Parameter vectors in SI, shape (b, p); one gravity, or one for each, shape (b, 1)."""
     scale_factor = scaling.scale * theta[:, 3:6] / g
     bias = (scaling.zero + scaling.scale * theta[:, 0:3]) / scale_factor
     powers = np.repeat(np.arange(1, order), 3)
@@ -297,38 +298,11 @@ def _warnings(
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
-        *_gravity_warnings(gravity, attitudes.recording),
+        *gravity_findings(gravity, attitudes.recording),
         *_attitude_warnings(attitudes, problem, solution, reduced_chi_square),
         *_freedom_warnings(problem, solution, observability),
         *_size_warnings(attitudes, solution),
     ]
-
-
-def _gravity_warnings(gravity: Gravity, recording: Recording) -> list[str]:
-    stated = _stated_gravity(recording)
-    if stated is not None and abs(gravity.value - stated) > _SAME_GRAVITY * stated:
-        return [
-            f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says {stated:.6g} "
-            f"m/s^2: scale factors differ by {_TO_MICRO * (stated / gravity.value - 1):+.0f} ppm between the two"
-        ]
-    if gravity.origin.startswith("standard"):
-        return [
-            f"no local gravity was given: standard gravity {gravity.value} m/s^2 was used, and every scale factor "
-            "inherits its difference from the local value (0.5 % from pole to equator)"
-        ]
-    low, high = _ON_EARTH
-    if not low <= gravity.value <= high:
-        return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
-    return []
-
-
-def _stated_gravity(recording: Recording) -> float | None:
-    """Return what a comment ``# gravity: 9.81362 m/s^2`` of the recording says, m/s^2."""
-    text = recording.metadata.get("gravity")
-    try:
-        return None if text is None else quantity(text, "gravity", "acceleration", "m/s^2")
-    except OptionError:
-        return None
 
 
 def _attitude_warnings(
