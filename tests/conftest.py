@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imulab.recording import Recording
+from imulab.recording import Array, Recording
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -42,6 +42,16 @@ def chromium() -> str:
     if path is None:
         pytest.skip("no Chromium on this machine (Debian package chromium)")
     return path
+
+
+@pytest.fixture
+def noise_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the stated noise of attitudes as exact, where a bound or an equality supposes that it is."""
+
+    def none(residuals: Array, variance: Array, spare: Array) -> tuple[Array, Array]:
+        return np.zeros(len(residuals)), np.full(len(residuals), np.inf)
+
+    monkeypatch.setattr("imulab.tumble.solve.plausible_excess", none)
 
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -17,6 +17,7 @@ from imulab.estimate import (
     leverage,
     median,
     observability,
+    plausible_excess,
     robust_scale,
 )
 
@@ -347,6 +348,59 @@ def test_the_excess_makes_chi_square_what_it_should_be():
             root = optimize.brentq(lambda t, r=r, v=v: (r**2 / (v + t)).sum() - 30, 0, most, xtol=1e-300, rtol=1e-14)
             assert tau == pytest.approx(root, rel=1e-11)  # the last step is below 1e-6, and convergence is quadratic
     assert 5 < np.count_nonzero(found == 0) < 30
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.5, 1.0, 2.0, 50.0, 1e8])
+@pytest.mark.parametrize(("count", "freedom"), [(12, 3), (24, 15), (400, 391)])
+def test_the_plausible_excess_has_the_mean_precision_of_its_posterior(ratio, count, freedom):
+    """All variances alike: chi-square is sufficient, and the posterior of the precision an integral over (0, 1)."""
+    v, residuals = 1e-9, np.random.default_rng(count).standard_normal((1, count))
+    chi_square = ratio * freedom
+    residuals *= np.sqrt(v * chi_square / (residuals**2).sum())
+    spare = np.full((1, count), freedom / count)
+    excess, effective = plausible_excess(residuals, np.full((1, count), v), spare)
+    b = min(0.25, freedom / 40)
+    # kappa = 1 - y^(1/b) takes the singularity at 1 away: a sum over equal steps of y.
+    kappa = 1 - ((np.arange(400_000) + 0.5) / 400_000) ** (1 / b)
+    density = stats.gamma.logpdf(kappa, freedom / 2, scale=2 / chi_square)
+    share = np.exp(density - density.max())
+    share /= share.sum()
+    mean, square = share @ kappa, share @ kappa**2
+    if ratio < 1e3:
+        assert v / (v + excess[0]) == pytest.approx(mean, rel=3e-3)
+        assert effective[0] == pytest.approx(2 * mean**2 / (square - mean**2), rel=0.1)
+    else:  # all scatter, no own noise: its mean square and its degrees of freedom
+        assert excess[0] == pytest.approx(v * ratio, rel=0.02)
+        assert effective[0] == pytest.approx(freedom, rel=0.05)
+
+
+def test_nothing_is_added_where_nothing_is_left_to_tell():
+    excess, effective = plausible_excess(np.full((1, 9), 1e-3), np.full((1, 9), 1e-12), np.zeros((1, 9)))
+    assert excess[0] == 0
+    assert effective[0] == np.inf
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.5, 2.0, 4.0])
+@pytest.mark.parametrize(("count", "size"), [(24, 9), (24, 15), (48, 12)])
+def test_intervals_with_the_plausible_excess_cover(ratio, count, size):
+    """Linear fits whose observations scatter `ratio` times as much (in variance) as is stated of them."""
+    rng = np.random.default_rng(3)
+    trials = 2500
+    design = rng.standard_normal((count, size))
+    stated = rng.uniform(0.5, 2.0, count)
+    noise = rng.standard_normal((trials, count)) * np.sqrt(stated + (ratio - 1) * stated.mean())
+    weights = np.tile(1 / stated, (trials, 1))
+    for _ in range(3):
+        normal = np.einsum("np,tn,nq->tpq", design, weights, design)
+        found = np.linalg.solve(normal, np.einsum("np,tn->tp", design, weights * noise)[:, :, None])[:, :, 0]
+        spare = 1 - leverage(np.broadcast_to(design, (trials, count, size)), weights)
+        excess, freedom = plausible_excess(noise - found @ design.T, np.tile(stated, (trials, 1)), spare)
+        weights = 1 / (stated + excess[:, None])
+    inverse = np.linalg.inv(np.einsum("np,tn,nq->tpq", design, weights, design))
+    half = stats.t.ppf(0.975, freedom)[:, None] * np.sqrt(np.einsum("tpp->tp", inverse))
+    covered = (np.abs(found) <= half).mean()
+    print(f"scatter {ratio}, {count} observations, {size} parameters: {100 * covered:.1f} %")
+    assert 0.925 <= covered <= 0.972
 
 
 def test_robust_scale_is_the_median_deviation_about_zero_of_what_the_fit_leaves():

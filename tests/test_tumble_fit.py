@@ -77,7 +77,7 @@ def test_stated_covariances_weigh_the_attitudes():
         assert abs(weighted.value(name) - value) < 4 * weighted.parameters[name].standard_uncertainty
 
 
-def test_uncertainties_equal_the_cramer_rao_bound():
+def test_uncertainties_equal_the_cramer_rao_bound(noise_as_stated):
     rng = np.random.default_rng(32)
     truth = reference.random_truth(rng, 2)
     directions = reference.random_attitudes(rng, 30)
@@ -182,7 +182,8 @@ def test_unknown_noise_is_estimated_and_said():
     assert found.fit["reduced_chi_square"] == pytest.approx(1e-6, rel=0.6)
     known = fit(data, 1, sigma=1e-3).calibration
     assert known.fit["noise"] == "known"
-    assert known.fit["coverage_factor_95"] == pytest.approx(1.959964)
+    assert 1.959964 < known.fit["coverage_factor_95"] < 2.03
+    assert known.fit["effective_degrees_of_freedom"] > 30
 
 
 def test_attitudes_that_scatter_more_than_stated_get_an_excess():

@@ -27,7 +27,7 @@ def propagated(data, order, trials, **options):
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])
-def test_trials_scatter_as_the_bound_says_where_noise_is_known(order):
+def test_trials_scatter_as_the_bound_says_where_noise_is_known(order, noise_as_stated):
     sigma = 1e-4
     truth, directions, data = problem(order, 36, sigma)
     found = propagated(data, order, 20_000, stated=sigma).fit["monte_carlo"]

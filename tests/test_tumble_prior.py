@@ -31,7 +31,7 @@ def joined(first, second):
 
 
 @pytest.mark.parametrize(("order", "few"), [(1, 30), (1, 5), (2, 30), (2, 7)])
-def test_prior_and_data_equal_one_fit_of_everything(order, few):
+def test_prior_and_data_equal_one_fit_of_everything(order, few, noise_as_stated):
     truth = reference.random_truth(np.random.default_rng(order), order)
     factory, field = (attitudes_of(truth, order, n, seed) for n, seed in ((40, 1), (few, 2)))
     updated = fit(field, order, prior=fit(factory, order))
@@ -61,7 +61,7 @@ def test_a_vague_prior_changes_nothing_and_a_sharp_one_everything():
             assert updated.fit["prior"]["shares"][name] == pytest.approx(share, abs=1e-3), name
 
 
-def test_shares_say_what_few_attitudes_cannot_tell():
+def test_shares_say_what_few_attitudes_cannot_tell(noise_as_stated):
     """Six faces of a cube say nothing of misalignment, and much of bias and scale factor.
 
     With a prior that does not tie misalignment to them, that is: else they do so through it.

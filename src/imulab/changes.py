@@ -162,6 +162,9 @@ def _shared(first: Calibration, second: Calibration, names: list[str]) -> Array:
 def _freedom(record: Calibration, name: str) -> float | None:
     """Return the degrees of freedom of a parameter's uncertainty; None where the noise was known."""
     fit = record.fit
+    if "effective_degrees_of_freedom" in fit:
+        effective: float | None = fit["effective_degrees_of_freedom"]
+        return effective
     if fit.get("noise") == "known" and not fit.get("excess", {}).get("value"):
         return None
     stated = fit.get("degrees_of_freedom", fit.get("repeatability"))

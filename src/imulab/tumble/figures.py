@@ -166,6 +166,20 @@ def _span(values: list[float], bars: list[float] | None) -> float:
     return 1.25 * (max(map(abs, values)) + (float(np.median(bars)) if bars else 0.0)) or 1.0
 
 
+def _basis(record: Calibration) -> str:
+    """Say what the uncertainties rest on."""
+    fit = record.fit
+    freedom = fit.get("effective_degrees_of_freedom", fit["degrees_of_freedom"])
+    if fit["noise"] != "known":
+        return f"Noise estimated from the residuals; Student's t with {freedom:.0f} degrees of freedom."
+    if not fit["excess"]["value"] or freedom is None:
+        return "Noise known from the attitudes' own scatter; normal quantiles."
+    return (
+        f"Noise known from the attitudes' own scatter, with {_micro_g(fit['excess']['value']):.3g} µg more for each "
+        f"attitude, as its residual makes plausible; Student's t with {freedom:.0f} effective degrees of freedom."
+    )
+
+
 def _parameters(record: Calibration) -> Table:
     factors = {False: record.fit["coverage_factor_95"], True: record.fit.get("gyro", {}).get("coverage_factor_95")}
     rows = []
@@ -177,13 +191,7 @@ def _parameters(record: Calibration) -> Table:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
         rows.append([row.name, value, uncertainty, interval, row.unit])
-    known = record.fit["noise"] == "known" and record.fit["excess"]["value"] == 0
-    freedom = record.fit["degrees_of_freedom"]
-    basis = (
-        "Noise known from the attitudes' own scatter; normal quantiles."
-        if known
-        else f"Noise estimated from the residuals; Student's t with {freedom} degrees of freedom."
-    )
+    basis = _basis(record)
     turned = ""
     if "gyro" in record.fit:
         degrees = record.fit["gyro"]["degrees_of_freedom"]

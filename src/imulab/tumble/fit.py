@@ -12,9 +12,7 @@ from imulab.calibration import Calibration
 from imulab.errors import DataError, ObservabilityError, OptionError
 from imulab.estimate import (
     Observability,
-    chi_square_limit,
     covariance,
-    coverage_factor,
     huber_inflation,
     observability,
 )
@@ -27,7 +25,7 @@ from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
 from imulab.tumble.montecarlo import check_trials, propagate
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
 from imulab.tumble.record import Scaling, make_record, prior_of
-from imulab.tumble.solve import Problem, Solution, data_freedom, forces, informed_rows, solve_linearised, solve_norm
+from imulab.tumble.solve import Problem, Solution, forces, informed_rows, solve_linearised, solve_norm
 from imulab.units import parse_unit, to_si
 
 METHODS = ("norm", "linearised")
@@ -149,7 +147,7 @@ def fit_tumble(
         problem=problem,
         solution=solution,
         covariance=matrix,
-        coverage=coverage_factor(freedom) if matrix is not None else None,
+        effective=freedom,
         observability=seen,
         orders=choice.rows if choice else (),
         options={"order": order, "method": method, "loss": loss, "gravity": local.value}
@@ -253,10 +251,8 @@ def _solve(
 def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "linearised" and n >= size:
-        return solve_linearised(problem, attitudes.recording.name, chi_square_limit(n - size))
-    limit = chi_square_limit(n - size if problem.prior is None else n)
-    start = None if problem.prior is None else problem.prior.mean[None]
-    return solve_norm(problem, start, limit=limit)
+        return solve_linearised(problem, attitudes.recording.name)
+    return solve_norm(problem, None if problem.prior is None else problem.prior.mean[None])
 
 
 def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
@@ -265,18 +261,19 @@ def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, flo
     freedom = n - size
     if problem.prior is not None:
         rows, weights = informed_rows(problem, solution.jacobian[0], 1 / solution.variance[0])
-        left = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
-        estimated = bool(solution.excess[0] > 0) and left > 1
-        return covariance(rows[None], weights[None])[0], left if estimated else None
+        return covariance(rows[None], weights[None])[0], _finite(solution.freedom[0])
     base = covariance(solution.jacobian, 1 / solution.variance)[0]
     known = problem.covariance is not None
     if problem.robust and freedom > 0:
         factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
         return base * factor, float(freedom)
     if known:
-        estimated = bool(solution.excess[0] > 0)
-        return base, float(freedom) if estimated else None
+        return base, _finite(solution.freedom[0])
     if freedom == 0:
         return None, None
     chi_square = float((solution.residuals[0] ** 2 / solution.variance[0]).sum())
     return base * (chi_square / freedom), float(freedom)
+
+
+def _finite(freedom: float) -> float | None:
+    return float(freedom) if np.isfinite(freedom) else None

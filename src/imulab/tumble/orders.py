@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imulab.estimate import Observability, bayesian_information, chi_square_limit, f_test, observability
+from imulab.estimate import Observability, bayesian_information, f_test, observability
 from imulab.recording import Array
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count
 from imulab.tumble.solve import Problem, Solution, leave_one_out, solve_norm
@@ -70,7 +70,7 @@ def choose_order(problem: Problem, gravity: float) -> OrderChoice:
     for order in range(1, HIGHEST_ORDER + 1):
         if n > parameter_count(order) or (order == 1 and n == parameter_count(1)):
             trial = replace(problem, order=order)
-            fits[order] = trial, solve_norm(trial, limit=chi_square_limit(n - parameter_count(order)))
+            fits[order] = trial, solve_norm(trial)
     smallest = min((fit.excess[0] for order, (_, fit) in fits.items() if order <= 2), default=0.0)
     rows: list[OrderRow] = []
     seen = {order: observability(fit.jacobian[0], absolute_weights(trial, fit)) for order, (trial, fit) in fits.items()}

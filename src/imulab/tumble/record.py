@@ -11,7 +11,7 @@ import numpy as np
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import RecordError
-from imulab.estimate import Observability, coverage_factor, leverage
+from imulab.estimate import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.recording import Array
 from imulab.tumble.checks import check_prior
@@ -27,6 +27,7 @@ _ENOUGH_DEGREES = 9
 _WORST_SCALE = 0.1
 _WORST_MISALIGNMENT = 0.1
 _DOWN_WEIGHTED = 0.5
+_NOT_BY_CHANCE = 0.01
 _HIGH_CONDITION = 300.0
 _FEW_DEGREES = 5
 _TO_MICRO = 1e6
@@ -48,7 +49,7 @@ def make_record(
     problem: Problem,
     solution: Solution,
     covariance: Array | None,
-    coverage: float | None,
+    effective: float | None,
     observability: Observability,
     orders: tuple[OrderRow, ...],
     options: Mapping[str, Any],
@@ -58,8 +59,8 @@ def make_record(
     """Turn a solution in units of g into the record.
 
     ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; `covariance` is carried along by
-    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `coverage` is
-    the factor of a 95 % interval.
+    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `effective`
+    degrees of freedom are those of its scale: None where the noise is known.
     """
     g, order = gravity.value, problem.order
     names = parameter_names(order)
@@ -101,7 +102,8 @@ def make_record(
             "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
             "noise": "known" if known else "estimated from the residuals",
             "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
-            "coverage_factor_95": coverage,
+            "effective_degrees_of_freedom": effective,
+            "coverage_factor_95": None if covariance is None else coverage_factor(effective),
             "rank": observability.rank,
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
@@ -115,8 +117,9 @@ def make_record(
         sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
-            *_warnings(attitudes, gravity, problem, solution, observability, chi_square / max(freedom, 1.0)),
-            *_prior_warnings(prior, attitudes, solution),
+            *_warnings(attitudes, gravity, problem, solution, observability),
+            *_scatter_warnings(problem, solution, chi_square, freedom),
+            *_prior_warnings(prior, attitudes, beyond_noise(problem, chi_square, freedom)),
         ),
     )
 
@@ -216,14 +219,14 @@ def _prior_shares(prior: Calibration | None, names: list[str], matrix: Array | N
     }
 
 
-def _prior_warnings(prior: Calibration | None, attitudes: Attitudes, solution: Solution) -> list[str]:
+def _prior_warnings(prior: Calibration | None, attitudes: Attitudes, beyond: bool) -> list[str]:
     if prior is None:
         return []
     found = []
     mine, its = prior.sensor.get("serial"), attitudes.recording.metadata.get("serial")
     if mine and its and mine != its:
         found.append(f"the prior is a record of {mine}, the recording one of {its}")
-    if solution.excess[0] > 0:
+    if beyond:
         found.append(
             "prior and attitudes contradict each other: if the unit has changed since the prior was made, the values "
             "still lean on it and the uncertainties do not cover the change; fit without the prior and compare"
@@ -293,27 +296,35 @@ def _warnings(
     problem: Problem,
     solution: Solution,
     observability: Observability,
-    reduced_chi_square: float,
 ) -> list[str]:
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
         *gravity_findings(gravity, attitudes.recording),
-        *_attitude_warnings(attitudes, problem, solution, reduced_chi_square),
+        *_attitude_warnings(attitudes, problem, solution),
         *_freedom_warnings(problem, solution, observability),
         *_size_warnings(attitudes, solution),
     ]
 
 
-def _attitude_warnings(
-    attitudes: Attitudes, problem: Problem, solution: Solution, reduced_chi_square: float
-) -> list[str]:
-    found = []
-    if solution.excess[0] > 0:
-        found.append(
-            f"the attitudes scatter more than their own noise explains (reduced chi-square {reduced_chi_square:.3g}): "
-            f"{_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"
-        )
+def beyond_noise(problem: Problem, chi_square: float, freedom: float) -> bool:
+    """Whether attitudes scatter so much that their own noise would do it once in a hundred tests or less."""
+    known = problem.covariance is not None and freedom >= 1
+    return known and chi_square_probability(chi_square, freedom) < _NOT_BY_CHANCE
+
+
+def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, freedom: float) -> list[str]:
+    """Say that the attitudes scatter beyond their noise; the uncertainties hold that scatter with or without this."""
+    if not beyond_noise(problem, chi_square, freedom):
+        return []
+    added = f"; {_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"
+    return [
+        "the attitudes scatter more than their own noise explains (reduced chi-square "
+        f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}"
+    ]
+
+
+def _attitude_warnings(attitudes: Attitudes, problem: Problem, solution: Solution) -> list[str]:
     deviation = 1e3 * solution.deviations[0]
     if problem.robust:
         down = solution.down_weights[0]
@@ -328,7 +339,7 @@ def _attitude_warnings(
             for i, standard in _outliers(problem, solution).items()
         ]
     more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []
-    return found + single[:_MOST_NAMED] + more
+    return single[:_MOST_NAMED] + more
 
 
 def _freedom_warnings(problem: Problem, solution: Solution, observability: Observability) -> list[str]:

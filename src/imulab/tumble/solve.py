@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from imulab.errors import DataError
 from imulab.estimate import (
     Fit,
-    excess_variance,
     huber_weights,
     levenberg_marquardt,
     leverage,
+    plausible_excess,
     robust_scale,
 )
 from imulab.recording import Array
@@ -64,7 +64,7 @@ class Problem:
     robust
         Huber's loss instead of squares.
     excess
-        Whether attitudes that scatter more than their covariances allow get a common further variance.
+        Whether the attitudes get the common further variance that their scatter makes plausible.
     prior
         Earlier knowledge of the parameters.
     """
@@ -101,6 +101,8 @@ class Solution:
         Standard deviation that residuals were standardised with, in units of sqrt(variance), shape (b,).
     excess
         Standard deviation added to each attitude, shape (b,).
+    freedom
+        Effective degrees of freedom of `variance`, shape (b,): infinite where the attitudes' own noise is all.
     iterations, converged
         Shape (b,).
     """
@@ -114,6 +116,7 @@ class Solution:
     down_weights: Array
     scale: Array
     excess: Array
+    freedom: Array
     iterations: NDArray[np.int64]
     converged: NDArray[np.bool_]
 
@@ -134,12 +137,12 @@ def start_parameters(order: int, count: int = 1) -> Array:
     return theta
 
 
-def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.inf) -> Solution:
+def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
     """Fit |f| = 1 by weighted least squares, or with Huber's loss.
 
-    Weights are ``1 / (q' C q)``, q = d|f|/dM: each attitude's own noise along its own vertical. They and the
-    lengthening of |f| by noise across it are recomputed at the solution and the fit is repeated until they rest (at
-    most 4 passes, 30 with Huber's loss).
+    Weights are ``1 / (q' C q + tau^2)``, q = d|f|/dM: each attitude's own noise along its own vertical, and what the
+    attitudes scatter beyond it (`plausible_excess`). They and the lengthening of |f| by noise across it are recomputed
+    at the solution and the fit is repeated until they rest (at most 4 passes, 30 with Huber's loss).
 
     Parameters
     ----------
@@ -147,16 +150,13 @@ def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.i
         The attitudes.
     start
         Start parameters, shape (b, p); the nominal sensor if not given.
-    limit
-        Chi-square beyond which the attitudes' own covariances are taken as too small and a common excess
-        variance is estimated (Mandel-Paule).
     """
     count, n, _ = problem.reading.shape
     theta = start_parameters(problem.order, count) if start is None else start
     size = parameter_count(problem.order)
     lengthening, own = _noise(problem, theta)
     variance, down, scale = own, np.ones((count, n)), np.ones(count)
-    excess = np.zeros(count)
+    excess, freedom = np.zeros(count), np.full(count, np.inf)
     iterations = np.zeros(count, dtype=np.int64)
     repeat = problem.robust or problem.covariance is not None
     for number in range(_REWEIGHTING_PASSES[problem.robust] if repeat else 1):
@@ -167,10 +167,7 @@ def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.i
         lengthening, own = _noise(problem, theta, fit.jacobian)
         residuals = fit.residuals
         if problem.covariance is not None and problem.excess and not problem.robust:
-            too_large = (residuals**2 / own).sum(axis=1) > limit
-            freedom = n - size if problem.prior is None else data_freedom(problem, fit.jacobian[0], 1 / own[0])
-            found = excess_variance(residuals, own, max(freedom, 1)) if too_large.any() else np.zeros(count)
-            excess = np.where(too_large, found, 0.0)
+            excess, freedom = plausible_excess(residuals, own, _spare(problem, fit.jacobian, 1 / variance))
         variance = own + excess[:, None]
         if problem.robust:
             standard = residuals / np.sqrt(variance * np.maximum(1 - leverage(fit.jacobian, down / variance), 0.05))
@@ -193,6 +190,7 @@ def solve_norm(problem: Problem, start: Array | None = None, limit: float = np.i
         down_weights=down,
         scale=scale,
         excess=np.sqrt(excess),
+        freedom=freedom,
         iterations=iterations,
         converged=fit.converged,
     )
@@ -234,6 +232,14 @@ def informed_rows(problem: Problem, jacobian: Array, weights: Array) -> tuple[Ar
     if problem.prior is None:
         return jacobian, weights
     return np.vstack([jacobian, problem.prior.rows]), np.concatenate([weights, np.ones(len(problem.prior.rows))])
+
+
+def _spare(problem: Problem, jacobian: Array, weights: Array) -> Array:
+    """Return ``1 - leverage`` of the attitudes, shape (b, n), whose sum is the number of degrees of freedom."""
+    if problem.prior is None:
+        return 1 - leverage(jacobian, weights)
+    rows, all_weights = informed_rows(problem, jacobian[0], weights[0])
+    return 1 - leverage(rows[None], all_weights[None])[:, : weights.shape[1]]
 
 
 def data_freedom(problem: Problem, jacobian: Array, weights: Array) -> float:
@@ -283,7 +289,7 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     )  # fmt: skip
 
 
-def solve_linearised(problem: Problem, name: str, limit: float = np.inf) -> Solution:
+def solve_linearised(problem: Problem, name: str) -> Solution:
     """Run the published first-order iteration for a batch of one; weights and excess variance as for `solve_norm`.
 
     ``sum_i sum_j d_ji a_i^(j+1) + m_1 a_x a_y + m_2 a_y a_z + m_3 a_z a_x = (|B|^2 - 1) / 2``, solved by linear least
@@ -297,14 +303,19 @@ def solve_linearised(problem: Problem, name: str, limit: float = np.inf) -> Solu
     _, own = _noise(problem, start_parameters(problem.order))
     theta, passes = _linearised_iteration(problem, own[0], name)
     solution = _evaluated(problem, theta, passes, name)
-    chi_square = float((solution.residuals**2 / solution.own_variance).sum())
-    if problem.covariance is None or chi_square <= limit:
+    if problem.covariance is None:
         return solution
-    n, size = problem.reading.shape[1], theta.shape[1]
-    excess = excess_variance(solution.residuals, solution.own_variance, max(n - size, 1))
-    theta, passes = _linearised_iteration(problem, solution.own_variance[0] + excess, name)
-    solution = _evaluated(problem, theta, passes, name)
-    return replace(solution, variance=solution.own_variance + excess[:, None], excess=np.sqrt(excess))
+    for _ in range(_REWEIGHTING_PASSES[False]):
+        before = solution.excess
+        spare = _spare(problem, solution.jacobian, solution.weights)
+        excess, freedom = plausible_excess(solution.residuals, solution.own_variance, spare)
+        theta, passes = _linearised_iteration(problem, solution.own_variance[0] + excess, name)
+        solution = _evaluated(problem, theta, passes, name)
+        variance = solution.own_variance + excess[:, None]
+        solution = replace(solution, variance=variance, excess=np.sqrt(excess), freedom=freedom)
+        if np.abs(solution.excess - before).max() <= _WEIGHTS_AT_REST * solution.excess.max():
+            break
+    return solution
 
 
 def _linearised_iteration(problem: Problem, variance: Array, name: str) -> tuple[Array, int]:
@@ -360,6 +371,7 @@ def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> So
         down_weights=np.ones((1, n)),
         scale=np.ones(1),
         excess=np.zeros(1),
+        freedom=np.full(1, np.inf),
         iterations=np.array([iterations]),
         converged=np.array([True]),
     )
