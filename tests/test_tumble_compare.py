@@ -60,7 +60,7 @@ def test_a_check_needs_the_unit_of_the_record(truth):
         check_tumble(record, counts, limit=1.0)
 
 
-def test_no_change_is_claimed_where_nothing_changed(truth):
+def test_no_change_is_claimed_where_nothing_changed(noise_as_stated, truth):
     """One false claim in twenty comparisons, and the joint probability uniform."""
     claims, probabilities = 0, []
     for seed in range(200):
