@@ -169,10 +169,10 @@ def test_the_mean_is_that_of_the_samples_of_the_pieces():
 
 def test_the_covariance_of_the_mean_is_that_of_batch_means(monkeypatch):
     samples, time, _ = tumble(DIRECTIONS)
-    monkeypatch.setattr(segment, "_POOL_DEGREES", 0.0)  # each attitude on its own
+    monkeypatch.setattr(segment, "POOL_DEGREES", 0.0)  # each attitude on its own
     attitudes = find_attitudes(recording(samples, time))
     lengths = attitudes.pieces[:, 1] - attitudes.pieces[:, 0]
-    batch = int(np.median(lengths // 10)) // 4 * 10  # four batches, of whole blocks of 0.1 s
+    batch = int(np.median(lengths // 13)) // 10 * 13  # ten batches, of whole blocks of 0.13 s
     for (start, stop, k), length in zip(attitudes.pieces, lengths, strict=True):
         expected = reference.batch_covariance_of_mean(samples[start:stop], batch)
         used = length // batch * batch / length  # the mean is of all samples, the batches may leave some over
@@ -192,7 +192,7 @@ def test_the_covariance_knows_that_samples_are_not_white():
         return sigma**2 / n**2 * (n * (1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (1 - phi) ** 2)
 
     lengths = attitudes.samples
-    batch = int(np.median(lengths // 10)) // 4 * 10
+    batch = int(np.median(lengths // 13)) // 10 * 13
     batches = lengths // batch
     # Batches are a little correlated: (V(L) - V(m L)) / (m - 1) is what batch means find on average.
     expected = (variance(batch) - variance(batches * batch)) / (batches - 1) * (batches * batch / lengths)

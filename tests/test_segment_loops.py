@@ -88,17 +88,17 @@ def test_points_that_determine_no_ellipsoid_have_no_error():
 def test_the_attitudes_of_a_recording_are_the_best_of_the_plain_sweep(moved):
     samples, time, _, _ = disturbed(moved)
     found = find_attitudes(recording(samples, time))
-    mean, scatter, longest = reference.blocks(samples, time, 10)
-    variance = reference.window_variance(mean, scatter, longest > 0.25, 10)
+    mean, scatter, longest = reference.blocks(samples, time, 13)
+    variance = reference.window_variance(mean, scatter, longest > 0.25, 8)
     quiet = np.quantile(variance, 0.05)
     sweep = {}
     for factor in np.geomspace(1.5, 400.0, 18):
-        pieces = reference.stretches(variance, factor * quiet, 10, 3, 10)
+        pieces = reference.stretches(variance, factor * quiet, 8, 3, 8)
         number, means = reference.attitudes(mean, pieces, 2e-3)
         sweep.setdefault(tuple(pieces), (reference.ellipsoid_error(means), number, len(means), factor))
     enough = [pieces for pieces in sweep if sweep[pieces][2] >= 0.75 * np.median([item[2] for item in sweep.values()])]
     best = min(enough, key=lambda pieces: sweep[pieces][0])
-    assert found.pieces[:, :2].tolist() == [[10 * start, 10 * stop] for start, stop in best]
+    assert found.pieces[:, :2].tolist() == [[13 * start, 13 * stop] for start, stop in best]
     assert found.pieces[:, 2].tolist() == sweep[best][1]
     assert found.trace.threshold == pytest.approx(sweep[best][3] * quiet, rel=1e-9)
 
@@ -108,14 +108,28 @@ def test_batches_are_those_of_the_plain_form(size):
     mean, _, _ = walk(3)
     found = [(k, k + 7 + k % 5) for k in range(0, 380, 13)]
     number = [k // 2 for k in range(len(found))]
-    first, counts, scatters = reference.batches(mean, found, number, size)
+    centre = G * random_attitudes(np.random.default_rng(4), max(number) + 1)
+    first, moments, counts, scatters = reference.batches(mean, found, number, centre, size)
     start, stop = np.array(found).T.astype(np.int64).copy()
-    ours = np.empty(len(first), dtype=np.int64), np.empty((len(first), 3))
-    many, scatter = np.empty(len(counts), dtype=np.int64), np.empty((len(counts), 3, 3))
-    _segment.batches(mean, start, stop, np.array(number), size, *ours, many, scatter)
+    ours = np.empty(len(first), dtype=np.int64), np.empty((len(first), 9))
+    many, scatter = np.empty(len(counts), dtype=np.int64), np.empty((len(counts), 9, 9))
+    _segment.batches(mean, start, stop, np.array(number), centre, size, *ours, many, scatter)
     assert (ours[0].tolist(), many.tolist()) == (first, counts)
-    np.testing.assert_allclose(ours[1], [mean[at : at + size].mean(axis=0) for at in first], rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(scatter, scatters, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(ours[1], moments, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(scatter, scatters, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("length", [1, 4, 13])
+def test_the_motion_of_a_hold_is_that_of_the_plain_form(length):
+    rng = np.random.default_rng(8)
+    samples = rng.standard_normal((60 * length, 3)).cumsum(axis=0)
+    found, number = [(0, 9), (9, 12), (15, 16), (20, 22), (30, 60)], [0, 0, 1, 1, 2]
+    centre = rng.standard_normal((3, 3))
+    mean = reference.blocks(samples, np.arange(60.0 * length), length)[0]
+    start, stop = np.array(found).T.astype(np.int64).copy()
+    sums = np.empty((3, 3, 3, 3))
+    _segment.motion(*np.ascontiguousarray(samples.T), length, mean, start, stop, np.array(number), centre, *sums)
+    np.testing.assert_allclose(sums, reference.motion(samples, length, found, number, centre), rtol=1e-11, atol=1e-11)
 
 
 def test_drift_is_the_slope_of_least_squares():
@@ -146,8 +160,17 @@ def test_buffers_that_do_not_go_together_are_refused():
         lambda: _segment.stretches(many, 1.0, 1, 2**62, 1, index, index.copy()),
         lambda: _segment.attitudes(three, index, index + 5, 0.1, index.copy(), three.copy()),
         lambda: _segment.attitudes(three, index, index, 0.1, index.copy(), three.copy()),
-        lambda: _segment.batches(three, index, index + 2, index, 1, index.copy(), three.copy(), index, np.zeros(36)),
-        lambda: _segment.batches(three, index, index + 1, index + 9, 1, index, three.copy(), index, np.zeros(36)),
+        lambda: _segment.batches(
+            three, index, index + 2, index, three, 1, index.copy(), np.zeros((4, 9)), index, np.zeros(324)
+        ),
+        lambda: _segment.batches(
+            three, index, index + 1, index + 9, three, 1, index.copy(), np.zeros((4, 9)), index, np.zeros(324)
+        ),
+        lambda: _segment.motion(many, many, many, 11, three, index, index + 1, index, three, *np.zeros((3, 4, 3, 3))),
+        lambda: _segment.motion(
+            many, many, many[:-1], 4, three, index, index + 1, index, three, *np.zeros((3, 4, 3, 3))
+        ),
+        lambda: _segment.motion(many, many, many, 4, three, index, index + 9, index, three, *np.zeros((3, 4, 3, 3))),
         lambda: _segment.drift(three, index, index + 5, np.zeros(3), np.zeros(3)),
         lambda: _segment.drift(three, index, index + 1, np.zeros(3), np.zeros(4)),
     )

@@ -32,11 +32,26 @@ def batches(
     start: NDArray[Any],
     stop: NDArray[Any],
     attitude: NDArray[Any],
+    centre: NDArray[Any],
     size: int,
     first: NDArray[Any],
     mean: NDArray[Any],
     number: NDArray[Any],
     scatter: NDArray[Any],
+) -> None: ...
+def motion(
+    x: NDArray[Any],
+    y: NDArray[Any],
+    z: NDArray[Any],
+    length: int,
+    block_mean: NDArray[Any],
+    start: NDArray[Any],
+    stop: NDArray[Any],
+    attitude: NDArray[Any],
+    centre: NDArray[Any],
+    noise: NDArray[Any],
+    spread: NDArray[Any],
+    slope: NDArray[Any],
 ) -> None: ...
 def drift(
     block_mean: NDArray[Any], start: NDArray[Any], stop: NDArray[Any], slope: NDArray[Any], scatter: NDArray[Any]

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.recording import Array, Recording
+
+POOL_DEGREES = 10.0
+"""Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,45 @@ class Trace:
             f"standard deviation within a window {low:.3g} (quietest 5 %), {middle:.3g} (median), {high:.3g} "
             f"(95 %); {100 * below:.0f} % of the time below the threshold {np.sqrt(self.threshold):.3g}"
         )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How each attitude moved while it was held, as far as the mean magnitude of f in it depends on that.
+
+    The mean of the magnitudes differs from the magnitude of the mean by the motion, and their scatter is the noise.
+    Both follow from the blocks of a hold through df/dM, which is known only when the fit is done.
+
+    Attributes
+    ----------
+    lengthening
+        ``C_w / N - D``, (n, 3, 3): covariance of the mean by white noise, which makes |f| too long, less the motion,
+        which makes the magnitude of the mean too short; in the squared unit of the outputs.
+    moments
+        Covariance of the attitude's means of x, y, z, xx, yy, zz, xy, xz, yz about its mean, from batches, (n, 9, 9).
+    usual
+        Covariance of the mean that white noise alone would leave, pooled over the attitudes: what tells noisy axes from
+        quiet ones, but not how strong the noise is at low frequencies; (n, 3, 3).
+    freedom
+        Degrees of freedom of `moments`, shape (n,).
+    """
+
+    lengthening: Array
+    moments: Array
+    usual: Array
+    freedom: Array
+
+    def scaled(self, scale: Array) -> Motion:
+        """Return it for outputs that are divided by `scale`, shape (3,)."""
+        square = scale[:, None] * scale
+        each = np.concatenate([scale, scale**2, square[[0, 0, 1], [1, 2, 2]]])
+        return Motion(
+            self.lengthening / square, self.moments / (each[:, None] * each), self.usual / square, self.freedom
+        )
+
+    def __getitem__(self, which: NDArray[Any]) -> Motion:
+        """Return it for some of the attitudes."""
+        return Motion(self.lengthening[which], self.moments[which], self.usual[which], self.freedom[which])
 
 
 @dataclass(frozen=True)
@@ -58,6 +101,8 @@ class Attitudes:
         Static stretches as rows (first sample, last sample + 1, attitude), for a continuous recording.
     swing
         Range of each axis over the whole recording, motion included, shape (3,).
+    motion
+        How they moved while they were held; None for a table.
     notes
         What a user should know of how they were found.
     """
@@ -73,6 +118,7 @@ class Attitudes:
     trace: Trace | None = None
     pieces: NDArray[np.int64] | None = None
     swing: Array | None = None
+    motion: Motion | None = None
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab import _segment
-from imulab.attitudes import Attitudes, Trace
+from imulab.attitudes import POOL_DEGREES, Attitudes, Motion, Trace
 from imulab.clipping import check_clipped_rows, check_clipping
 from imulab.errors import SegmentError, UnitError
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import conversion_factor
 
-_BLOCK_SECONDS = 0.1
+_BLOCK_SECONDS = 0.125
+"""One period of a hand's tremor: shorter blocks rectify it, longer ones hide the motion of the hand."""
 _SMALLEST_BLOCK = 4
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
@@ -36,14 +37,12 @@ _NO_TIME = (
     "no time column: each of the {} rows was taken as an attitude at rest; is this a recording with "
     "motion? Then it needs a column time, or a layout with sample_rate"
 )
-_BATCHES = 4
-"""Batches per attitude: few, so that they are long against the correlation of the noise, which is pooled."""
+_BATCHES = 10
+"""Batches per attitude: few, so that they are long against the correlation of the noise, but enough to tell it."""
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
 _SAME_ATTITUDE = 2e-3
 """Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
 shortens the vector by less than 0.5 ug."""
-_POOL_DEGREES = 10.0
-"""Weight, in degrees of freedom, of the noise pooled over all attitudes against an attitude's own."""
 _TRACE_POINTS = 2000
 _A_PART = 2000
 
@@ -155,17 +154,20 @@ def find_attitudes(
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
     stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
     check_clipping(recording, names, stretches)
-    mean, covariance, samples, noise = _statistics(pieces, blocks)
+    moments, freedom, share, noise = _statistics(pieces, blocks)
     if (noise < resolution / 2).any():
         resolution = _resolutions(recording, names)
     # Noise below half a step of the output does not average its rounding away.
-    covariance[:, range(3), range(3)] += np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
+    rounding = np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
+    covariance = _pooled(moments[:, :3, :3], freedom, share)
+    for matrices in (moments, covariance):
+        matrices[:, range(3), range(3)] += rounding
     first = np.unique(pieces.attitude, return_index=True)[1]
     last = np.append(first[1:], len(pieces.start)) - 1
     return Attitudes(
-        mean=mean,
+        mean=pieces.mean,
         covariance=covariance,
-        samples=samples,
+        samples=np.bincount(pieces.attitude, pieces.stop - pieces.start).astype(np.int64) * blocks.length,
         start=time[pieces.start[first] * blocks.length],
         stop=time[pieces.stop[last] * blocks.length - 1],
         unit=unit,
@@ -174,6 +176,7 @@ def find_attitudes(
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
+        motion=_motion([recording.column(name) for name in names], pieces, blocks, moments, freedom, share),
         notes=_notes(blocks, variance) + _drift_notes(pieces, blocks, names, unit),
     )
 
@@ -238,7 +241,7 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
     usual = steps[steps <= np.quantile(steps, 0.99)] if steps.size else np.ones(1)
     step = float(usual.mean())
     seconds = min(_BLOCK_SECONDS, window / 3, len(time) * step)  # no block is longer than the recording
-    length = max(_SMALLEST_BLOCK, round(seconds / step))
+    length = max(_SMALLEST_BLOCK, math.ceil(seconds / step - 0.01))
     count = len(time) // length
     mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
@@ -299,26 +302,57 @@ def _choose(candidates: list[_Pieces]) -> int:
     return int(np.argmax(counts))
 
 
-def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, NDArray[np.int64], Array]:
-    """Mean, its covariance by batch means, and number of samples of each attitude; noise of each axis, shape (3,)."""
-    mean = pieces.mean
-    count = len(mean)
+def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, Array, Array]:
+    """Return `Motion.moments` of each attitude, their degrees of freedom, the share of a batch; noise of each axis."""
+    count = len(pieces.mean)
     size = pieces.stop - pieces.start
     total = np.bincount(pieces.attitude, size, count)
     per_batch = max(1, min(int(np.median(total)) // _BATCHES, int(size.min()) // 2))
     first = np.empty(int((size // per_batch).sum()), dtype=np.int64)
-    number, scatter = np.empty(count, dtype=np.int64), np.empty((count, 3, 3))
-    batch = np.empty((len(first), 3))
-    _segment.batches(blocks.mean, pieces.start, pieces.stop, pieces.attitude, per_batch, first, batch, number, scatter)
-    # Shrink towards the noise common to all: ten batches alone would make poor weights.
-    freedom = (number - 1.0)[:, None, None]
-    level = np.trace(scatter, axis1=1, axis2=2) / np.maximum(number - 1, 1)
-    usual = level <= 3 * np.median(level)
-    pooled = scatter[usual].sum(axis=0) / max(float((number - 1)[usual].sum()), 1.0)
-    shrunk = (scatter + _POOL_DEGREES * pooled) / (freedom + _POOL_DEGREES)
-    covariance: Array = shrunk * (per_batch / total)[:, None, None]
+    number = np.empty(count, dtype=np.int64)
+    scatter: Array = np.empty((count, 9, 9))
+    _segment.batches(
+        blocks.mean, pieces.start, pieces.stop, pieces.attitude, pieces.mean, per_batch,
+        first, np.empty((len(first), 9)), number, scatter,
+    )  # fmt: skip
+    freedom, share = number.astype(np.float64) - 1, np.full(count, float(per_batch)) / total
+    moments: Array = scatter * (share / np.maximum(freedom, 1))[:, None, None]
     noise: Array = np.sqrt(np.median(blocks.scatter[first], axis=0))
-    return mean, covariance, (total * blocks.length).astype(np.int64), noise
+    return moments, freedom, share, noise
+
+
+def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
+    """Covariance of each mean, shrunk towards the noise common to all: a few batches alone make poor weights."""
+    scatter = covariance / share[:, None, None]
+    level = np.trace(scatter, axis1=1, axis2=2)
+    usual = level <= 3 * np.median(level)
+    pooled = np.einsum("n,nij->ij", freedom[usual], scatter[usual]) / max(float(freedom[usual].sum()), 1.0)
+    own = freedom[:, None, None]
+    shrunk: Array = (own * scatter + POOL_DEGREES * pooled) / (own + POOL_DEGREES)
+    return shrunk * share[:, None, None]
+
+
+def _motion(
+    samples: list[Array], pieces: _Pieces, blocks: _Blocks, moments: Array, freedom: Array, share: Array
+) -> Motion:
+    """How the attitudes moved: ``D = cov(x_k) - C_w / B + [mean(e e') - C_w / 2B] / 12``, B samples in a block."""
+    count, size = len(pieces.mean), pieces.stop - pieces.start
+    sums = np.empty((3, count, 3, 3))
+    x, y, z = (np.ascontiguousarray(values, dtype=np.float64) for values in samples)
+    _segment.motion(
+        x, y, z, blocks.length, blocks.mean, pieces.start, pieces.stop, pieces.attitude, pieces.mean, *sums
+    )  # fmt: skip
+    terms = size * blocks.length - 1, size, np.maximum(size - 2, 0)
+    numbers = np.array([np.bincount(pieces.attitude, each, count) for each in terms])
+    difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
+    white = difference / (2 * blocks.length)
+    pooled = np.median(white, axis=0)
+    return Motion(
+        lengthening=white * (1 + 1 / 24) - spread - slope / 12,
+        moments=moments,
+        usual=(pooled + (1e-3 * np.trace(pooled) + np.finfo(float).tiny) * np.eye(3)) * share[:, None, None],
+        freedom=freedom,
+    )
 
 
 def _resolutions(recording: Recording, names: list[str], part: int | None = None) -> Array:

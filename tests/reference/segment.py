@@ -72,18 +72,34 @@ def ellipsoid_error(points: Array) -> float:
 
 
 def batches(
-    mean: Array, found: list[tuple[int, int]], number: list[int], size: int
-) -> tuple[list[int], list[int], list[Array]]:
-    """Return the first block of each batch, and for each attitude how many there are and how their means scatter."""
+    mean: Array, found: list[tuple[int, int]], number: list[int], centre: Array, size: int
+) -> tuple[list[int], Array, list[int], list[Array]]:
+    """Return the first block and the moments of each batch, and for each attitude their number and their scatter."""
     first = [list(range(start, stop - size + 1, size)) for start, stop in found]
-    counts, scatters = [], []
+    moments, counts, scatters = [], [], []
     for k in range(max(number) + 1):
+        x, y, z = (mean - centre[k]).T
+        each = np.column_stack([x, y, z, x * x, y * y, z * z, x * y, x * z, y * z])
         begins = [at for begin, n in zip(first, number, strict=True) if n == k for at in begin]
-        own = [mean[at : at + size].mean(axis=0) for at in begins]
+        own = [each[at : at + size].mean(axis=0) for at in begins]
         deviation = np.array(own) - np.mean(own, axis=0)
+        moments += own
         counts.append(len(own))
         scatters.append(deviation.T @ deviation)
-    return [at for begin in first for at in begin], counts, scatters
+    return [at for begin in first for at in begin], np.array(moments), counts, scatters
+
+
+def motion(samples: Array, length: int, found: list[tuple[int, int]], number: list[int], centre: Array) -> list[Array]:
+    """Return sums of products (a, 3, 3): differences of samples, blocks about the centre, and their slopes."""
+    mean = blocks(samples, np.arange(float(len(samples))), length)[0]
+    sums = [np.zeros((len(centre), 3, 3)) for _ in range(3)]
+    for (start, stop), k in zip(found, number, strict=True):
+        step = np.diff(samples[start * length : stop * length], axis=0)
+        off = mean[start:stop] - centre[k]
+        slope = (mean[start + 2 : stop] - mean[start : stop - 2]) / 2
+        for total, rows in zip(sums, (step, off, slope), strict=True):
+            total[k] += rows.T @ rows
+    return sums
 
 
 def drift(mean: Array, found: list[tuple[int, int]]) -> tuple[Array, Array]:

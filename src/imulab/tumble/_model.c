@@ -115,17 +115,23 @@ static PyObject *lengths(PyObject *module, PyObject *args) {
 PyDoc_STRVAR(noise_doc,
              "noise(theta, jacobian, covariance, lengthening, variance) -> None\n\n"
              "theta (b, p), jacobian (b, n, p) and the covariance of the outputs (b, n, 3, 3), or (1, n, 3, 3) for all alike,\n"
-             "to the lengthening of |f| by noise and its variance (b, n); float64 buffers without gaps.");
+             "to the lengthening of |f| by noise and its variance (b, n); or, from the covariance of x, y, z, xx, yy, zz, xy, xz\n"
+             "and yz, (b or 1, n, 9, 9), the variance of |f|^2 / 2 alone. Float64 buffers without gaps.");
 
-/* d' C d */
-static double quadratic(const double *c, const double *d) {
+/* d' C d, of `size` rows */
+static double quadratic(const double *c, const double *d, int size) {
     double sum = 0.0;
-    for (int i = 0; i < 3; i++) sum += d[i] * (c[3 * i] * d[0] + c[3 * i + 1] * d[1] + c[3 * i + 2] * d[2]);
+    for (int i = 0; i < size; i++) {
+        double row = 0.0;
+        for (int j = 0; j < size; j++) row += c[size * i + j] * d[j];
+        sum += d[i] * row;
+    }
     return sum;
 }
 
 static PyObject *noise(PyObject *module, PyObject *args) {
     enum { THETA, JACOBIAN, COVARIANCE, LENGTHENING, VARIANCE, BUFFERS };
+    enum { AXES = 3, MOMENTS = 9 };
     Py_buffer v[BUFFERS];
     (void)module;
     if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &v[THETA], &v[JACOBIAN], &v[COVARIANCE], &v[LENGTHENING], &v[VARIANCE])) {
@@ -134,11 +140,13 @@ static PyObject *noise(PyObject *module, PyObject *args) {
     const Py_ssize_t one = (Py_ssize_t)sizeof(double), all = v[VARIANCE].len / one;
     const Py_ssize_t p = all > 0 ? v[JACOBIAN].len / one / all : 0, problems = p > 0 ? v[THETA].len / one / p : 0;
     const Py_ssize_t n = problems > 0 ? all / problems : 0;
+    const int size = v[LENGTHENING].len == 0 ? MOMENTS : AXES;
+    const Py_ssize_t square = size * size;
     const int fits = p >= 9 && n > 0 && v[THETA].len == problems * p * one && all == problems * n &&
-                     v[JACOBIAN].len == all * p * one && v[LENGTHENING].len == v[VARIANCE].len &&
-                     (v[COVARIANCE].len == 9 * n * one || v[COVARIANCE].len == 9 * all * one);
+                     v[JACOBIAN].len == all * p * one && (size == MOMENTS || v[LENGTHENING].len == v[VARIANCE].len) &&
+                     (v[COVARIANCE].len == square * n * one || v[COVARIANCE].len == square * all * one);
     if (fits) {
-        const Py_ssize_t next = v[COVARIANCE].len == 9 * all * one ? 9 * n : 0;
+        const Py_ssize_t next = v[COVARIANCE].len == square * all * one ? square * n : 0;
         const double *theta = v[THETA].buf, *derivative = v[JACOBIAN].buf, *covariance = v[COVARIANCE].buf;
         double *lengthening = v[LENGTHENING].buf, *variance = v[VARIANCE].buf;
         for (Py_ssize_t b = 0; b < problems; b++, theta += p, covariance += next) {
@@ -147,9 +155,24 @@ static PyObject *noise(PyObject *module, PyObject *args) {
             const double carried[3][3] = {{1.0 / scale[0], 0.0, 0.0},
                                           {-m[0] / scale[0], 1.0 / scale[1], 0.0},
                                           {(m[2] * m[0] - m[1]) / scale[0], -m[2] / scale[1], 1.0 / scale[2]}};
+            double gram[3][3]; /* of its columns: |f|^2 / 2 is half of it, to second order in the outputs */
+            for (int i = 0; i < 3; i++) {
+                for (int j = 0; j < 3; j++) {
+                    gram[i][j] = carried[0][i] * carried[0][j] + carried[1][i] * carried[1][j] + carried[2][i] * carried[2][j];
+                }
+            }
             for (Py_ssize_t i = 0; i < n; i++, derivative += p) {
-                const double *c = covariance + 9 * i, along = quadratic(c, derivative); /* its first three are -q */
-                const double trace = quadratic(c, carried[0]) + quadratic(c, carried[1]) + quadratic(c, carried[2]);
+                const double *c = covariance + square * i; /* the first three derivatives are -q */
+                if (size == MOMENTS) {
+                    const double d[MOMENTS] = {-derivative[0],     -derivative[1],     -derivative[2],
+                                               gram[0][0] / 2.0, gram[1][1] / 2.0, gram[2][2] / 2.0,
+                                               gram[0][1],       gram[0][2],       gram[1][2]};
+                    *variance++ = quadratic(c, d, MOMENTS);
+                    continue;
+                }
+                const double along = quadratic(c, derivative, AXES);
+                double trace = 0.0;
+                for (int j = 0; j < 9; j++) trace += gram[j / 3][j % 3] * c[j];
                 *lengthening++ = (trace - along) / 2.0;
                 *variance++ = along;
             }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -115,7 +115,8 @@ def fit_tumble(
     reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
     spread = scaling.scale[:, None] * scaling.scale
     noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
-    problem = Problem(reading, noise, 1, robust=loss == "huber")
+    motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
+    problem = Problem(reading, noise, 1, robust=loss == "huber", motion=motion)
     choice: OrderChoice | None = None
     known = None
     if prior is not None:
@@ -127,7 +128,7 @@ def fit_tumble(
         chosen = choice.order if choice else 1
     else:
         chosen = int(order)
-    problem = Problem(reading, noise, chosen, robust=loss == "huber", prior=known)
+    problem = replace(problem, order=chosen, prior=known)
     solution, seen = _solve(problem, attitudes, method, choice)
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])

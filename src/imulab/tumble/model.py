@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.attitudes import POOL_DEGREES, Motion
 from imulab.estimate import Fit
 from imulab.recording import Array
 from imulab.tumble import _model
@@ -21,6 +22,7 @@ from imulab.tumble import _model
 AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
 HIGHEST_ORDER = 5
+_UNUSUAL = 3.0
 GAUGE = "x input axis along body x, y input axis in the body xy plane"
 
 
@@ -118,10 +120,16 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
     return norm, jacobian, force, -jacobian[:, :, 0:3]
 
 
-def length_noise(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:
+def length_noise(theta: Array, jacobian: Array, covariance: Array, motion: Motion | None = None) -> tuple[Array, Array]:
     """Return the lengthening ``(tr C_f - u' C_f u) / 2`` of |f| by noise, and its variance ``q' C q``, shapes (b, n).
 
-    ``q = d|f|/d reading`` is the negative of the Jacobian's columns for the zero; |f| is 1 to first order.
+    ``q = d|f|/d reading`` is the negative of the Jacobian's columns for the zero; |f| is 1 to first order. Where the
+    attitudes are known to move while they are held, the lengthening is that of the noise less the shortening by the
+    motion, and the variance is that of the mean of the magnitudes ``|f(x_k)|`` of the blocks of a hold, by batch means
+
+        u^2 = (nu v + 10 m e) / (nu + 10),   m = sum nu v / sum nu e
+
+    with v the attitude's own variance, of nu degrees of freedom, and e what the noise of its axes lets expect.
 
     Parameters
     ----------
@@ -129,7 +137,25 @@ def length_noise(theta: Array, jacobian: Array, covariance: Array) -> tuple[Arra
         As for, and from, `norm_and_jacobian`.
     covariance
         C, of the outputs, shape (b, n, 3, 3), or (1, n, 3, 3) for all problems alike.
+    motion
+        Of n attitudes, the same for all problems; `covariance` is not used then.
     """
+    if motion is None:
+        return _carried(theta, jacobian, covariance)
+    lengthening = _carried(theta, jacobian, motion.lengthening)[0]
+    expected = _carried(theta, jacobian, motion.usual)[1]
+    own = np.empty(jacobian.shape[:2])
+    _model.noise(np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), motion.moments, np.empty(0), own)
+    # An attitude that was knocked, or moved in other ways, says nothing of the others' noise.
+    ratio = own / expected
+    counts = motion.freedom * (ratio <= _UNUSUAL * np.median(ratio, axis=1, keepdims=True))
+    level = (counts * own).sum(axis=1) / np.maximum((counts * expected).sum(axis=1), np.finfo(float).tiny)
+    usual = level[:, None] * expected
+    return lengthening, (motion.freedom * own + POOL_DEGREES * usual) / (motion.freedom + POOL_DEGREES)
+
+
+def _carried(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:
+    """Lengthening and variance of |f| by a covariance of the outputs, shapes (b, n)."""
     lengthening, variance = np.empty(jacobian.shape[:2]), np.empty(jacobian.shape[:2])
     _model.noise(
         np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), np.ascontiguousarray(covariance),

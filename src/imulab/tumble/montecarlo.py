@@ -79,6 +79,7 @@ def propagate(
     """
     check_trials(trials)
     rng = np.random.default_rng(seed)
+    problem = problem.held_still(solution)
     covariance = _noise(problem, solution)
     root = np.linalg.cholesky(covariance)
     n = problem.reading.shape[1]

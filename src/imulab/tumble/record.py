@@ -22,6 +22,7 @@ from imulab.tumble.solve import Prior, Problem, Solution, data_freedom, forces
 from imulab.units import parse_unit
 
 _STANDS_OUT = 5.0
+_TOO_GOOD = 1e-3
 _MOST_NAMED = 8
 _ENOUGH_DEGREES = 9
 _WORST_SCALE = 0.1
@@ -276,6 +277,7 @@ def _data(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: So
             "residual": (g * solution.deviations[0]).tolist(),
             "residual_before": (g * before).tolist(),
             "standard_uncertainty": uncertainty.tolist() if known else None,
+            "lengthening": (g * solution.lengthening[0]).tolist(),
             "down_weight": solution.down_weights[0].tolist(),
         }
     }
@@ -314,7 +316,14 @@ def beyond_noise(problem: Problem, chi_square: float, freedom: float) -> bool:
 
 
 def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, freedom: float) -> list[str]:
-    """Say that the attitudes scatter beyond their noise; the uncertainties hold that scatter with or without this."""
+    """Say that the attitudes scatter beyond their noise, which the uncertainties hold anyway, or far below it."""
+    known = problem.covariance is not None and problem.prior is None and not problem.robust
+    if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - _TOO_GOOD:
+        return [
+            "the attitudes scatter less than their own noise lets expect (reduced chi-square "
+            f"{chi_square / freedom:.3g}): that noise is overstated, and every uncertainty is about "
+            f"{np.sqrt(freedom / max(chi_square, 1e-12)):.2g} times too large"
+        ]
     if not beyond_noise(problem, chi_square, freedom):
         return []
     added = f"; {_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"

@@ -9,10 +9,12 @@ Sources: the method's patent (linearised); noise-length term: second-order expan
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.attitudes import Motion
 from imulab.errors import DataError
 from imulab.estimate import (
     Fit,
@@ -67,6 +69,8 @@ class Problem:
         Whether the attitudes get the common further variance that their scatter makes plausible.
     prior
         Earlier knowledge of the parameters.
+    motion
+        How the attitudes moved while they were held, in g and g^2; None where nothing is known of it.
     """
 
     reading: Array
@@ -75,6 +79,31 @@ class Problem:
     robust: bool = False
     excess: bool = True
     prior: Prior | None = None
+    motion: Motion | None = None
+
+    def only(self, which: NDArray[Any]) -> Problem:
+        """Return the problem with some of its attitudes, by index or mask of shape (n,)."""
+        return replace(
+            self,
+            reading=self.reading[:, which],
+            covariance=None if self.covariance is None else self.covariance[:, which],
+            motion=None if self.motion is None else self.motion[which],
+        )
+
+    def held_still(self, solution: Solution) -> Problem:
+        """Return attitudes that do not move, whose magnitudes and noise are those that this problem was solved with."""
+        if self.motion is None:
+            return self
+        q = -solution.jacobian[:, :, :3]
+        square = (q**2).sum(axis=2)
+        shift = solution.lengthening / square
+        noise = solution.own_variance / square
+        return replace(
+            self,
+            reading=self.reading - shift[:, :, None] * q,
+            covariance=noise[:, :, None, None] * np.eye(3),
+            motion=None,
+        )
 
 
 @dataclass(frozen=True)
@@ -88,7 +117,9 @@ class Solution:
     residuals
         |f| - 1 less the lengthening by noise, shape (b, n).
     deviations
-        |f| - 1 as it is, shape (b, n).
+        |f| - 1 as it is, shape (b, n); of the mean magnitude where the attitudes move.
+    lengthening
+        By how much noise makes |f| too long, less what motion makes it too short, shape (b, n).
     jacobian
         Of |f|, shape (b, n, p).
     variance
@@ -110,6 +141,7 @@ class Solution:
     theta: Array
     residuals: Array
     deviations: Array
+    lengthening: Array
     jacobian: Array
     variance: Array
     own_variance: Array
@@ -183,7 +215,8 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
     return Solution(
         theta=theta,
         residuals=fit.residuals,
-        deviations=fit.residuals + lengthening,
+        deviations=fit.residuals + (0.0 if problem.motion is not None else lengthening),
+        lengthening=lengthening,
         jacobian=fit.jacobian,
         variance=variance,
         own_variance=own,
@@ -265,7 +298,7 @@ def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tup
         return np.zeros(problem.reading.shape[:2]), np.ones(problem.reading.shape[:2])
     if jacobian is None:
         jacobian = norm_and_jacobian(theta, problem.reading, problem.order)[1]
-    return length_noise(theta, jacobian, problem.covariance)
+    return length_noise(theta, jacobian, problem.covariance, problem.motion)
 
 
 def forces(problem: Problem, solution: Solution) -> Array:
@@ -282,9 +315,8 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     if problem.reading.shape[1] > _REFIT_AT_MOST:
         errors: Array = (solution.residuals / (1 - leverage(solution.jacobian, solution.weights)))[0]
         return errors
-    lengthening = solution.deviations - solution.residuals
     return left_out_lengths(
-        solution.theta, problem.reading, solution.weights, lengthening, problem.order,
+        solution.theta, problem.reading, solution.weights, solution.lengthening, problem.order,
         tolerance=_REFIT_TOLERANCE, most=_REFIT_STEPS,
     )  # fmt: skip
 
@@ -300,8 +332,8 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
     DataError
         The iteration does not converge, or ends where the model cannot be inverted.
     """
-    _, own = _noise(problem, start_parameters(problem.order))
-    theta, passes = _linearised_iteration(problem, own[0], name)
+    lengthening, own = _noise(problem, start_parameters(problem.order))
+    theta, passes = _linearised_iteration(problem, lengthening[0], own[0], name)
     solution = _evaluated(problem, theta, passes, name)
     if problem.covariance is None:
         return solution
@@ -309,7 +341,7 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
         before = solution.excess
         spare = _spare(problem, solution.jacobian, solution.weights)
         excess, freedom = plausible_excess(solution.residuals, solution.own_variance, spare)
-        theta, passes = _linearised_iteration(problem, solution.own_variance[0] + excess, name)
+        theta, passes = _linearised_iteration(problem, solution.lengthening[0], solution.own_variance[0] + excess, name)
         solution = _evaluated(problem, theta, passes, name)
         variance = solution.own_variance + excess[:, None]
         solution = replace(solution, variance=variance, excess=np.sqrt(excess), freedom=freedom)
@@ -318,7 +350,7 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
     return solution
 
 
-def _linearised_iteration(problem: Problem, variance: Array, name: str) -> tuple[Array, int]:
+def _linearised_iteration(problem: Problem, lengthening: Array, variance: Array, name: str) -> tuple[Array, int]:
     """Repeat the linear step until it rests; return theta, shape (1, p), and the number of passes."""
     order = problem.order
     root = 1 / np.sqrt(variance)
@@ -331,7 +363,7 @@ def _linearised_iteration(problem: Problem, variance: Array, name: str) -> tuple
         z = a[:, 2] - misalignment[1] * x - misalignment[2] * y
         products = np.column_stack([a[:, 0] * a[:, 1], a[:, 2] * a[:, 0], a[:, 1] * a[:, 2]])
         design = np.column_stack([*(a ** (j + 1) for j in range(order + 1)), products])
-        right = (x * x + y * y + z * z - 1) / 2
+        right = (x * x + y * y + z * z - 1) / 2 - lengthening
         solution = np.linalg.lstsq(design * root[:, None], right * root, rcond=None)[0]
         change = solution[: 3 * (order + 1)].reshape(order + 1, 3)
         bias = bias + change[0]
@@ -364,7 +396,8 @@ def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> So
     return Solution(
         theta=theta,
         residuals=norm - 1 - lengthening,
-        deviations=norm - 1,
+        deviations=norm - 1 - (lengthening if problem.motion is not None else 0.0),
+        lengthening=lengthening,
         jacobian=jacobian,
         variance=own,
         own_variance=own,
