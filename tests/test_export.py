@@ -334,6 +334,13 @@ def test_noise_that_is_not_known_is_a_comment_and_a_wrong_file_is_refused(tmp_pa
     imu, _ = programs.kalibr(file)
     assert "gyroscope_noise_density" not in imu
     assert "# gyroscope_noise_density is not known: not measured" in file.read_text()
+    unknown = noise()
+    unknown["columns"]["gyro_y"]["angle_random_walk"] |= {"value": None, "standard_uncertainty": None, "reason": "..."}
+    (file,) = export("kalibr", [record(3)], tmp_path, ExportOptions(noise=unknown))
+    imu, _ = programs.kalibr(file)
+    assert "gyroscope_noise_density" not in imu
+    assert imu["gyroscope_random_walk"] == 4e-6
+    assert "# gyroscope_noise_density is not known: not determined on every axis" in file.read_text()
     for wrong, message in (
         ({"a": 1}, "^n.json: lacks 'columns'"),
         (noise(accel_x={"unit": "m/s^2"}), "^n.json: lacks angle_random_walk of accel_x"),

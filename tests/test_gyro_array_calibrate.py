@@ -172,6 +172,25 @@ def test_the_record_survives_saving_and_draws_its_report(tmp_path):
     json.dumps([item.traces for item in shown.items if hasattr(item, "traces")], allow_nan=False)
 
 
+@pytest.mark.parametrize("axes", [1, 3])
+def test_an_element_without_noise_coefficients_still_serves(tmp_path, axes):
+    still, moving, _, _ = array_of(2, axes)
+    name = "gyro_y_2" if axes == 3 else "gyro_2"
+    coarse = {name: 0.3 * np.round(still.columns[name] / 0.3)}  # steps of six times its noise
+    record = calibrate_array(still.with_columns(coarse, {name: "deg/s"}), moving).calibration
+    found = record.sections["elements"][1]["angle_random_walk"]
+    assert (found["value"][1] if axes == 3 else found["value"]) is None
+    assert "steps that are" in found["reason"]
+    assert any(f"column {name}: noise coefficients not determined" in line for line in record.warnings)
+    record.save(tmp_path / "r.json")
+    again = il.load(tmp_path / "r.json")
+    il.write_report(again, tmp_path / "r.html")
+    assert "not determined" in (tmp_path / "r.html").read_text()
+    il.export("blob", [again], tmp_path / "unit")
+    for method in ("robust", "kalman", "covariance"):
+        assert np.isfinite(fuse(moving, FuseOptions(method=method, calibration=again)).rate).all()
+
+
 def test_the_real_array_is_calibrated(real_data):
     recording = il.read(real_data / "mimu4444" / "exp_1.bin")
     quiet = (recording.time > 468.5) & (recording.time < 495.5)

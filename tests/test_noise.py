@@ -5,10 +5,15 @@ import json
 import allantools
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from imulab.allan import analyse, column_noise, noise_lines
+from imulab.coefficients import read_coefficients
 from imulab.errors import DataError, OptionError
-from imulab.noise import allan_deviation, analyse, read_coefficients, sampling_rate
+from imulab.lines import spectral_lines
+from imulab.noise import allan_deviation
 from imulab.recording import Recording
+from imulab.sampling import sampling_rate
 
 
 @pytest.mark.parametrize("count", [5, 57, 1000, 65_537])
@@ -73,6 +78,109 @@ def test_flicker_noise_is_read_as_bias_instability():
 def test_a_constant_has_no_noise():
     found = read_coefficients(allan_deviation(np.full(1000, 4.2), 10.0))
     assert max(found.angle_random_walk.value, found.bias_instability.value, found.rate_random_walk.value) < 1e-20
+
+
+DEG = np.pi / 180
+ARW, BI = 0.3 * DEG / 60, 10.8 * DEG / 3600
+
+
+def flicker(n: int, size: float, rng: np.random.Generator) -> np.ndarray:
+    """1/f noise of bias instability `size`, by its spectrum (IEEE Std 952)."""
+    lines = rng.standard_normal(n // 2) + 1j * rng.standard_normal(n // 2)
+    lines *= size * np.sqrt(n / (4 * np.pi * np.arange(1, n // 2 + 1) / n))
+    return np.fft.irfft(np.concatenate([[0], lines]), n)
+
+
+def behind_a_filter(n: int, rate: float, corner: float, rng: np.random.Generator) -> np.ndarray:
+    """White noise of ARW behind a first-order low-pass filter, with flicker of BI, rad/s."""
+    pole = np.exp(-2 * np.pi * corner / rate)
+    white = ARW * np.sqrt(rate) * lfilter([1 - pole], [1, -pole], rng.standard_normal(n + 1000))[1000:]
+    return white + flicker(n, BI, rng)
+
+
+@pytest.mark.parametrize(("corner", "longest"), [(42.0, 0.08), (5.0, 0.64)])
+def test_a_low_pass_filter_does_not_spoil_the_coefficients(corner, longest):
+    # From all averaging times the fit gives ARW 0 and a bias instability ten times too large, both without a doubt.
+    rng = np.random.default_rng(8)
+    within = []
+    for _ in range(15):
+        found = read_coefficients(allan_deviation(behind_a_filter(100_000, 200.0, corner, rng), 200.0))
+        assert found.filtered
+        assert found.shortest <= longest
+        assert found.correlation_time == pytest.approx(1 / (2 * np.pi * corner), rel=0.4)
+        for c, truth in ((found.angle_random_walk, ARW), (found.bias_instability, BI)):
+            within.append(abs(c.value - truth) < 2 * c.standard_uncertainty)
+        assert found.angle_random_walk.standard_uncertainty < 0.05 * ARW
+    assert np.mean(within) > 0.85
+
+
+def test_a_curve_that_is_of_no_such_noise_gives_no_number():
+    rng = np.random.default_rng(9)
+    rate, n = 100.0, 100_000
+    time = np.arange(n) / rate
+    sway = 0.01 * np.sin(2 * np.pi * time / 40) + 0.02 * rng.standard_normal(n)
+    found = read_coefficients(allan_deviation(sway, rate))
+    assert np.isnan(found.bias_instability.value)
+    assert "curve is not that of white noise" in found.bias_instability.reason
+    assert np.isnan(found.rate_random_walk.standard_uncertainty)
+    # Its short part is white noise all the same, and the mean is not better known than the curve's far end says.
+    assert found.angle_random_walk.value == pytest.approx(0.002, rel=0.03)
+    assert found.mean_uncertainty(n / rate) > 2e-4  # white noise alone: 6e-5
+
+
+def test_quantisation_is_told_from_white_noise():
+    rng = np.random.default_rng(10)
+    rate, n, step = 100.0, 60_000, 5 * DEG / 3600
+    white = 1.5e-4  # rad/s/sqrt(Hz)
+    angle = np.cumsum(white * np.sqrt(rate) * rng.standard_normal(n)) / rate + 3.14e-3 * np.arange(n) / rate
+    counted = np.diff(step * np.round(angle / step)) * rate  # an integrating gyro counts whole steps of angle
+    found = read_coefficients(allan_deviation(counted, rate))
+    q = found.quantisation
+    assert abs(q.value - step / np.sqrt(12)) < 3 * q.standard_uncertainty
+    assert abs(found.angle_random_walk.value - white) < 3 * found.angle_random_walk.standard_uncertainty
+    plain = read_coefficients(allan_deviation(white * np.sqrt(rate) * rng.standard_normal(n), rate)).quantisation
+    assert plain.value < 3 * plain.standard_uncertainty
+
+
+def test_steps_of_the_output_larger_than_the_noise_give_no_number():
+    rng = np.random.default_rng(11)
+    noise = 0.1 + rng.standard_normal(20_000)
+    for lsb, known in ((1.0, True), (4.0, False)):
+        samples = lsb * np.round(noise / lsb)
+        found = column_noise(samples, 50.0).coefficients
+        assert (found.angle_random_walk.reason == "") == known
+        if known:  # rounding adds LSB^2 / 12
+            arw = found.angle_random_walk
+            assert abs(arw.value - np.sqrt((1 + lsb**2 / 12) / 50)) < 3 * arw.standard_uncertainty
+        else:
+            assert "steps that are" in found.angle_random_walk.reason
+
+
+def test_lines_of_the_spectrum_are_named_and_do_not_count_as_noise():
+    rng = np.random.default_rng(12)
+    rate, n = 62.5, 20_000
+    samples = rng.standard_normal(n) + 0.8 * np.sin(2 * np.pi * 9.29 * np.arange(n) / rate)
+    found = column_noise(samples, rate)
+    assert found.lines.frequency == pytest.approx([9.29], abs=0.01)
+    assert found.lines.amplitude == pytest.approx([0.8], rel=0.05)
+    assert abs(found.coefficients.angle_random_walk.value - 1 / np.sqrt(rate)) < 0.02 / np.sqrt(rate)
+    assert "column gyro_x" not in noise_lines({"gyro_x": found})[0]
+    assert "gyro_x 9.29" in noise_lines({"gyro_x": found})[0]
+    false = [len(spectral_lines(rng.standard_normal(5000), 1.0).frequency) for _ in range(100)]
+    assert sum(false) <= 2
+
+
+def test_a_coefficient_is_null_with_a_reason_in_json(imulab, tmp_path):
+    import imulab as il
+
+    recording = _recording(gyro_x=np.full(3000, 0.5), gyro_y=np.random.default_rng(1).standard_normal(3000))
+    il.write_csv(recording, tmp_path / "r.csv")
+    printed = json.loads(imulab("allan", "r.csv", "--json").stdout)["columns"]["gyro_x"]["angle_random_walk"]
+    assert (printed["value"], printed["standard_uncertainty"]) == (None, None)
+    assert printed["reason"] == "all samples are the same: a dead sensor"
+    shown = imulab("allan", "r.csv")
+    assert "not determined" in shown.stdout
+    assert "column gyro_x: noise coefficients not determined: all samples are the same" in shown.stderr
 
 
 @pytest.mark.parametrize(

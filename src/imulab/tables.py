@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.arraytable import ArraySettings, array_table
+from imulab.arraytable import ArraySettings, array_table, element_white_noise
 from imulab.calibration import Calibration
 from imulab.errors import RecordError
 from imulab.packing import Field, Table
@@ -194,7 +194,7 @@ def _array(record: Calibration) -> tuple[Table, ...]:
         raise RecordError(f"expected the record of an array calibration, found one of a {record.model.get('kind')}")
     elements = record.sections["elements"]
     axes = len(record.model["axes"])
-    white = np.array([np.atleast_1d(element["angle_random_walk"]["value"]) for element in elements]).T
+    white = element_white_noise(record.sections)
     matrices = None
     if record.model["aligned"]:
         matrices = np.array(

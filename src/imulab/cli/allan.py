@@ -20,7 +20,7 @@ def allan(
     json: AsJson = False,
 ) -> None:
     """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
-    from imulab.noise import analyse
+    from imulab.allan import analyse
     from imulab.readers import read
 
     found = analyse(read(file, layout), taus)
@@ -45,15 +45,20 @@ def describe(found: dict[str, Any]) -> str:
             ("angle_random_walk", "angle random walk"),
             ("bias_instability", "bias instability"),
             ("rate_random_walk", "rate random walk"),
+            ("quantisation", "quantisation"),
         ):
+            if key == "quantisation" and not _visible(column[key]):
+                continue
             unit, factor = _shown(column["unit"], key)
-            value, u = column[key]["value"] * factor, column[key]["standard_uncertainty"] * factor
+            texts = ("not determined", "")
+            if column[key]["value"] is not None:
+                texts = format_uncertain(*(column[key][part] * factor for part in ("value", "standard_uncertainty")))
             label = (
                 title
                 if column["unit"] != "m/s^2"
                 else title.replace("angle", "velocity").replace("rate", "acceleration")
             )
-            rows.append([name, label, *format_uncertain(value, u), unit])
+            rows.append([name, label, *texts, unit])
     lines = [f"{found['file']}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
     lines += aligned(["column", "coefficient", "value", "u", "unit"], rows)
     names = list(found["columns"])
@@ -68,6 +73,11 @@ def describe(found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _visible(found: dict[str, Any]) -> bool:
+    """Whether a coefficient is beyond three times its uncertainty."""
+    return found["value"] is not None and bool(found["value"] > 3 * found["standard_uncertainty"])
+
+
 def _shown(unit: str, key: str) -> tuple[str, float]:
     """Engineering unit of a coefficient, and the factor from SI to it."""
     hour = math.sqrt(_HOUR)
@@ -76,15 +86,18 @@ def _shown(unit: str, key: str) -> tuple[str, float]:
             "angle_random_walk": ("deg/sqrt(h)", hour / _DEGREE),
             "bias_instability": ("deg/h", _HOUR / _DEGREE),
             "rate_random_walk": ("deg/h/sqrt(h)", _HOUR * hour / _DEGREE),
+            "quantisation": ("arcsec", _HOUR / _DEGREE),
         }[key]
     if unit == "m/s^2":
         return {
             "angle_random_walk": ("m/s/sqrt(h)", hour),
             "bias_instability": ("ug", 1e6 / 9.80665),
             "rate_random_walk": ("ug/sqrt(h)", 1e6 * hour / 9.80665),
+            "quantisation": ("mm/s", 1e3),
         }[key]
     return {
         "angle_random_walk": (f"{unit}/sqrt(Hz)", 1.0),
         "bias_instability": (unit, 1.0),
         "rate_random_walk": (f"{unit}/sqrt(s)", 1.0),
+        "quantisation": (f"{unit} s", 1.0),
     }[key]

@@ -38,8 +38,10 @@ def noise_lines(options: ExportOptions, indent: str) -> list[str]:
     lines = []
     for key, (sensor, coefficient, unit) in _KEYS.items():
         found = [_value(columns[name], coefficient, name, options.noise_file) for name in _names(columns, sensor)]
-        value = max(found, default=0.0)
-        if value > 0:
+        value = max((one for one in found if one is not None), default=0.0)
+        if None in found:  # the largest of the others may not be the largest of all
+            lines.append(f"{indent}# {key} is not known: not determined on every axis (imulab allan says why)")
+        elif value > 0:
             lines.append(f"{indent}{key}: {yaml_number(value)}  # {unit}, the largest of {len(found)} axes")
         else:
             lines.append(f"{indent}# {key} is not known: {'not resolved' if found else 'not measured'}")
@@ -56,7 +58,7 @@ def _names(columns: Mapping[str, Any], sensor: str) -> list[str]:
     return [f"{sensor}_{axis}" for axis in AXES if f"{sensor}_{axis}" in columns]
 
 
-def _value(column: Any, coefficient: str, name: str, file: str) -> float:
+def _value(column: Any, coefficient: str, name: str, file: str) -> float | None:
     try:
         value = column[coefficient]["value"]
         unit = column["unit"]
@@ -67,6 +69,8 @@ def _value(column: Any, coefficient: str, name: str, file: str) -> float:
     needed = _UNITS[name.partition("_")[0]]
     if unit != needed:
         raise OptionError(f"{file}: has {name} in {unit!r}; expected {needed!r}")
+    if value is None:
+        return None
     if not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
         raise OptionError(f"{file}: has {coefficient} of {name} = {value!r}; expected a number of at least 0")
     return float(value)

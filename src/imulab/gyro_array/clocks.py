@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imulab.errors import DataError
-from imulab.noise import usual_step
 from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.sampling import usual_step
 
 _GAP = 1.5
 _MOST_OFFSET = 0.5

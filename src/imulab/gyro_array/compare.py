@@ -16,8 +16,9 @@ from imulab.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
 from imulab.gyro_array.health import Turned
 from imulab.gyro_array.model import FEWEST_ROBUST, METHODS, Elements, array_calibration, find_elements
 from imulab.gyro_array.single import Singles, single_gyros
-from imulab.noise import allan_deviation, sampling_rate
+from imulab.noise import allan_deviation
 from imulab.recording import Array, Recording
+from imulab.sampling import sampling_rate
 
 _TRACE = 800
 _QUIET_FACTOR = 3.0

@@ -62,7 +62,10 @@ def _elements_table(record: Calibration) -> Table:
         for a, axis in enumerate(record.model["axes"]):
 
             def text(key: str, factor: float, a: int = a, element: dict[str, Any] = element) -> str:
-                value = float(np.atleast_1d(element[key]["value"])[a]) * factor
+                found = np.atleast_1d(np.array(element[key]["value"], dtype=np.float64))[a]
+                if math.isnan(found):
+                    return "not determined"
+                value = float(found) * factor
                 u = float(np.atleast_1d(element[key]["standard_uncertainty"])[a]) * factor
                 return " ± ".join(format_uncertain(value, u))
 
@@ -88,7 +91,8 @@ def _elements_table(record: Calibration) -> Table:
         title="Elements",
         caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth rate "
         "too) included. Angle random walk (ARW), bias instability and rate random walk (RRW) are read from the Allan "
-        "curves below; 0 ± u means that the recording is too short or the effect too small to be seen.",
+        "curves below; 0 ± u means that the recording is too short or the effect too small to be seen, not determined "
+        "that the curve is not that of such noises (the warnings say why).",
         columns=[
             "gyro",
             "bias, deg/s",

@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from imulab.allan import ColumnNoise, column_noise, noise_lines
 from imulab.calibration import Calibration, Covariance, Parameter
+from imulab.coefficients import COEFFICIENTS, coefficients_dict
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.gyro_array.align import Alignment, align
 from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.model import Elements, find_elements, fixed_weights
-from imulab.noise import COEFFICIENTS, AllanCurve, NoiseCoefficients, allan_deviation, read_coefficients, sampling_rate
+from imulab.noise import AllanCurve
 from imulab.recording import Array, Recording, check_finite
+from imulab.sampling import sampling_rate
 from imulab.units import parse_unit, to_si
 
 _FEWEST_SAMPLES = 200
@@ -39,7 +42,7 @@ class _AtRest:
 
     bias: Array
     curves: tuple[tuple[AllanCurve, ...], ...]
-    noise: tuple[tuple[NoiseCoefficients, ...], ...]
+    noise: tuple[tuple[ColumnNoise, ...], ...]
     white: Array
     duration: float
     rate: float
@@ -98,6 +101,8 @@ def calibrate_array(
             f"taken at {used:.3g} s"
         )
     _check_at_rest(still, readings, rest, elements)
+    noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
+    warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
     if serial is not None:
         record = Calibration(**{**record.__dict__, "sensor": {**record.sensor, "serial": serial}})
@@ -121,11 +126,10 @@ def _at_rest(still: Recording, elements: Elements) -> _AtRest:
         if np.ptp(still.columns[name]) == 0:
             raise DataError(f"{still.name}: column {name}: all samples are {still.columns[name][0]:g}: a dead gyro")
     readings = _si(still, elements)
-    curves = tuple(
-        tuple(allan_deviation(readings[:, a, i], rate) for i in range(elements.count))
-        for a in range(len(elements.axes))
+    noise = tuple(
+        tuple(column_noise(readings[:, a, i], rate) for i in range(elements.count)) for a in range(len(elements.axes))
     )
-    noise = tuple(tuple(read_coefficients(curve) for curve in row) for row in curves)
+    curves = tuple(tuple(one.curve for one in row) for row in noise)
     white = np.array([[curve.deviation[0] for curve in row] for row in curves])
     return _AtRest(readings.mean(axis=0), curves, noise, white, len(still) / rate, rate)
 
@@ -215,7 +219,7 @@ def _record(
     warnings: list[str],
 ) -> Calibration:
     axes, n = len(elements.axes), elements.count
-    spread = np.array([[c.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
+    spread = np.array([[c.coefficients.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
     one = axes == 1
 
     def scalar(values: Array) -> Any:
@@ -242,13 +246,9 @@ def _record(
             else:
                 entry["matrix"] = _with_unit(inverse.tolist(), carried.tolist(), "1")
             entry["residual"] = {"value": scalar(aligned.residual[i]), "unit": "rad/s"}
-        for name, unit in zip(COEFFICIENTS, ("rad/s/sqrt(Hz)", "rad/s", "rad/s/sqrt(s)"), strict=True):
-            found = [getattr(rest.noise[a][i], name) for a in range(axes)]
-            entry[name] = _with_unit(
-                scalar(np.array([c.value for c in found])),
-                scalar(np.array([c.standard_uncertainty for c in found])),
-                unit,
-            )
+        dicts = [coefficients_dict(rest.noise[a][i].coefficients, "rad/s") for a in range(axes)]
+        for name in COEFFICIENTS:
+            entry[name] = dicts[0][name] if one else _over_axes([found[name] for found in dicts])
         listed.append(entry)
     fixed = [fixed_weights(matrix) for matrix in covariance]
     sigma = np.sqrt(np.einsum("aii->ai", covariance))
@@ -308,6 +308,13 @@ def _record(
             },
         },
     )
+
+
+def _over_axes(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """One entry with a list over x, y, z for three of one axis each."""
+    reasons = [one["reason"] for one in found if "reason" in one]
+    listed = {key: [one[key] for one in found] for key in ("value", "standard_uncertainty")}
+    return {**listed, "unit": found[0]["unit"], **({"reason": reasons[0]} if reasons else {})}
 
 
 def _shared(correlation: Array) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.arraytable import element_white_noise
 from imulab.calibration import Calibration
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.recording import Array, Recording
@@ -146,7 +147,8 @@ class ArrayCalibration:
     weights
         Fixed weights ``C^-1 1 / (1' C^-1 1)``, shape (axes, n).
     white, walk
-        Angle random walk, unit s^1/2, and rate random walk, unit s^-1/2, shape (axes, n).
+        Angle random walk, unit s^1/2 (`element_white_noise`), and rate random walk, unit s^-1/2, 0 where it is not
+        determined, shape (axes, n).
     """
 
     bias: Array
@@ -190,9 +192,11 @@ def array_calibration(record: Calibration, elements: Elements, recording: str = 
         if parse_unit(unit).quantity != "rate":
             raise UnitError(f"{recording}: column {row[0]} is in {unit}; the record of the calibration is in rad/s")
 
-    def of(key: str) -> Array:
-        values = np.array([np.atleast_1d(element[key]["value"]) for element in listed]).T
+    def of(values: Array) -> Array:
         return np.array([from_si(row, unit) for row, unit in zip(values, elements.units, strict=True)])
+
+    def listed_as(key: str) -> Array:
+        return np.array([np.atleast_1d(np.array(e[key]["value"], dtype=np.float64)) for e in listed]).T
 
     matrices = None
     if record.model["aligned"]:
@@ -200,11 +204,11 @@ def array_calibration(record: Calibration, elements: Elements, recording: str = 
         size = np.array([conversion_factor("rad/s", unit) for unit in elements.units])
         matrices *= size[:, None] / size[None, :]
     return ArrayCalibration(
-        bias=of("bias"),
+        bias=of(listed_as("bias")),
         matrices=matrices,
         weights=np.array(record.sections["correlation"]["weights"]),
-        white=of("angle_random_walk"),
-        walk=of("rate_random_walk"),
+        white=of(element_white_noise(record.sections)),
+        walk=of(np.nan_to_num(listed_as("rate_random_walk"))),
     )
 
 

@@ -1,0 +1,173 @@
+"""What a recording's time says of its sampling: rate, gaps, changes of rate, a unit that cannot be right; bad rows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from imulab.errors import DataError
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.units import to_si
+
+_FEWEST = 3
+_GAP = 1.5
+_COARSE = 0.2
+_BLOCKS, _SMALLEST_BLOCK = 100, 100
+_SAME_RATE = 0.05
+_SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz, of sensors as they are logged
+_USUAL = (10.0, 10_000.0)  # Hz
+_BRIDGED = 0.01  # of all rows
+
+
+def usual_step(step: Array) -> tuple[float, float]:
+    """Return the usual step of time, s, and the longest that is no gap, from steps of time, shape (n,), n >= 1.
+
+    Beyond 1.5 times the median a step is a gap, unless a fifth of all steps are: then time is written that coarsely
+    (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
+    fifth exceed. The usual step is the mean of those that are no gaps.
+    """
+    longest = _GAP * float(np.median(step))
+    if np.mean(step > longest) > _COARSE:
+        longest = _GAP * float(np.quantile(step, 1 - _COARSE))
+    return float(step[step <= longest].mean()), longest
+
+
+def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
+    """Return the sampling rate, Hz, of a recording, and what there is to say of its time.
+
+    Said are gaps, a rate that changes, and a rate at which no sensor is logged: the unit of time is wrong then.
+
+    Raises
+    ------
+    DataError
+        There is no time column, time does not rise, or there are fewer than 3 samples.
+    """
+    if "time" not in recording:
+        raise DataError(f"{recording.name}: no column time; expected one, the noise depends on the sampling rate")
+    time = check_time(recording)
+    if len(time) < _FEWEST:
+        raise DataError(f"{recording.name}: {len(time)} samples are too few; expected at least {_FEWEST}")
+    step = np.diff(time)
+    usual, longest = usual_step(step)
+    start, stop = steady_rows(time)
+    if (start, stop) != (0, len(time)):
+        return 1 / usual, [_change(recording, time, start, stop), *_mislabelled(recording, 1 / usual)]
+    wide = np.flatnonzero(step > longest)
+    if not wide.size:
+        rate = (len(time) - 1) / float(time[-1] - time[0])
+        return rate, _mislabelled(recording, rate)
+    worst = int(wide[np.argmax(step[wide])])
+    return 1 / usual, [
+        f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
+        f"after {recording.place(worst)}; the samples on both sides are taken as neighbours",
+        *_mislabelled(recording, 1 / usual),
+    ]
+
+
+def steady_rows(time: Array) -> tuple[int, int]:
+    """Return the first row and the last + 1 of the longest stretch with one sampling rate, by times, s, shape (n,).
+
+    Blocks of a hundred samples or more whose usual steps differ by more than 5 % have different rates; a single block
+    that differs is passed over.
+    """
+    step = np.diff(time)
+    size = max(_SMALLEST_BLOCK, -(-len(step) // _BLOCKS))
+    count = len(step) // size
+    if count < 2:
+        return 0, len(time)
+    blocks = np.array_split(step[: count * size], count)
+    size_of_step = np.log([usual_step(block)[0] for block in blocks])
+    best = (0, 0)
+    for level in size_of_step:
+        same = np.abs(size_of_step - level) < _SAME_RATE
+        same[1:-1] |= same[:-2] & same[2:]
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+        runs = edges.reshape(-1, 2)
+        widest = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))]
+        if widest[1] - widest[0] > best[1] - best[0]:
+            best = (int(widest[0]), int(widest[1]))
+    return best[0] * size, len(time) if best[1] == count else best[1] * size
+
+
+def steady_part(recording: Recording) -> tuple[Recording, list[str]]:
+    """Return the longest stretch of a recording that has one sampling rate, and a line where that is not all of it.
+
+    Raises
+    ------
+    DataError
+        Time does not rise.
+    """
+    if "time" not in recording:
+        return recording, []
+    time = check_time(recording)
+    start, stop = steady_rows(time)
+    if (start, stop) == (0, len(time)):
+        return recording, []
+    columns = {name: values[start:stop] for name, values in recording.columns.items()}
+    line = (
+        f"{_change(recording, time, start, stop)}; used are {recording.place(start)} to {recording.place(stop - 1)}, "
+        f"{time[stop - 1] - time[start]:.4g} s"
+    )
+    return replace(recording, columns=columns, first_row=recording.first_row + start), [line]
+
+
+def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str]]:
+    """Return a recording without the few rows that hold no numbers, and a line that counts them.
+
+    A row without a time is dropped; other samples that are not finite become the line through their neighbours.
+
+    Raises
+    ------
+    DataError
+        More than 1 % of the rows are bad; the message names the first.
+    """
+    bad = np.zeros(len(recording), dtype=bool)
+    for name in names:
+        bad |= ~np.isfinite(recording.column(name))
+    timed = np.isfinite(recording.column("time")) if "time" in recording else np.ones(len(recording), dtype=bool)
+    count = int(np.count_nonzero(bad | ~timed))
+    if not count:
+        return recording, []
+    if count > _BRIDGED * len(recording):
+        check_finite(recording, [*names, *(["time"] if "time" in recording else [])])
+    columns = {name: values[timed] for name, values in recording.columns.items()}
+    row = np.arange(len(recording), dtype=np.float64)[timed]
+    for name in names:
+        fine = np.isfinite(columns[name])
+        columns[name] = np.interp(row, row[fine], columns[name][fine])
+    first = recording.place(int(np.argmax(bad | ~timed)))
+    rows = f"{count} row{'s' if count > 1 else ''} without numbers"
+    where = first if count == 1 else f"the first {first}"
+    return replace(recording, columns=columns), [f"{recording.name}: {rows} ({where}) bridged from their neighbours"]
+
+
+def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
+    """Say where the rate changes, and between which rates."""
+
+    def rate(rows: slice) -> float:
+        return 1 / usual_step(np.diff(time[rows]))[0]
+
+    steady = rate(slice(start, stop))
+    other = rate(slice(stop, None)) if len(time) - stop > start else rate(slice(None, start))
+    at = stop if len(time) - stop > start else start
+    return (
+        f"{recording.name}: the sampling rate changes near {recording.place(at)}: {steady:.4g} Hz on one side of it, "
+        f"{other:.4g} Hz on the other"
+    )
+
+
+def _mislabelled(recording: Recording, rate: float) -> list[str]:
+    """Say that no sensor is logged at a rate, and in which unit of time it would be."""
+    if _SLOWEST < rate < _FASTEST:
+        return []
+    unit = recording.units["time"]
+    others = {other: rate * to_si(1.0, unit) / to_si(1.0, other) for other in ("us", "ms", "s") if other != unit}
+    likely = [
+        f"{value:.4g} Hz if it is in {other}" for other, value in others.items() if _USUAL[0] <= value < _USUAL[1]
+    ]
+    guess = f": {' or '.join(likely)}" if likely else ""
+    return [
+        f"{recording.name}: column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): is the unit of "
+        f"time right{guess}? If not, every figure that depends on time is wrong"
+    ]
