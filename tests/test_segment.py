@@ -175,7 +175,7 @@ def test_the_covariance_of_the_mean_is_that_of_batch_means(monkeypatch):
     batch = int(np.median(lengths // 13)) // 10 * 13  # ten batches, of whole blocks of 0.13 s
     for (start, stop, k), length in zip(attitudes.pieces, lengths, strict=True):
         expected = reference.batch_covariance_of_mean(samples[start:stop], batch)
-        used = length // batch * batch / length  # the mean is of all samples, the batches may leave some over
+        used = length // batch * batch / (length // 13 * 13)  # the batches may leave some over
         np.testing.assert_allclose(attitudes.covariance[k], expected * used, rtol=1e-9, atol=1e-20)
 
 

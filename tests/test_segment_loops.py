@@ -88,17 +88,17 @@ def test_points_that_determine_no_ellipsoid_have_no_error():
 def test_the_attitudes_of_a_recording_are_the_best_of_the_plain_sweep(moved):
     samples, time, _, _ = disturbed(moved)
     found = find_attitudes(recording(samples, time))
-    mean, scatter, longest = reference.blocks(samples, time, 13)
-    variance = reference.window_variance(mean, scatter, longest > 0.25, 8)
+    mean, scatter, longest = reference.blocks(samples, time, 10)
+    variance = reference.window_variance(mean, scatter, longest > 0.25, 10)
     quiet = np.quantile(variance, 0.05)
     sweep = {}
     for factor in np.geomspace(1.5, 400.0, 18):
-        pieces = reference.stretches(variance, factor * quiet, 8, 3, 8)
+        pieces = reference.stretches(variance, factor * quiet, 10, 3, 10)
         number, means = reference.attitudes(mean, pieces, 2e-3)
         sweep.setdefault(tuple(pieces), (reference.ellipsoid_error(means), number, len(means), factor))
     enough = [pieces for pieces in sweep if sweep[pieces][2] >= 0.75 * np.median([item[2] for item in sweep.values()])]
     best = min(enough, key=lambda pieces: sweep[pieces][0])
-    assert found.pieces[:, :2].tolist() == [[13 * start, 13 * stop] for start, stop in best]
+    assert found.pieces[:, :2].tolist() == [[10 * start, 10 * stop] for start, stop in best]
     assert found.pieces[:, 2].tolist() == sweep[best][1]
     assert found.trace.threshold == pytest.approx(sweep[best][3] * quiet, rel=1e-9)
 

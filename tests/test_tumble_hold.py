@@ -117,7 +117,7 @@ def test_every_estimator_averages_magnitudes(options):
     record, usual = fitted(attitudes, **options), fitted(attitudes)
     error, u = errors(record)
     assert np.all(np.abs(error[3:6]) < 4 * u[3:6])  # biases of this size are beyond the linearised method
-    np.testing.assert_allclose(u, errors(usual)[1], rtol=0.35)
+    np.testing.assert_allclose(u, errors(usual)[1], rtol=0.5)
     if "monte_carlo" in options:
         spread = [record.fit["monte_carlo"]["parameters"][name]["standard_deviation"] for name in TRUTH]
         np.testing.assert_allclose(spread, u, rtol=0.1)

@@ -24,8 +24,9 @@ from imulab.errors import SegmentError, UnitError
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import conversion_factor
 
-_BLOCK_SECONDS = 0.125
-"""One period of a hand's tremor: shorter blocks rectify it, longer ones hide the motion of the hand."""
+_BLOCK_SECONDS = 0.1
+_TREMOR_SECONDS = 0.125
+"""A period of a hand's tremor: the magnitudes of shorter blocks rectify it, longer ones hide the motion of the hand."""
 _SMALLEST_BLOCK = 4
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
@@ -154,7 +155,9 @@ def find_attitudes(
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
     stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
     check_clipping(recording, names, stretches)
-    moments, freedom, share, noise = _statistics(pieces, blocks)
+    held = _Held.of(recording, names, pieces, blocks)
+    moments, freedom, share = _statistics(held)
+    noise = np.sqrt(np.median(held.scatter, axis=0))
     if (noise < resolution / 2).any():
         resolution = _resolutions(recording, names)
     # Noise below half a step of the output does not average its rounding away.
@@ -176,7 +179,7 @@ def find_attitudes(
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
-        motion=_motion([recording.column(name) for name in names], pieces, blocks, moments, freedom, share),
+        motion=_motion(held, moments, freedom, share),
         notes=_notes(blocks, variance) + _drift_notes(pieces, blocks, names, unit),
     )
 
@@ -241,7 +244,7 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
     usual = steps[steps <= np.quantile(steps, 0.99)] if steps.size else np.ones(1)
     step = float(usual.mean())
     seconds = min(_BLOCK_SECONDS, window / 3, len(time) * step)  # no block is longer than the recording
-    length = max(_SMALLEST_BLOCK, math.ceil(seconds / step - 0.01))
+    length = max(_SMALLEST_BLOCK, round(seconds / step))
     count = len(time) // length
     mean, scatter, longest = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
     x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
@@ -302,23 +305,55 @@ def _choose(candidates: list[_Pieces]) -> int:
     return int(np.argmax(counts))
 
 
-def _statistics(pieces: _Pieces, blocks: _Blocks) -> tuple[Array, Array, Array, Array]:
-    """Return `Motion.moments` of each attitude, their degrees of freedom, the share of a batch; noise of each axis."""
-    count = len(pieces.mean)
-    size = pieces.stop - pieces.start
-    total = np.bincount(pieces.attitude, size, count)
+@dataclass(frozen=True)
+class _Held:
+    """The samples of all holds, one after the other, in blocks as long as a hand's tremor.
+
+    `start` and `stop` are the stretches in blocks, `attitude` says whose each is; `centre` is an attitude's mean.
+    """
+
+    samples: tuple[Array, Array, Array]
+    mean: Array
+    scatter: Array
+    length: int
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+    attitude: NDArray[np.int64]
+    centre: Array
+
+    @classmethod
+    def of(cls, recording: Recording, names: list[str], pieces: _Pieces, blocks: _Blocks) -> _Held:
+        begin, end = pieces.start * blocks.length, pieces.stop * blocks.length
+        usual = math.ceil(_TREMOR_SECONDS / blocks.duration * blocks.length - 0.01)
+        length = min(max(_SMALLEST_BLOCK, usual), int((end - begin).min()) // 2)
+        size = (end - begin) // length
+        index = np.concatenate([np.arange(a, a + n * length) for a, n in zip(begin, size, strict=True)])
+        x, y, z = (np.ascontiguousarray(recording.column(name)[index], dtype=np.float64) for name in names)
+        stop = np.cumsum(size)
+        mean, scatter, unused = np.empty((stop[-1], 3)), np.empty((stop[-1], 3)), np.empty(stop[-1])
+        _segment.blocks(x, y, z, x, length, mean, scatter, unused)
+        first = np.unique(pieces.attitude, return_index=True)[1]
+        total = np.add.reduceat(size, first)[:, None]
+        centre = np.add.reduceat(mean, (stop - size)[first]) / total
+        return cls((x, y, z), mean, scatter, length, stop - size, stop, pieces.attitude, centre)
+
+
+def _statistics(held: _Held) -> tuple[Array, Array, Array]:
+    """Return `Motion.moments` of each attitude, their degrees of freedom, and the share of a batch in all."""
+    count = len(held.centre)
+    size = held.stop - held.start
+    total = np.bincount(held.attitude, size, count)
     per_batch = max(1, min(int(np.median(total)) // _BATCHES, int(size.min()) // 2))
     first = np.empty(int((size // per_batch).sum()), dtype=np.int64)
     number = np.empty(count, dtype=np.int64)
     scatter: Array = np.empty((count, 9, 9))
     _segment.batches(
-        blocks.mean, pieces.start, pieces.stop, pieces.attitude, pieces.mean, per_batch,
+        held.mean, held.start, held.stop, held.attitude, held.centre, per_batch,
         first, np.empty((len(first), 9)), number, scatter,
     )  # fmt: skip
     freedom, share = number.astype(np.float64) - 1, np.full(count, float(per_batch)) / total
     moments: Array = scatter * (share / np.maximum(freedom, 1))[:, None, None]
-    noise: Array = np.sqrt(np.median(blocks.scatter[first], axis=0))
-    return moments, freedom, share, noise
+    return moments, freedom, share
 
 
 def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
@@ -332,20 +367,17 @@ def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
     return shrunk * share[:, None, None]
 
 
-def _motion(
-    samples: list[Array], pieces: _Pieces, blocks: _Blocks, moments: Array, freedom: Array, share: Array
-) -> Motion:
+def _motion(held: _Held, moments: Array, freedom: Array, share: Array) -> Motion:
     """How the attitudes moved: ``D = cov(x_k) - C_w / B + [mean(e e') - C_w / 2B] / 12``, B samples in a block."""
-    count, size = len(pieces.mean), pieces.stop - pieces.start
+    count, size = len(held.centre), held.stop - held.start
     sums = np.empty((3, count, 3, 3))
-    x, y, z = (np.ascontiguousarray(values, dtype=np.float64) for values in samples)
     _segment.motion(
-        x, y, z, blocks.length, blocks.mean, pieces.start, pieces.stop, pieces.attitude, pieces.mean, *sums
+        *held.samples, held.length, held.mean, held.start, held.stop, held.attitude, held.centre, *sums
     )  # fmt: skip
-    terms = size * blocks.length - 1, size, np.maximum(size - 2, 0)
-    numbers = np.array([np.bincount(pieces.attitude, each, count) for each in terms])
+    terms = size * held.length - 1, size, np.maximum(size - 2, 0)
+    numbers = np.array([np.bincount(held.attitude, each, count) for each in terms])
     difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
-    white = difference / (2 * blocks.length)
+    white = difference / (2 * held.length)
     pooled = np.median(white, axis=0)
     return Motion(
         lengthening=white * (1 + 1 / 24) - spread - slope / 12,
