@@ -205,6 +205,12 @@ def gyro(
     window: Window = None,
     fit_bias: Annotated[bool, typer.Option("--fit-bias", help="Fit the biases to the turns too.")] = False,
     g_sensitivity: Annotated[str, typer.Option(help="auto, yes or no.")] = "auto",
+    clock: Annotated[
+        str, typer.Option(help="Standard uncertainty of the clock's rate, common to the three scale factors.")
+    ] = "50 ppm",
+    clock_of: Annotated[
+        str, typer.Option("--clock-of", help="Whose time stamps are right where two clocks differ: gyro or accel.")
+    ] = "gyro",
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -220,7 +226,10 @@ def gyro(
     record = load(accel)
     recording = read_recording(file, layout, chosen(topic, instance, window))
     own = recording if accel_file is None else read_recording(accel_file, accel_layout or layout, {})
-    result = fit_gyro(record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity)
+    result = fit_gyro(
+        record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
+        clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
+    )  # fmt: skip
     finish(with_gyro(record, result, recording, own), output, report, json=json)
 
 

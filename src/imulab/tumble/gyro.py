@@ -13,30 +13,26 @@ Source: Tedaldi, Pretto, Menegatti, ICRA 2014, section IV; the change of a turn 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
-from imulab.estimate import Observability, covariance, levenberg_marquardt, observability
+from imulab.estimate import Observability, covariance, observability
 from imulab.recording import Array, Recording, check_finite, check_time
-from imulab.rotation import Turns, composed_turns, weighted_turns
 from imulab.tumble.apply import output_factor, specific_force
 from imulab.tumble.directions import direction_covariance
-from imulab.tumble.gyrorest import SENSITIVITIES, Holds, Rest, at_rest, beyond_range, clock_notes, find_holds
-from imulab.units import STANDARD_GRAVITY, from_si, parse_unit, to_si
+from imulab.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks
+from imulab.tumble.gyrolinear import Nonlinearity, test_linearity
+from imulab.tumble.gyrorest import SENSITIVITIES, clock_notes, find_holds
+from imulab.tumble.gyrosolve import Case, Solved, solve_turns
+from imulab.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
+from imulab.units import STANDARD_GRAVITY, from_si
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
-_ROWS, _COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
-_FEWEST_TURNS = 8
 _FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
-_LONGEST_TURN = 60.0  # s
-_WORST_TURN = np.radians(20.0)
-_COARSE = 4  # steps taken as one where a scale factor is only to be found roughly
-_START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
 @dataclass(frozen=True)
@@ -67,6 +63,12 @@ class GyroFit:
         Whether the biases were fitted to the turns instead of taken from rest.
     observability
         Of the parameters that were fitted to the turns.
+    clock
+        What the time is known by that the scale factors are referred to.
+    nonlinearity
+        Of the scale factors over the rate.
+    aside
+        Start, stop, s, and miss, rad, of turns that stand out and were set aside, shape (k, 3).
     notes
         What a user should know, a sentence each.
     """
@@ -83,26 +85,15 @@ class GyroFit:
     unit: str
     fit_bias: bool
     observability: Observability
+    clock: Clock
+    nonlinearity: Nonlinearity | None
+    aside: Array
     notes: tuple[str, ...] = ()
 
     @property
     def cost(self) -> float:
         """Sum of the squared angles, rad^2."""
         return float(np.sum(self.residuals**2))
-
-
-@dataclass(frozen=True)
-class _Segments:
-    """Turns as steps between samples: mean output less what acceleration adds, (m, n, 3), and durations, (m, n)."""
-
-    output: Array
-    step: Array
-    before: Array
-    after: Array
-    start: Array
-    stop: Array
-    attitude: NDArray[np.intp]
-    """Index of the attitude before each turn; the one after it is the next."""
 
 
 def fit_gyro(
@@ -112,6 +103,8 @@ def fit_gyro(
     *,
     fit_bias: bool = False,
     sensitivity: str = "auto",
+    clock: float = CRYSTAL,
+    clock_of: str = "gyro",
 ) -> GyroFit:
     """Calibrate a gyroscope triad from the turns between static attitudes.
 
@@ -126,7 +119,13 @@ def fit_gyro(
     fit_bias
         Fit the biases to the turns too, instead of taking them from the outputs at rest.
     sensitivity
-        Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the outputs at rest show it.
+        Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the outputs at rest show it and
+        the turns miss less with it.
+    clock
+        Relative standard uncertainty of the rate of the clock: common to the three scale factors.
+    clock_of
+        Whose time counts where the two triads have clocks of their own: ``gyro``, or ``accel``: the gyroscopes' is
+        carried over to it.
 
     Raises
     ------
@@ -139,12 +138,16 @@ def fit_gyro(
     ObservabilityError
         The turns cannot separate the parameters.
     OptionError
-        `sensitivity` has an unknown value.
+        `sensitivity`, `clock` or `clock_of` has a value that cannot be.
     """
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
     if sensitivity not in SENSITIVITIES:
         raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {' '.join(SENSITIVITIES)}")
+    if clock_of not in CLOCKS:
+        raise OptionError(f"clock of {clock_of!r}: expected one of {' '.join(CLOCKS)}")
+    if not 0 <= clock < 1:
+        raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
     if attitudes.trace is None:
         raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
     unit = recording.triad_unit("gyro")
@@ -152,37 +155,49 @@ def fit_gyro(
     time, output = check_time(recording), recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
     means = attitudes.mean * factor
-    force = specific_force(record, means)
-    holds = find_holds(attitudes, time, output, recording.name)
-    rest = at_rest(holds, output, force, sensitivity)
-    moving = _force_at(record, attitudes.recording, time, factor) if rest.slope is not None else None
-    segments, notes = _segments(holds, time, output, force, rest, moving, recording.name)
-    notes += _record_notes(record, attitudes, force)
-    if attitudes.recording is not recording:
-        notes += clock_notes(holds, attitudes, time)
-    scale = _start_scale(segments, unit)
-    theta, jacobian, residual, converged = _estimate(segments, scale, fit_bias)
-    miss = np.linalg.norm(residual.reshape(-1, 3), axis=1)
-    if not np.median(miss) < _WORST_TURN:
-        raise DataError(
-            f"{recording.name}: columns gyro_x gyro_y gyro_z: the turns miss the change of gravity's direction by "
-            f"{np.degrees(np.median(miss)):.0f} deg (median of {len(miss)}): swapped or reversed axes, or a wrong unit?"
-        )
+    own, own_force = (
+        attitudes.recording.si("time"),
+        specific_force(record, attitudes.recording.triad("accel") * factor),
+    )
+    case = Case(recording.name, attitudes, specific_force(record, means), own, own_force, output, unit, fit_bias)
+    found = solve_turns(case, time, sensitivity)
+    apart = attitudes.recording is not recording
+    comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
+    if clock_of == "accel":
+        if comparison is None:
+            raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
+        time = comparison.on_other(time)
+        found = solve_turns(case, time, sensitivity)
+    known = clock_of_scale(comparison, clock, clock_of)
+    notes = [*found.notes, *_record_notes(record, attitudes, case.force), *known.notes(apart=apart)]
+    if apart and clock_of == "gyro":
+        notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
+    segments, residual, jacobian = found.segments, found.residual, found.jacobian
+    miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), found.theta.size
     # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
-    freedom = max(2 * len(miss) - theta.size, 1)
+    freedom = max(2 * len(miss) - size, 1)
     seen = observability(jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
-    if seen.rank < theta.size:
-        confused = " ".join(seen.confused(gyro_names()[: theta.size]))
+    if seen.rank < size:
+        confused = " ".join(seen.confused(gyro_names()[:size]))
         raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
-    if not converged:
+    if not found.converged:
         raise DataError(
             f"{recording.name}: the fit of the gyroscopes does not converge on these {len(miss)} turns "
             f"(condition number {seen.condition:.0f}); use more turns, about more directions"
         )
-    known = direction_covariance(record, attitudes, means, force)
-    matrix = _covariance(segments, scale, theta, jacobian, residual, known, None if fit_bias else rest)
-    result = _result(theta, matrix, scale, rest, miss, segments, unit, fit_bias, seen)
-    return replace(result, notes=tuple(notes))
+    directions = direction_covariance(record, attitudes, means, case.force)
+    zero = None if fit_bias else found.rest.zero_uncertainty
+    shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
+    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
+    pulled = jacobian.T @ shared @ jacobian
+    # What the residuals scatter beyond all that is taken as a variance of their own, the same in each.
+    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
+    variance = max(left, 0.0) / freedom
+    matrix = bread @ pulled @ bread + variance * bread
+    linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
+    if linearity is not None:
+        notes += linearity.notes()
+    return _result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes))
 
 
 def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
@@ -209,20 +224,21 @@ def gyro_names() -> list[str]:
 
 
 def _result(
-    theta: Array,
+    found: Solved,
     matrix: Array,
-    scale: Array,
-    rest: Rest,
     miss: Array,
-    segments: _Segments,
     unit: str,
     fit_bias: bool,
     seen: Observability,
+    clock: Clock,
+    linearity: Nonlinearity | None,
+    notes: tuple[str, ...],
 ) -> GyroFit:
     """Turn scaled parameters into the triad."""
+    theta, scale, rest = found.theta, found.scale, found.rest
     scale_factor = scale * (1 + theta[:3])
     misalignment = np.eye(3)
-    misalignment[_ROWS, _COLUMNS] = theta[3:9]
+    misalignment[ROWS, COLUMNS] = theta[3:9]
     moved = theta[9:12] if fit_bias else np.zeros(3)
     bias = (rest.zero + scale * moved) / scale_factor
     everything = np.zeros((12, 12))
@@ -231,162 +247,25 @@ def _result(
         everything[range(9, 12), range(9, 12)] = (rest.zero_uncertainty / scale) ** 2
     derivative = np.diag(np.concatenate([scale, np.ones(6), scale / scale_factor]))
     derivative[range(9, 12), range(3)] = -bias * scale / scale_factor
+    # A clock that is fast makes all scale factors too large by as much, and what is divided by them too small.
+    common = clock.uncertainty * np.concatenate([scale_factor, np.zeros(6), -bias])
     return GyroFit(
         scale_factor=scale_factor,
         misalignment=misalignment,
         bias=bias,
         sensitivity=None if rest.slope is None else rest.slope / scale_factor[:, None],
-        covariance=derivative @ everything @ derivative.T,
+        covariance=derivative @ everything @ derivative.T + np.outer(common, common),
         sensitivity_uncertainty=(
             None if rest.slope_uncertainty is None else rest.slope_uncertainty / scale_factor[:, None]
         ),
         residuals=miss,
-        start=segments.start,
-        stop=segments.stop,
+        start=found.segments.start,
+        stop=found.segments.stop,
         unit=unit,
         fit_bias=fit_bias,
         observability=seen,
+        clock=clock,
+        nonlinearity=linearity,
+        aside=found.aside,
+        notes=notes,
     )
-
-
-def _force_at(record: Calibration, recording: Recording, time: Array, factor: float) -> Array:
-    """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
-    force = specific_force(record, recording.triad("accel") * factor)
-    own = recording.si("time")
-    if len(own) == len(time) and np.array_equal(own, time):
-        return force
-    return np.column_stack([np.interp(time, own, force[:, axis]) for axis in range(3)])
-
-
-def _segments(
-    holds: Holds, time: Array, output: Array, force: Array, rest: Rest, moving: Array | None, name: str
-) -> tuple[_Segments, list[str]]:
-    begin, end = holds.leave[:-1], holds.arrive[1:]
-    clipped = np.vstack([np.zeros((1, 3), dtype=np.int64), np.cumsum(beyond_range(output), axis=0)])
-    turns = (end > begin) & (time[end] - time[begin] <= _LONGEST_TURN)
-    beyond = (clipped[end + 1] > clipped[begin]) & turns[:, None]
-    chosen = np.flatnonzero(turns & ~beyond.any(axis=1))
-    notes = []
-    if beyond.any():
-        axes = " ".join(f"gyro_{'xyz'[axis]}" for axis in range(3) if beyond[:, axis].any())
-        where = np.flatnonzero(beyond.any(axis=1))
-        at = " ".join(f"{t:.1f}" for t in time[begin[where[:6]]].tolist()) + (" ..." if len(where) > 6 else "")
-        notes.append(f"gyro: {len(where)} turns left out, clipped: {axes} stay at the end of their range (from {at} s)")
-    if len(chosen) < _FEWEST_TURNS:
-        aside = f" ({int(beyond.any(axis=1).sum())} more are clipped)" if notes else ""
-        raise SegmentError(f"{name}: {len(chosen)} turns between attitudes{aside}; expected at least {_FEWEST_TURNS}")
-    start, stop = begin[chosen], end[chosen]
-    index = start[:, None] + np.arange(int((stop - start).max()))
-    inside = index < stop[:, None]
-    here, there = np.where(inside, index, 0), np.where(inside, index + 1, 0)
-    mean = 0.5 * (output[here] + output[there]) - rest.zero
-    if moving is not None and rest.slope is not None:
-        mean = mean - 0.5 * (moving[here] + moving[there]) @ rest.slope.T
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    step = np.where(inside, time[there] - time[here], 0.0)
-    return _Segments(mean, step, up[chosen], up[chosen + 1], time[start], time[stop], chosen), notes
-
-
-def _start_scale(segments: _Segments, unit: str) -> Array:
-    """Output per rad/s to start from: by the unit, or what makes the turns fit best with ideal axes."""
-    known = parse_unit(unit)
-    if known.quantity == "rate":
-        return np.full(3, 1 / to_si(1.0, known.symbol))
-    angle = np.arccos(np.clip(np.einsum("mi,mi->m", segments.before, segments.after), -1, 1))
-    turned = np.linalg.norm((segments.output * segments.step[:, :, None]).sum(axis=1), axis=1)
-    # A turn goes at least as far as the direction of gravity does.
-    guess = float(np.median((turned / np.maximum(angle, 1e-3))[angle > 0.3])) if (angle > 0.3).any() else 1.0
-    few = slice(None, 40)
-    angle_steps = segments.output[few] * segments.step[few, :, None]
-    missing = -angle_steps.shape[1] % _COARSE
-    coarse = np.pad(angle_steps, ((0, 0), (0, missing), (0, 0))).reshape(len(angle_steps), -1, _COARSE, 3).sum(axis=2)
-    costs = []
-    for factor in _START_FACTORS:
-        miss = (
-            np.einsum("mij,mj->mi", composed_turns(coarse / (guess * factor)), segments.before[few])
-            - segments.after[few]
-        )
-        costs.append(float(np.median(np.linalg.norm(miss, axis=1))))
-    return np.full(3, guess * float(_START_FACTORS[int(np.argmin(costs))]))
-
-
-def _estimate(segments: _Segments, scale: Array, fit_bias: bool) -> tuple[Array, Array, Array, bool]:
-    """Return scaled parameters (p,), Jacobian (3 m, p), residuals (3 m,), and whether the steps became small."""
-
-    def model(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
-        residual, jacobian = _model(segments, scale, parameters[0], fit_bias)
-        return residual[None], jacobian[None]
-
-    count = 12 if fit_bias else 9
-    fit = levenberg_marquardt(model, np.zeros((1, count)), np.ones((1, 3 * len(segments.before))), tolerance=1e-8)
-    return fit.parameters[0], fit.jacobian[0], fit.residuals[0], bool(fit.converged[0])
-
-
-def _covariance(
-    segments: _Segments, scale: Array, theta: Array, jacobian: Array, residual: Array, known: Array, rest: Rest | None
-) -> Array:
-    """Covariance of a least-squares estimate whose observations share errors: (J'J)^-1 J' V J (J'J)^-1.
-
-    V is what the directions of gravity (`known`) and the zero at rest bring to the residuals, and a common variance of
-    each for all else, which takes up what the residuals scatter beyond them.
-    """
-    m, size = len(segments.before), theta.size
-    turn = _turns(segments, scale, theta)
-    rows = jacobian.reshape(m, 3, size)
-    count = len(known) // 3
-    seen = np.zeros((count, 3, size))
-    np.add.at(seen, segments.attitude, np.swapaxes(turn, 1, 2) @ rows)
-    np.add.at(seen, segments.attitude + 1, -rows)
-    pulled = seen.reshape(3 * count, size)
-    meat: Array = pulled.T @ known @ pulled
-    blocks = known.reshape(count, 3, count, 3)
-    here, there = segments.attitude, segments.attitude + 1
-    spent = float(
-        np.einsum("mii->", blocks[here, :, here]) + np.einsum("mii->", blocks[there, :, there])
-        - 2 * np.einsum("mij,mji->", turn, blocks[here, :, there])
-    )  # fmt: skip
-    if rest is not None:
-        zero = _model(segments, scale, np.concatenate([theta, np.zeros(3)]), fit_bias=True)[1][:, size:]
-        zero = zero * (rest.zero_uncertainty / scale)
-        meat += (jacobian.T @ zero) @ (zero.T @ jacobian)
-        spent += float((zero**2).sum())
-    bread = covariance(jacobian[None], np.ones((1, 3 * m)))[0]
-    left = float(residual @ residual) - (spent - float(np.trace(bread @ meat)))
-    variance = max(left, 0.0) / max(2 * m - size, 1)
-    found: Array = bread @ meat @ bread + variance * bread
-    return found
-
-
-def _turns(segments: _Segments, scale: Array, theta: Array) -> Array:
-    """Matrices of the turns under given parameters, shape (m, 3, 3)."""
-    t = np.eye(3)
-    t[_ROWS, _COLUMNS] = theta[3:9]
-    moved = scale * theta[9:12] if theta.size > 9 else 0.0
-    rate = (segments.output - moved) / (scale * (1 + theta[:3])) @ np.linalg.inv(t).T
-    return composed_turns(rate * segments.step[:, :, None])
-
-
-def _model(segments: _Segments, scale: Array, theta: Array, fit_bias: bool) -> tuple[Array, Array]:
-    """Carried less found direction of each turn, (3 m,), and derivatives, (3 m, p).
-
-    An error ``dw`` of the rate changes a carried direction u by ``C (u x sum C' dw dt)``; dw is linear in the scaled
-    output, the rate and a constant, so that five sums per turn hold all derivatives.
-    """
-    s = scale * (1 + theta[:3])
-    t = np.eye(3)
-    t[_ROWS, _COLUMNS] = theta[3:9]
-    inverse = np.linalg.inv(t)
-    scaled = (segments.output - (scale * theta[9:12] if fit_bias else 0.0)) / s
-    rate = scaled @ inverse.T
-    weights = np.concatenate([scaled, rate, np.ones((*rate.shape[:2], 1))], axis=2)
-    turns: Turns = weighted_turns(rate, segments.step, weights)
-    found = np.einsum("mij,mj->mi", turns.matrix, segments.before)
-    columns = [(k, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
-    columns += [(3 + j, -inverse[:, i]) for i, j in zip(_ROWS, _COLUMNS, strict=True)]
-    if fit_bias:
-        columns += [(6, -inverse[:, k] * (scale / s)[k]) for k in range(3)]
-    jacobian = np.empty((len(found), 3, len(columns)))
-    for column, (which, direction) in enumerate(columns):
-        moved = np.cross(segments.before, turns.weighted[:, which] @ direction)
-        jacobian[:, :, column] = np.einsum("mij,mj->mi", turns.matrix, moved)
-    return (found - segments.after).ravel(), jacobian.reshape(-1, len(columns))

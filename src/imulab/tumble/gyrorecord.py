@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +11,23 @@ from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.estimate import coverage_factor
 from imulab.recording import Array, Recording
 from imulab.tumble.gyro import PAIRS, GyroFit, gyro_names
+from imulab.tumble.gyroclock import Clock
+from imulab.tumble.gyrolinear import Nonlinearity
 from imulab.units import parse_unit
+from imulab.verdict import Bad
 
 _AXES = ("x", "y", "z")
 _WORST_SCALE = 0.1
-_STANDS_OUT = 6.0
+_USUAL = (
+    (np.degrees(1), "are the rates in deg/s?"),
+    (np.radians(1), "are the rates in rad/s?"),
+    (2.0, "is the sample rate twice what the time stamps say?"),
+    (0.5, "is the sample rate half what the time stamps say?"),
+)
+"""Factors by which scale factors are off, and what makes them so."""
+_ALIKE = 5.7  # Student's t of three at 1 %, over root 3
+_CLEAR = 4.0
+_SMALLEST_ALIKE = 0.05  # %
 _LARGE_MISS = 2.0  # deg
 
 
@@ -50,6 +63,12 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
                 "condition_number": fit.observability.condition,
                 "bias": "fitted to the turns" if fit.fit_bias else "from the outputs at rest",
                 "g_sensitivity": "none" if fit.sensitivity is None else "from the outputs at rest",
+                "clock": _clock(fit.clock),
+                "nonlinearity": _nonlinearity(fit.nonlinearity),
+                "set_aside": [
+                    {"start": start, "stop": stop, "miss": {"value": miss, "unit": "rad"}}
+                    for start, stop, miss in fit.aside.tolist()
+                ],
             },
         },
         data={
@@ -103,23 +122,63 @@ def _diagonal_blocks(first: Array, second: Array) -> Array:
     return joined
 
 
+def _clock(clock: Clock) -> dict[str, Any]:
+    """What the record says of the clock: relative uncertainty, whose it is, and how the two differ."""
+    found: dict[str, Any] = {"of": clock.of, "standard_uncertainty": clock.uncertainty}
+    other = clock.comparison
+    if other is not None:
+        found["accel_clock_rate"] = {"value": other.rate, "standard_uncertainty": other.rate_uncertainty, "unit": "1"}
+        found["latency"] = {"value": -other.delay, "standard_uncertainty": other.delay_uncertainty, "unit": "s"}
+    return found
+
+
+def _nonlinearity(found: Nonlinearity | None) -> dict[str, Any] | None:
+    """What the record says of scale factors that change with the rate: test, sizes, and the rates seen."""
+    if found is None:
+        return None
+    return {
+        "probability": found.probability,
+        "odd": _with_uncertainty(found.odd, found.odd_uncertainty),
+        "even": _with_uncertainty(found.even, found.even_uncertainty),
+        "largest_rate": {"value": found.largest.tolist(), "unit": "rad/s"},
+    }
+
+
+def _with_uncertainty(value: Array, uncertainty: Array) -> dict[str, Any]:
+    return {"value": value.tolist(), "standard_uncertainty": uncertainty.tolist(), "unit": "1"}
+
+
+def _off_nominal(fit: GyroFit) -> list[str]:
+    """Say if the scale factors are far from the stated unit, or all three by the same."""
+    known = parse_unit(fit.unit)
+    if known.quantity != "rate":
+        return []
+    ratio = fit.scale_factor * known.factor
+    error = 100 * (ratio - 1)
+    listed = " ".join(f"{value:+.3g}" for value in error.tolist())
+    if np.abs(error).max() > 100 * _WORST_SCALE:
+        middle = float(np.exp(np.mean(np.log(np.abs(ratio)))))
+        guess = next((f": {says}" for of, says in _USUAL if abs(middle / of - 1) < _WORST_SCALE), "")
+        return [
+            Bad(
+                f"gyro: the scale factors are off by {listed} % (x y z){guess or ': is the unit right?'}; check the "
+                f"unit ({fit.unit}) and the sample rate of the recording"
+            )
+        ]
+    mean, spread = float(error.mean()), float(error.std(ddof=1))
+    own = 100 * float(np.sqrt(np.diag(fit.covariance)[:3]).max() / fit.scale_factor.mean())
+    if abs(mean) > max(_ALIKE * spread, _CLEAR * own, _SMALLEST_ALIKE):
+        return [
+            f"gyro: the scale factors are off by {listed} % (x y z), all by the same: a sample rate or a clock that is "
+            "off by as much does that; compare the time stamps with a clock"
+        ]
+    return []
+
+
 def _warnings(fit: GyroFit) -> list[str]:
     found = list(fit.notes)
-    if parse_unit(fit.unit).quantity == "rate":
-        nominal = 1 / parse_unit(fit.unit).factor
-        found += [
-            f"gyro scale factor of {axis} is off by {100 * (value / nominal - 1):+.0f} %: is the unit right?"
-            for axis, value in zip(_AXES, fit.scale_factor, strict=True)
-            if abs(value / nominal - 1) > _WORST_SCALE
-        ]
+    found += _off_nominal(fit)
     rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
     if rms > _LARGE_MISS:
         found.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")
-    worst = int(np.argmax(fit.residuals))
-    others = float(np.sqrt(np.mean(np.delete(fit.residuals, worst) ** 2)))
-    if fit.residuals[worst] > _STANDS_OUT * others:
-        found.append(
-            f"gyro: the turn at {fit.start[worst]:.1f} to {fit.stop[worst]:.1f} s misses by "
-            f"{np.degrees(fit.residuals[worst]):.3g} deg, the others by {np.degrees(others):.3g} deg rms"
-        )
     return found
