@@ -14,7 +14,7 @@ from imulab.tumble.gyro import PAIRS, GyroFit, gyro_names
 from imulab.tumble.gyroclock import Clock
 from imulab.tumble.gyrolinear import Nonlinearity
 from imulab.units import parse_unit
-from imulab.verdict import Bad
+from imulab.verdict import UNJUDGED, Bad
 
 _AXES = ("x", "y", "z")
 _WORST_SCALE = 0.1
@@ -76,6 +76,7 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
             "gyro": {"start": fit.start.tolist(), "stop": fit.stop.tolist(), "residual": fit.residuals.tolist()},
         },
         warnings=(*(w for w in record.warnings if not w.startswith("gyro")), *_warnings(fit)),
+        verdict=UNJUDGED,
     )
 
 

@@ -1,4 +1,4 @@
-"""A six-axis unit that is turned from hold to hold, written apart from imulab: plain NumPy.
+"""A six-axis unit that is turned from hold to hold: its motion and its outputs, in plain NumPy.
 
 Each turn is about an axis fixed in the body, with rate proportional to ``1 - cos``: the direction of gravity is then
 known at every instant without any integration. The unit is carried around a point beside it, so that the
@@ -10,26 +10,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-import imulab as il
-
-G = 9.80665
+Array = NDArray[np.float64]
+GRAVITY = 9.80665
 
 
 @dataclass(frozen=True)
 class Unit:
     """True errors of a unit, SI."""
 
-    accel_bias: np.ndarray
-    accel_scale: np.ndarray
-    scale: np.ndarray
-    misalignment: np.ndarray
-    bias: np.ndarray
-    sensitivity: np.ndarray
-    arm: np.ndarray
+    accel_bias: Array
+    accel_scale: Array
+    scale: Array
+    misalignment: Array
+    bias: Array
+    sensitivity: Array
+    arm: Array
 
 
-def unit(rng: np.random.Generator, sensitivity: float = 0.0) -> Unit:
+def random_unit(rng: np.random.Generator, sensitivity: float = 0.0) -> Unit:
     """Draw a unit; `sensitivity` is the standard deviation of its g-sensitivities, rad/s/(m/s^2)."""
     misalignment = np.eye(3) + np.where(np.eye(3) > 0, 0.0, rng.normal(0, 0.01, (3, 3)))
     return Unit(
@@ -47,14 +47,14 @@ def unit(rng: np.random.Generator, sensitivity: float = 0.0) -> Unit:
 class Path:
     """Directions of gravity at rest (n, 3), axes of the turns between (n - 1, 3), angles and durations of the turns."""
 
-    up: np.ndarray
-    axis: np.ndarray
-    angle: np.ndarray
-    duration: np.ndarray
+    up: Array
+    axis: Array
+    angle: Array
+    duration: Array
     hold: float
 
     @property
-    def begin(self) -> np.ndarray:
+    def begin(self) -> Array:
         """Start of each turn, s, shape (n - 1,)."""
         return self.hold + np.concatenate([[0.0], np.cumsum(self.duration + self.hold)[:-1]])
 
@@ -64,13 +64,15 @@ class Path:
         return float(self.begin[-1] + self.duration[-1] + self.hold)
 
 
-def _turned(v: np.ndarray, axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _turned(v: Array, axis: Array, angle: Array) -> Array:
     """Body components of fixed directions v after the body turned about an axis in it by an angle (Rodrigues)."""
     c, s = np.cos(angle)[..., None], np.sin(angle)[..., None]
     return v * c - np.cross(axis, v) * s + axis * np.sum(axis * v, axis=-1)[..., None] * (1 - c)
 
 
-def path(rng: np.random.Generator, holds: int = 24, hold: float = 3.0, turn: tuple[float, float] = (1.2, 3.0)) -> Path:
+def random_path(
+    rng: np.random.Generator, holds: int = 24, hold: float = 3.0, turn: tuple[float, float] = (1.2, 3.0)
+) -> Path:
     """Draw a path over the sphere: turns by 60 to 150 degrees about axes across the vertical, mostly."""
     up, axes, angles = [np.array([0.0, 0.0, 1.0])], [], []
     while len(up) < holds:
@@ -88,46 +90,44 @@ def path(rng: np.random.Generator, holds: int = 24, hold: float = 3.0, turn: tup
     return Path(np.array(up), np.array(axes), np.array(angles), duration, hold)
 
 
-def motion(way: Path, time: np.ndarray, arm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def motion(path: Path, time: Array, arm: Array) -> tuple[Array, Array]:
     """Body rate, rad/s, and specific force, m/s^2, at given times, both (n, 3)."""
-    begin = way.begin
+    begin = path.begin
     turn = np.clip(np.searchsorted(begin, time, side="right") - 1, 0, len(begin) - 1)
-    share = np.clip((time - begin[turn]) / way.duration[turn], 0.0, 1.0)
+    share = np.clip((time - begin[turn]) / path.duration[turn], 0.0, 1.0)
     done = share - np.sin(2 * np.pi * share) / (2 * np.pi)
-    speed = (way.angle / way.duration)[turn] * (1 - np.cos(2 * np.pi * share))
-    faster = (2 * np.pi * way.angle / way.duration**2)[turn] * np.sin(2 * np.pi * share)
-    axis = way.axis[turn]
+    speed = (path.angle / path.duration)[turn] * (1 - np.cos(2 * np.pi * share))
+    faster = (2 * np.pi * path.angle / path.duration**2)[turn] * np.sin(2 * np.pi * share)
+    axis = path.axis[turn]
     rate, change = axis * speed[:, None], axis * faster[:, None]
-    up = _turned(way.up[turn], axis, way.angle[turn] * done)
-    return rate, G * up + np.cross(change, arm) + np.cross(rate, np.cross(rate, arm))
+    up = _turned(path.up[turn], axis, path.angle[turn] * done)
+    return rate, GRAVITY * up + np.cross(change, arm) + np.cross(rate, np.cross(rate, arm))
 
 
-def gyro_columns(
-    of: Unit, way: Path, time: np.ndarray, rng: np.random.Generator, noise: float, cubic: float = 0.0,
-    limit: float | None = None, count_unit: float = 1.0,
-) -> dict[str, np.ndarray]:  # fmt: skip
+def gyroscopes(
+    unit: Unit,
+    path: Path,
+    time: Array,
+    rng: np.random.Generator,
+    noise: float = np.radians(0.05),
+    *,
+    cubic: float = 0.0,
+    limit: float | None = None,
+) -> dict[str, Array]:
     """What the gyroscopes put out, rad/s; `cubic` is the change of the scale factors at 100 deg/s, of each axis."""
-    rate, force = motion(way, time, of.arm)
-    sensed = rate @ of.misalignment.T
+    rate, force = motion(path, time, unit.arm)
+    sensed = rate @ unit.misalignment.T
     sensed = sensed * (1 + cubic * (sensed / np.radians(100)) ** 2)
-    put_out = of.scale * (sensed + of.bias + force @ of.sensitivity.T) + rng.normal(0, noise, rate.shape)
+    put_out = unit.scale * (sensed + unit.bias + force @ unit.sensitivity.T) + rng.normal(0, noise, rate.shape)
     if limit is not None:
         put_out = np.clip(put_out, -limit, limit)
-    return {f"gyro_{a}": count_unit * put_out[:, i] for i, a in enumerate("xyz")}
+    return {f"gyro_{a}": put_out[:, i] for i, a in enumerate("xyz")}
 
 
-def accel_columns(
-    of: Unit, way: Path, time: np.ndarray, rng: np.random.Generator, noise: float
-) -> dict[str, np.ndarray]:
+def accelerometers(
+    unit: Unit, path: Path, time: Array, rng: np.random.Generator, noise: float = 0.7e-3 * GRAVITY
+) -> dict[str, Array]:
     """What the accelerometers put out, m/s^2."""
-    force = motion(way, time, of.arm)[1]
-    put_out = of.accel_scale * (force + of.accel_bias) + rng.normal(0, noise, force.shape)
+    force = motion(path, time, unit.arm)[1]
+    put_out = unit.accel_scale * (force + unit.accel_bias) + rng.normal(0, noise, force.shape)
     return {f"accel_{a}": put_out[:, i] for i, a in enumerate("xyz")}
-
-
-def recording(columns: dict[str, np.ndarray], name: str = "turns.csv") -> il.Recording:
-    """Hand columns over as a recording."""
-    quantity = {"time": "s", "accel": "m/s^2", "gyro": "rad/s"}
-    return il.Recording(
-        columns=columns, units={key: quantity[key.split("_")[0]] for key in columns}, name=name, metadata={}
-    )

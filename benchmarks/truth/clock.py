@@ -1,0 +1,111 @@
+"""Gyroscopes whose clock, samples, turns or unit are not what a person takes them for."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scenario import Scenario, Trial
+from scipy.stats import t as student
+
+import imulab as il
+from imulab.errors import ImulabError
+from imulab.tumble.gyro import fit_gyro
+from imulab.tumble.gyrorecord import with_gyro
+from imulab.verdict import Note
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+from reference import turns
+
+GYRO = "Gyroscopes of a tumble"
+RATE = 100.0
+
+
+def gyro(
+    seed: int,
+    *,
+    words: str = "",
+    clock: float = 50e-6,
+    fast: float = 0.0,
+    late: float = 0.0,
+    apart: bool = False,
+    clock_of: str = "gyro",
+    sensitivity: float = 0.0,
+    cubic: float = 0.0,
+    limit: float | None = None,
+    lost: tuple[int, bool] | None = None,
+    knock: float = 0.0,
+    scale: float = 1.0,
+) -> Trial:
+    """Calibrate a unit; warned means that a finding other than a note holds the words, where there are some.
+
+    `clock`: standard deviation of the clocks' rates; `fast`: what the gyroscopes' clock is off by beyond that; `lost`:
+    samples lost in a turn, and whether the time stamps show it.
+    """
+    rng = np.random.default_rng(seed)
+    unit = turns.random_unit(rng, sensitivity)
+    path = turns.random_path(rng)
+    true = np.arange(0, path.end, 1 / RATE)
+    accel = turns.accelerometers(unit, path, true, rng)
+    columns = turns.gyroscopes(unit, path, true - late, rng, cubic=cubic, limit=limit)
+    columns = {name: scale * values for name, values in columns.items()}
+    time, own = (true * (1 + extra + rng.normal(0, clock)) for extra in (fast, 0.0))
+    turn = int(rng.integers(2, 20))
+    middle = path.begin[turn] + path.duration[turn] * rng.uniform(0.35, 0.65)
+    if knock:
+        columns["gyro_x"] = columns["gyro_x"] + knock * np.exp(-0.5 * ((true - middle) / 0.03) ** 2)
+    if lost is not None:
+        count, stamped = lost
+        keep = np.abs(true - middle) > count / RATE / 2
+        columns, accel = ({n: v[keep] for n, v in values.items()} for values in (columns, accel))
+        time = time[keep] if stamped else time[: keep.sum()]
+    units = {"time": "s"} | {f"gyro_{a}": "rad/s" for a in "xyz"} | {f"accel_{a}": "m/s^2" for a in "xyz"}
+    accelerometers = recording = il.Recording(columns={"time": time, **columns, **accel}, units=units, name="both.csv")
+    if apart:
+        accelerometers = il.Recording(columns={"time": own, **accel}, units=units, name="accel.csv")
+        recording = il.Recording(columns={"time": time, **columns}, units=units, name="gyro.csv")
+    try:
+        attitudes = il.find_attitudes(accelerometers)
+        record = il.fit_tumble(attitudes, order=1, gravity=turns.GRAVITY).calibration
+        fit = fit_gyro(record, attitudes, recording, clock_of=clock_of)
+        both = with_gyro(record, fit, recording, accelerometers)
+    except ImulabError as error:
+        return Trial(warned=words in str(error))
+    i, j = np.nonzero(~np.eye(3, dtype=bool))
+    found = np.concatenate([fit.scale_factor, fit.misalignment[i, j], fit.bias])
+    wanted = np.concatenate([unit.scale, unit.misalignment[i, j], unit.bias])
+    half = student.ppf(0.975, 2 * len(fit.residuals) - 9) * np.sqrt(np.diag(fit.covariance))
+    said = [w for w in both.warnings if w.startswith("gyro") and not isinstance(w, Note)]
+    error = 1e6 * float(np.sqrt(np.mean((fit.scale_factor / unit.scale - 1) ** 2)))
+    return Trial(tuple((np.abs(found - wanted) < half).tolist()), any(words in w for w in said), error)
+
+
+def row(name: str, **options: object) -> Scenario:
+    """Return a scenario of the gyroscopes: settings of `Scenario` and arguments of `gyro`."""
+    settings = {key: options.pop(key) for key in ("coverage", "warned", "false_alarms", "trials") if key in options}
+    settings = {"trials": 60, "unit": "ppm of scale factor", **settings}
+    return Scenario(GYRO, name, partial(gyro, **options), **settings)  # type: ignore[arg-type]
+
+
+SCENARIOS = [
+    row("nothing wrong, clocks of 50 ppm", false_alarms=5.0, trials=100),
+    row("the same, each triad on a clock of its own", apart=True, false_alarms=5.0),
+    row("clock 2000 ppm fast, the accelerometers' true", apart=True, fast=2e-3, words="clock runs", coverage=None,
+        warned=95.0),
+    row("clock 500 ppm fast, the accelerometers' true", apart=True, fast=5e-4, words="clock runs", coverage=None,
+        warned=95.0),
+    row("clock 2000 ppm fast, `--clock-of accel`", apart=True, fast=2e-3, clock_of="accel"),
+    row("samples 10 ms late", late=0.01, false_alarms=5.0),
+    row("scale factor 0.1 % larger at 100 deg/s", cubic=1e-3, words="depends on the rate", coverage=None, warned=95.0),
+    row("g-sensitivity of 0.001 deg/s/g", sensitivity=np.radians(0.001) / turns.GRAVITY),
+    row("g-sensitivity of 0.002 deg/s/g", sensitivity=np.radians(0.002) / turns.GRAVITY),
+    row("g-sensitivity of 0.05 deg/s/g", sensitivity=np.radians(0.05) / turns.GRAVITY),
+    row("a knock in a turn", knock=0.3, words="set aside", warned=95.0),
+    row("12 samples lost in a turn, stamps run on", lost=(12, False), words="set aside", warned=95.0),
+    row("12 samples lost in a turn, stamps show it", lost=(12, True), words="samples are missing", warned=95.0),
+    row("a range of 130 deg/s", limit=np.radians(130.0)),
+    row("deg/s labelled rad/s", scale=57.29578, words="in deg/s?", coverage=None, warned=95.0, trials=20),
+    row("time stamps of half the rate", fast=1.0, words="twice what", coverage=None, warned=95.0, trials=20),
+]  # fmt: skip
