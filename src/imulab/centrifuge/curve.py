@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.blend import blend
 from imulab.errors import OptionError
 from imulab.estimate import chi_square_limit, chi_square_probability
 from imulab.recording import Array
 
 MODELS: dict[str, tuple[int, ...]] = {"constant": (), "c1": (1,), "c2": (2,), "c1+c2": (1, 2)}
+_NESTED = ("constant", "c1", "c1+c2")
 _GAIN = 0.05
 _ROUNDING = 1e-9
 
@@ -27,6 +29,9 @@ class CurveFit:
         Of 1, a, a^2: ``K(a) = p0 + p1 a + p2 a^2``; zero where the model has no such term.
     from_levels
         Matrix that turns the K_i into them, shape (3, n).
+    covariance
+        Of `coefficients`, shape (3, 3): given the model where it was given; whichever of them is right where it was
+        chosen here (`imulab.blend`).
     chi_square, freedom
         Of the residuals.
     tried
@@ -36,6 +41,7 @@ class CurveFit:
     model: str
     coefficients: Array
     from_levels: Array
+    covariance: Array
     chi_square: float
     freedom: int
     tried: tuple[tuple[str, int, float, bool], ...]
@@ -51,7 +57,7 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
 
     A term is taken where it lowers chi-square by more than the 5 % point of chi-square with one degree of freedom;
     where even the largest model leaves more scatter than the covariance explains, chi-square counts in units of that
-    scatter (F-test).
+    scatter (F-test). What is chosen so has its own values, and the uncertainty of all models together.
 
     Parameters
     ----------
@@ -81,10 +87,29 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
         scale = max(1.0, min(value[2] for value in found.values()) / freedom) if freedom > 0 else 1.0
         chosen = min(names, key=lambda name: found[name][2] / scale + chi_square_limit(1, _GAIN) * len(MODELS[name]))
     coefficients, matrix, chi_square = found[chosen]
+    given = matrix @ covariance @ matrix.T
     return CurveFit(
-        chosen, coefficients, matrix, chi_square, len(K) - 1 - len(MODELS[chosen]),
+        chosen, coefficients, matrix,
+        _blended(force, K, whitened, covariance, coefficients, given) if model == "auto" else given,
+        chi_square, len(K) - 1 - len(MODELS[chosen]),
         tuple((name, 1 + len(MODELS[name]), found[name][2], name == chosen) for name in names),
     )  # fmt: skip
+
+
+def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Array, given: Array) -> Array:
+    """Covariance of the chosen coefficients whichever model is right: nowhere less than that given the model."""
+    nested = [name for name in _NESTED if len(MODELS[name]) < len(K)]
+    steps = [_solve(force, K, root, MODELS[name]) for name in nested]
+    squares = np.array([chi_square for *_, chi_square in steps])
+    found = blend(
+        np.array([coefficients for coefficients, *_ in steps]),
+        np.array([matrix @ covariance @ matrix.T for _, matrix, _ in steps]),
+        -np.diff(squares), np.ones(len(steps) - 1), prior=0.0,
+    )  # fmt: skip
+    scale = np.max(force) ** np.arange(3.0)
+    values, vectors = np.linalg.eigh((found.about(chosen) - given) * np.outer(scale, scale))
+    more: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(scale, scale)
+    return given + more
 
 
 def _regular(covariance: Array, K: Array) -> Array:

@@ -9,6 +9,9 @@ from typing import Any
 from imulab.errors import ReadError, UnitError
 from imulab.units import parse_unit, to_si
 
+Window = tuple[float | None, float | None]
+"""First and last time of a part of a file, s, either None for no bound."""
+
 
 def quantity_of(entry: Any, key: str, kind: str, name: str) -> tuple[float, float]:
     """Return value and standard uncertainty of ``{ value, standard_uncertainty, unit }`` in SI."""
@@ -61,3 +64,32 @@ def example(key: str) -> str:
         "scale_factor": 'fog = { value = 1250.0, unit = "count/(deg/s)" }',
         "run": "tables [[run]], one for each file",
     }[key]
+
+
+def window_text(window: Window) -> str:
+    """Return a window as a manifest writes it, FROM:TO in seconds."""
+    return ":".join("" if end is None else f"{end:.12g}" for end in window)
+
+
+def overlap(one: Window, other: Window) -> bool:
+    """Return whether two windows have more than a bound in common; a window overlaps itself unless it is empty."""
+
+    def ends(window: Window) -> tuple[float, float]:
+        first, last = window
+        return (-math.inf if first is None else first), (math.inf if last is None else last)
+
+    (first, last), (begin, end) = ends(one), ends(other)
+    return first < end and begin < last
+
+
+def window_of(text: Any, place: str) -> Window | None:
+    """Return a window that a manifest writes as FROM:TO in seconds."""
+    if text is None:
+        return None
+    try:
+        first, last = (float(end) if end.strip() else None for end in str(text).split(":"))
+    except ValueError:
+        first = last = math.nan
+    if any(math.isnan(end) for end in (first, last) if end is not None) or not overlap((first, last), (first, last)):
+        raise ReadError(f'{place}: window {text!r}: expected FROM:TO in seconds, such as "100:1000", "100:" or ":900"')
+    return first, last

@@ -8,7 +8,15 @@ import numpy as np
 
 from imulab.calibration import Calibration
 from imulab.centrifuge.model import curve
-from imulab.centrifuge.tables import PER_G, budget_table, curve_table, level_table, parameters_table, run_table
+from imulab.centrifuge.tables import (
+    PER_G,
+    budget_table,
+    curve_table,
+    cycle_tables,
+    level_table,
+    parameters_table,
+    run_table,
+)
 from imulab.estimate import coverage_factor
 from imulab.exhibit import BAD, GOOD, INK, QUIET, Exhibits, Figure, Table, format_uncertain
 from imulab.recording import Array
@@ -35,6 +43,7 @@ def exhibits(record: Calibration) -> Exhibits:
     items += [_repeatability(record, sets), *_spectra(record)]
     items += [
         level_table(record, sets),
+        *cycle_tables(record),
         curve_table(record, sets),
         budget_table(record),
         parameters_table(record),
@@ -72,7 +81,7 @@ def _headline(record: Calibration, prefix: str) -> str:
     zeta = record.parameters[f"{prefix}zeta_{last}"]
     measured = _change(zeta.value, zeta.standard_uncertainty)
     curved = _curve_change(record, prefix, _force(record, last))
-    if not curved:
+    if record.model["curve"][prefix.rstrip("_")] == "constant":
         return (
             f"{_label(prefix)} drifts linearly with g, by {_per_g(record, f'{prefix}K0')} from {first} to {top}; the "
             f"factor at {top} is {measured} than that at {first}."

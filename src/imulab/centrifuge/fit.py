@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imulab.calibration import Calibration
+from imulab.centrifuge.budget import error_budget
+from imulab.centrifuge.corrections import corrected, find_corrections
 from imulab.centrifuge.curve import MODELS
 from imulab.centrifuge.levels import Levels, level_numbers, pool_levels
 from imulab.centrifuge.manifest import Manifest, Run
@@ -94,7 +96,10 @@ def fit_centrifuge(
         if progress is not None:
             progress(done)
     _same_channels(statics, runs, manifest)
-    levels = pool_levels(runs, manifest, method)
+    levels = before = pool_levels(runs, manifest, method)
+    found = find_corrections(runs, before.lines, correct=method == "least-squares")
+    if found.common:
+        levels = pool_levels(corrected(runs, found), manifest, method)
     estimates = estimate(levels, manifest, method=method, curve=curve)
     record = make_record(
         manifest=manifest,
@@ -102,6 +107,8 @@ def fit_centrifuge(
         runs=runs,
         levels=levels,
         estimates=estimates,
+        budget=error_budget(runs, before.lines, manifest, found.corrected),
+        found=found.warnings,
         options={"method": method, "curve": curve},
         sources=sources() if sources is not None else (),
         temperature=float(np.mean(seen.temperatures)) if seen.temperatures else None,

@@ -14,11 +14,13 @@ import numpy as np
 
 from imulab.centrifuge.manifest import SAME_LEVEL, Manifest
 from imulab.centrifuge.model import fog_share, real_covariance
+from imulab.centrifuge.rates import three_sigma
 from imulab.centrifuge.regress import Complex
 from imulab.centrifuge.repeat import Deviations, Repeatability, find_repeatability
 from imulab.centrifuge.run import LoadedRun
 from imulab.errors import DataError
 from imulab.recording import Array
+from imulab.verdict import Note
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class RunLine:
         The same from the arm rate's uncertainty.
     freedom
         Of the noise.
+    common
+        What a standard uncertainty of each correction does to (Re, Im) of each axis, shape (c, 2p).
     """
 
     source: LoadedRun
@@ -42,6 +46,7 @@ class RunLine:
     noise: Array
     rate: Array
     freedom: float
+    common: Array
 
     @property
     def vector(self) -> Array:
@@ -71,6 +76,9 @@ class Level:
         Numbers of its runs, counted from 0.
     directed
         Whether the lines are complex.
+    common
+        What a standard uncertainty of each correction does to (Re, Im) of each axis, alike in sign at all levels,
+        shape (c, 2p).
     """
 
     number: int
@@ -83,6 +91,7 @@ class Level:
     freedom: Array
     runs: tuple[int, ...]
     directed: bool
+    common: Array
 
 
 @dataclass(frozen=True)
@@ -112,6 +121,8 @@ def as_vector(line: Complex) -> Array:
 def axis_lines(run: LoadedRun, method: str) -> tuple[Complex, Complex]:
     """Return the lines of X - FOG and Y - i FOG, rad/s, and their covariance ``E[z z*]``, by one method."""
     share = fog_share(len(run.channels) - 1)
+    if run.fog_factor is not None:
+        share[:, -1] *= run.fog_factor
     if method == "fourier":
         assert run.whole_periods is not None
         line = share @ run.whole_periods.line
@@ -172,28 +183,34 @@ def pool_levels(runs: Sequence[LoadedRun], manifest: Manifest, method: str) -> L
     members = [[lines[run.index] for run in groups[key]] for key in keys]
     repeatability = find_repeatability(_deviations(members))
     items = [
-        _pooled(key[1], key[0], group, repeatability, all(line.source.encoder for line in group))
+        pooled(key[1], key[0], group, repeatability, all(line.source.encoder for line in group))
         for key, group in zip(keys, members, strict=True)
     ]
     return Levels(tuple(items), lines, repeatability, (*warnings, *_scatter_warnings(repeatability)))
 
 
 def _scatter_warnings(found: Repeatability) -> list[str]:
-    warnings = []
+    warnings: list[str] = []
     if found.cycle:
         warnings.append(
-            f"K differs between power cycles by {100 * np.sqrt(found.cycle):.2g} % (one standard deviation) beyond the "
-            "noise, at all levels alike: added to every K and the curve; zeta hardly knows of it"
+            Note(
+                f"K differs between power cycles by {100 * np.sqrt(found.cycle):.2g} % (one standard deviation) beyond "
+                "the noise, at all levels alike: added to every K and the curve; zeta hardly knows of it"
+            )
         )
     if found.turn:
         warnings.append(
-            f"the direction of the drift differs between power cycles by {np.degrees(np.sqrt(found.turn)):.2g} deg "
-            "(one standard deviation) beyond the noise: added to its uncertainty"
+            Note(
+                f"the direction of the drift differs between power cycles by {np.degrees(np.sqrt(found.turn)):.2g} deg "
+                "(one standard deviation) beyond the noise: added to its uncertainty"
+            )
         )
     if found.run:
         warnings.append(
-            f"K differs between runs of a power cycle by {100 * np.sqrt(found.run):.2g} % (one standard deviation) "
-            "beyond the noise: added to each run's uncertainty"
+            Note(
+                f"K differs between runs of a power cycle by {100 * np.sqrt(found.run):.2g} % (one standard deviation) "
+                "beyond the noise: added to each run's uncertainty"
+            )
         )
     return warnings
 
@@ -201,18 +218,36 @@ def _scatter_warnings(found: Repeatability) -> list[str]:
 def _run_line(run: LoadedRun, manifest: Manifest, method: str, directed: bool) -> RunLine:
     line, covariance = axis_lines(run, method)
     line, covariance = line / run.force, covariance / run.force**2
+    common = np.zeros((0, len(line)), dtype=np.complex128) if run.common is None else run.common / run.force
     if not directed:
         size = np.maximum(np.abs(line), 1e-300)
         unit = line.conj() / size
         covariance = covariance * np.outer(unit, unit.conj())
+        common = (common * unit).real.astype(np.complex128)
         if method == "least-squares":
             size = size - np.diagonal(covariance).real / 4 / size
         line = size.astype(np.complex128)
     vector = as_vector(line)
-    relative = 2 * manifest.rate_uncertainty / run.run.arm_rate
+    off, u = arm_rate_off(run)
+    found = abs(off) if abs(off) > three_sigma(run.rates.net_freedom) * u else 0.0
+    relative = 2 * float(np.hypot(manifest.rate_uncertainty, found)) / run.run.arm_rate
     lost = amplitude_lost(run, manifest, method)
     rate = (relative**2 + lost**2) * np.outer(vector, vector)
-    return RunLine(run, line, real_covariance(covariance), rate, run.freedom)
+    return RunLine(
+        run, line, real_covariance(covariance), rate, run.freedom, np.array([as_vector(row) for row in common])
+    )
+
+
+def arm_rate_off(run: LoadedRun) -> tuple[float, float]:
+    """Return how far the arm rate, table rate plus net rate as measured, is from the manifest's, and u; rad/s.
+
+    Both are zero where a rate was not measured.
+    """
+    rates = run.rates
+    if rates.net_rate is None or rates.origin == "manifest":
+        return 0.0, 0.0
+    u = float(np.hypot(rates.net_uncertainty or 0.0, rates.table_uncertainty or 0.0))
+    return run.run.sense * (rates.table_rate + rates.net_rate) - run.run.arm_rate, u
 
 
 def amplitude_lost(run: LoadedRun, manifest: Manifest, method: str) -> float:
@@ -250,7 +285,8 @@ def _radial(line: RunLine, axis: int, excess: float, *, rates: bool = True) -> f
     return noise + float(np.trace(line.rate[pair, pair])) + excess * float(abs(line.line[axis])) ** 2
 
 
-def _pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatability, directed: bool) -> Level:
+def pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatability, directed: bool) -> Level:
+    """Return the level that runs at one specific force make, their scatter beyond the noise given."""
     axes = len(group[0].line)
     weights = np.array([_weights(group, axis, found.run + found.cycle) for axis in range(axes)])
     line = np.einsum("ar,ra->a", weights, np.array([member.line for member in group]))
@@ -275,6 +311,7 @@ def _pooled(number: int, spin_axis: str, group: list[RunLine], found: Repeatabil
         number, spin_axis, float(np.mean([m.source.force for m in group])), line, covariance,
         {int(cycle): weights[:, cycles == cycle].sum(axis=1) for cycle in np.unique(cycles)}, component,
         np.minimum(dof, 1e9), tuple(m.source.index for m in group), directed,
+        np.einsum("ar,rca->ca", spread, np.array([member.common.reshape(-1, 2 * axes) for member in group])),
     )  # fmt: skip
 
 

@@ -12,7 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from imulab.centrifuge.entries import check_keys, example, number_of, quantity_of, unit_of
+from imulab.centrifuge.entries import (
+    Window,
+    check_keys,
+    example,
+    number_of,
+    overlap,
+    quantity_of,
+    unit_of,
+    window_of,
+    window_text,
+)
 from imulab.centrifuge.model import specific_force
 from imulab.errors import ReadError
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
@@ -25,13 +35,16 @@ SAME_LEVEL = 1e-3
 _SAME_RATE = 1e-3
 """Two lines closer than this part of the net rate cannot be told apart by any run."""
 _KEYS = ("radius", "gravity", "rates", "reference", "sensor", "scale_factor", "run")
-_RUN_KEYS = ("file", "power_cycle", "role", "arm_rate", "table_rate", "sense", "spin_axis")
+_RUN_KEYS = ("file", "power_cycle", "role", "arm_rate", "table_rate", "sense", "spin_axis", "window")
 _REFERENCE = {"value": 1.0, "unit": "g"}
 
 
 @dataclass(frozen=True)
 class Run:
-    """One recording of the test; rates are magnitudes, rad/s (0 for a static run), `sense` 1 or -1."""
+    """One recording of the test; rates are magnitudes, rad/s (0 for a static run), `sense` 1 or -1.
+
+    `window` is the part of the file that is this run, from and to, s, either None for no bound; None for all of it.
+    """
 
     file: str
     power_cycle: int
@@ -40,6 +53,12 @@ class Run:
     table_rate: float = 0.0
     sense: int = 1
     spin_axis: str = "up"
+    window: Window | None = None
+
+    @property
+    def label(self) -> str:
+        """File, and window where there is one."""
+        return self.file if self.window is None else f"{self.file} {window_text(self.window)}"
 
     @property
     def net_rate(self) -> float:
@@ -82,7 +101,7 @@ class Manifest:
 
     def place(self, index: int) -> str:
         """Return how messages name run `index`, counted from 0: manifest, number from 1, and file."""
-        return f"{self.name}: run {index + 1} ({self.runs[index].file})"
+        return f"{self.name}: run {index + 1} ({self.runs[index].label})"
 
     def force(self, run: Run) -> float:
         """Return the specific force of a run, m/s^2."""
@@ -157,16 +176,26 @@ def check_runs(manifest: Manifest) -> None:
     Raises
     ------
     ReadError
-        A file twice, no loaded run, a power cycle without static run, lines that coincide, no reference run.
+        A file twice without windows that lie apart, no loaded run, a power cycle without static run, lines that
+        coincide, no reference run.
     """
-    seen: dict[str, int] = {}
+    seen: dict[str, list[int]] = {}
     static = {run.power_cycle for run in manifest.runs if run.role == "static"}
     loaded = [run for run in manifest.runs if run.role == "loaded"]
     for index, run in enumerate(manifest.runs):
         place = manifest.place(index)
-        if run.file in seen:
-            raise ReadError(f"{place}: the same file as run {seen[run.file] + 1}; expected a file for each run")
-        seen[run.file] = index
+        for other in seen.setdefault(run.file, []):
+            if run.window is None or (window := manifest.runs[other].window) is None:
+                raise ReadError(
+                    f"{place}: the same file as run {other + 1}; expected a file for each run, or a window in each "
+                    'run of one file, such as window = "100:1000"'
+                )
+            if overlap(run.window, window):
+                raise ReadError(
+                    f"{place}: its window overlaps {window_text(window)} of run {other + 1}; expected windows that "
+                    "lie apart"
+                )
+        seen[run.file].append(index)
         if run.role != "loaded":
             continue
         if run.power_cycle not in static:
@@ -244,7 +273,7 @@ def _run(entry: Mapping[str, Any], place: str, rate_unit: str) -> Run:
                 "sense = -1)"
             )
         rates.append(to_si(value, rate_unit))
-    return Run(file, cycle, str(role), rates[0], rates[1], sense, str(spin_axis))
+    return Run(file, cycle, str(role), rates[0], rates[1], sense, str(spin_axis), window_of(entry.get("window"), place))
 
 
 def _sensor(table: Any, name: str) -> dict[str, str]:
@@ -359,6 +388,8 @@ def manifest_text(manifest: Manifest, comments: list[str] | None = None) -> str:
             lines.append(f"sense = {run.sense}")
         if run.spin_axis != "up":
             lines.append(f'spin_axis = "{run.spin_axis}"')
+        if run.window is not None:
+            lines.append(f'window = "{window_text(run.window)}"')
     return "\n".join(lines) + "\n"
 
 

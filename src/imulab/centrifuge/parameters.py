@@ -52,6 +52,8 @@ class Estimates:
         Prefix to the probability that the line's direction turns so much between levels by chance.
     cross
         Level to the complex cross term and half-sum of each axis, rad/s/(m/s^2)^2 and rad/s/(m/s^2).
+    given
+        Standard uncertainties if the chosen model of the curve is right, shape (p,).
     """
 
     names: tuple[str, ...]
@@ -64,6 +66,7 @@ class Estimates:
     curves: dict[str, CurveFit]
     turning: dict[str, float]
     cross: dict[int, tuple[np.ndarray, np.ndarray]]
+    given: Array
     warnings: tuple[str, ...] = field(default=())
 
 
@@ -95,6 +98,8 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
         V[index * width : (index + 1) * width, index * width : (index + 1) * width] = level.covariance
     common = _cycles(levels, size, width)
     V += common
+    corrections = np.concatenate([level.common for level in items], axis=1)
+    V += corrections.T @ corrections
     rows: list[_Row] = []
     curves: dict[str, CurveFit] = {}
     turning: dict[str, float] = {}
@@ -131,6 +136,9 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     values = np.array([row.value for row in rows])
     radius = np.array([row.radius for row in rows]) * manifest.radius_uncertainty / manifest.radius
     covariance = J @ V @ J.T + np.outer(radius, radius)
+    given = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    for prefix, chosen in curves.items():
+        _widen(covariance, [row.name for row in rows], prefix, chosen, J, V)
     freedom = _freedom(J, V, common, radius, levels, width)
     return Estimates(
         names=tuple(row.name for row in rows),
@@ -143,6 +151,7 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
         curves=curves,
         turning=turning,
         cross=cross,
+        given=given,
         warnings=tuple(warnings),
     )
 
@@ -173,12 +182,25 @@ def _curve(
     p, D = fitted.coefficients, fitted.from_levels @ G
     rows = [_Row(f"{prefix}K0", float(p[0]), CURVE_UNITS["K0"], D[0], -float(p[0]))]
     for power, term in ((1, "c1"), (2, "c2")):
-        if term in fitted.model:
+        if fitted.covariance[power, power] > 0:  # a term that was chosen away is 0, with an uncertainty
             value = float(p[power] / p[0])
             rows.append(
                 _Row(f"{prefix}{term}", value, CURVE_UNITS[term], (D[power] - value * D[0]) / p[0], -power * value)
             )
     return fitted, rows
+
+
+def _widen(covariance: Array, names: list[str], prefix: str, fitted: CurveFit, J: Array, V: Array) -> None:
+    """Add to the curve's part of the covariance what the choice of its model leaves open."""
+    powers = {"K0": 0, "c1": 1, "c2": 2}
+    mine = [(names.index(f"{prefix}{term}"), power) for term, power in powers.items() if f"{prefix}{term}" in names]
+    place, power = (np.array(part) for part in zip(*mine, strict=True))
+    p = fitted.coefficients
+    turn = np.eye(3) / p[0]
+    turn[:, 0] = -p / p[0] ** 2
+    turn[0] = 1.0, 0.0, 0.0
+    stated = (turn @ fitted.covariance @ turn.T)[np.ix_(power, power)]
+    covariance[np.ix_(place, place)] += stated - J[place] @ V @ J[place].T
 
 
 def _direction(

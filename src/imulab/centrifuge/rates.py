@@ -20,6 +20,7 @@ from imulab.centrifuge.spectra import (
     strongest_line,
 )
 from imulab.errors import DataError
+from imulab.estimate import coverage_factor
 from imulab.recording import Array
 from imulab.units import from_si, to_si
 
@@ -45,8 +46,8 @@ class Rates:
         ``encoder``, ``fog`` or ``manifest``.
     net_rate, net_uncertainty
         As measured; None where the FOG shows no line.
-    net_noise
-        Variance of a sample that the scatter of the net line stands for, shape (k, k).
+    net_noise, net_freedom
+        Variance of a sample that the scatter of the net line stands for, shape (k, k), and its degrees of freedom.
     warnings
         What a user should know.
     """
@@ -59,6 +60,7 @@ class Rates:
     net_uncertainty: float | None
     net_noise: Complex
     warnings: tuple[str, ...]
+    net_freedom: float = 1e9
 
 
 def find_rates(cells: Cells, place: str) -> Rates:
@@ -86,8 +88,8 @@ def find_rates(cells: Cells, place: str) -> Rates:
         table_shift = None
     shifts = [0.0, 0.0] if refined is None else [refined.table_shift, refined.net_shift]
     solution = solve(cells, *shifts)
-    table_noise = _noise(cells, solution, LINE)
-    net_noise = _noise(cells, solution, ROOM)
+    table_noise, _ = _noise(cells, solution, LINE)
+    net_noise, net_freedom = _noise(cells, solution, ROOM)
     origin, table_uncertainty = ("encoder", None) if encoder else ("fog", None)
     if not encoder and (table_shift is None or not _significant(solution, LINE, fog, table_noise)):
         origin, shifts[0] = "manifest", 0.0
@@ -112,24 +114,29 @@ def find_rates(cells: Cells, place: str) -> Rates:
         assert refined is not None
         net_rate = cells.net_rate + shifts[1]
         net_uncertainty = float(np.sqrt(refined.net_gain * net_noise[fog, fog].real))
-        warnings += _check_net(cells.net_rate, net_rate, net_uncertainty, place)
+        warnings += _check_net(cells.net_rate, net_rate, net_uncertainty * three_sigma(net_freedom), place)
         warnings += _check_units(solution, net_noise, place)
     solution = solve(cells, *shifts)
     rate = _encoder_rate(cells) if encoder else cells.table_rate + shifts[0]
     return Rates(
-        solution, rate, table_uncertainty, origin, net_rate, net_uncertainty, _noise(cells, solution, ROOM),
-            tuple(warnings)
+        solution, rate, table_uncertainty, origin, net_rate, net_uncertainty, _noise(cells, solution, ROOM)[0],
+        tuple(warnings), net_freedom,
     )  # fmt: skip
 
 
-def _check_net(expected: float, found: float, uncertainty: float, place: str) -> list[str]:
+def three_sigma(freedom: float | None) -> float:
+    """Return the factor of a standard uncertainty of so many degrees of freedom that is exceeded as seldom as 3."""
+    return coverage_factor(freedom, 0.9973)
+
+
+def _check_net(expected: float, found: float, reach: float, place: str) -> list[str]:
     off = abs(found - expected)
-    if off > max(MISMATCH, 3 * uncertainty):
+    if off > max(MISMATCH, reach):
         raise _mismatch(expected, found, place)
-    if off > max(_DOUBT, 3 * uncertainty):
+    if off > max(_DOUBT, reach):
         return [
-            f"{place}: the net rate measured on Earth rate is {in_degrees(found)} ± {in_degrees(uncertainty)}, "
-            f"{in_degrees(found - expected)} from arm_rate less table_rate"
+            f"{place}: the net rate measured on Earth rate is {in_degrees(found)} ± {in_degrees(reach / 3)}, "
+            f"{in_degrees(found - expected)} from arm_rate less table_rate: the difference is in u of this run's K"
         ]
     return []
 
@@ -171,11 +178,11 @@ def _check_units(solution: Solution, noise: Complex, place: str) -> list[str]:
     return warnings
 
 
-def _noise(cells: Cells, solution: Solution, row: int) -> Complex:
-    """Noise of a line by its scatter over blocks, or by the residuals where the run is too short for that."""
+def _noise(cells: Cells, solution: Solution, row: int) -> tuple[Complex, float]:
+    """Noise of a line by its scatter over blocks, or by the residuals where the run is too short, and its freedom."""
     least = 2 * np.pi / max(abs(cells.net_rate), 1e-9) if row == ROOM else 0.0
     found = scatter(cells, solution, row, least=min(least, cells.duration / 3))
-    return residual_noise(cells, solution) if found is None else found.noise
+    return (residual_noise(cells, solution), 1e9) if found is None else (found.noise, found.freedom)
 
 
 def residual_noise(cells: Cells, solution: Solution) -> Complex:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.centrifuge.budget import error_budget
+from imulab.centrifuge.cycles import power_cycles
+from imulab.centrifuge.entries import window_text
 from imulab.centrifuge.levels import Levels, RunLine, amplitude_lost, axis_lines
 from imulab.centrifuge.manifest import Manifest
 from imulab.centrifuge.model import real_covariance
@@ -29,14 +30,16 @@ def make_record(
     runs: Sequence[LoadedRun],
     levels: Levels,
     estimates: Estimates,
+    budget: Sequence[Mapping[str, Any]],
+    found: Sequence[str] = (),
     options: Mapping[str, Any],
     sources: Sequence[Source] = (),
     temperature: float | None = None,
 ) -> Calibration:
-    """Turn the estimates into the record."""
+    """Turn the estimates, the error budget and what it found into the record."""
     method = str(options["method"])
     sigma = np.sqrt(np.maximum(np.diagonal(estimates.covariance), 0.0))
-    found = levels.repeatability
+    repeated = levels.repeatability
     model: dict[str, Any] = {
         "equation": "drift = K(a) (a_x cos direction + a_y sin direction), K(a) = K0 (1 + c1 a + c2 a^2)",
         "radius": {"value": manifest.radius, "unit": "m", "from": "manifest"},
@@ -66,6 +69,11 @@ def make_record(
                     "chi_square": fitted.chi_square,
                     "degrees_of_freedom": fitted.freedom,
                     "probability": fitted.probability,
+                    "standard_uncertainty_given_model": {
+                        name.removeprefix(prefix): float(u)
+                        for name, u in zip(estimates.names, estimates.given, strict=True)
+                        if name in (f"{prefix}K0", f"{prefix}c1", f"{prefix}c2")
+                    },
                     "tried": [
                         {"model": name, "coefficients": count, "chi_square": chi_square, "chosen": chosen}
                         for name, count, chi_square, chosen in fitted.tried
@@ -75,19 +83,20 @@ def make_record(
             },
             "direction_probability": {prefix.rstrip("_"): p for prefix, p in estimates.turning.items()},
             "repeatability": {
-                "relative_standard_deviation": float(np.sqrt(found.cycle)),
-                "direction": _value(np.sqrt(found.turn), "rad"),
-                "within_power_cycle": float(np.sqrt(found.run)),
-                "chi_square": found.chi_square,
-                "degrees_of_freedom": found.freedom,
+                "relative_standard_deviation": float(np.sqrt(repeated.cycle)),
+                "direction": _value(np.sqrt(repeated.turn), "rad"),
+                "within_power_cycle": float(np.sqrt(repeated.run)),
+                "chi_square": repeated.chi_square,
+                "degrees_of_freedom": repeated.freedom,
             },
-            "error_budget": error_budget(runs, levels.lines, manifest),
+            "power_cycles": power_cycles(levels, method),
+            "error_budget": [dict(entry) for entry in budget],
         },
         options=dict(options),
         data={"spectra": _spectra(runs, levels), "statics": [_static(static) for static in statics]},
         sensor=dict(manifest.sensor),
         sources=tuple(sources),
-        warnings=_warnings(manifest, runs, levels, estimates, method),
+        warnings=(*found, *_warnings(manifest, runs, levels, estimates, method)),
         sections={"levels": _levels(levels, estimates), "runs": _runs(manifest, statics, runs, levels, method)},
     )
 
@@ -138,6 +147,7 @@ def _runs(
     for index, run in enumerate(manifest.runs):
         row: dict[str, Any] = {
             "file": run.file,
+            **({} if run.window is None else {"window": window_text(run.window)}),
             "power_cycle": run.power_cycle,
             "role": run.role,
             "sense": run.sense,
@@ -281,7 +291,8 @@ def _warnings(
     senses = {run.run.sense for run in runs}
     if len(senses) == 1 and len(runs) > 1:
         found.append(
-            "one sense of rotation only: differential flexure and scale mismatch are not separated from K(a)"
+            "one sense of rotation only: differential flexure, scale mismatch and a delay of the FOG within what the "
+            "error budget leaves open are not separated from K(a), and not in u; run both senses"
             + (
                 ""
                 if all(run.encoder for run in runs)

@@ -56,6 +56,10 @@ class LoadedRun:
         What the source's sums give, where they were asked for.
     spectrum
         Rates about the line, rad/s, (f,), and height of each channel and residual, rad/s, (2k - 1, f); or None.
+    fog_factor
+        Of the FOG's line as each axis saw it, shape (k - 1,); None where the test shows no difference.
+    common
+        What a standard uncertainty of each correction does to the axes' lines, rad/s, shape (c, k - 1); or None.
     """
 
     run: Run
@@ -79,6 +83,8 @@ class LoadedRun:
     whole_periods: PeriodResult | None
     spectrum: tuple[Array, Array] | None
     warnings: tuple[str, ...]
+    fog_factor: Complex | None = None
+    common: Complex | None = None
 
 
 def reduce_run(

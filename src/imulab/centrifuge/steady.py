@@ -122,7 +122,8 @@ def _unsteady_blocks(cells: Cells, place: str) -> tuple[int, int, list[str]] | N
     middle = np.median(found.deviation.real, axis=0) + 1j * np.median(found.deviation.imag, axis=0)
     deviation = np.abs(found.deviation - middle)
     sigma = np.median(deviation, axis=0) / 1.1774
-    bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size, axis=1)
+    # Below `FAINT` nothing is seen of a gyroscope: a simulated line without noise has no scatter to compare with.
+    bad: NDArray[np.bool_] = np.any(deviation > _STANDS_OUT * sigma + _UNSTEADY * size + FAINT, axis=1)
     count = len(bad)
     low = int(np.argmin(bad))
     high = count - int(np.argmin(bad[::-1]))

@@ -91,10 +91,39 @@ def curve_table(record: Calibration, sets: list[str]) -> Table:
         ]
     return Table(
         "Terms of the curve",
-        "Weighted fits to the K_i. A term is taken where it lowers chi-square by more than its 5 % point.",
+        "Weighted fits to the K_i. A term is taken where it lowers chi-square by more than its 5 % point; a term that "
+        "was not taken is 0, with the uncertainty of all these models together.",
         ["axis", "terms beside K0", "coefficients", "chi-square", ""],
         rows,
     )
+
+
+def cycle_tables(record: Calibration) -> list[Table]:
+    """Return zeta of each power cycle by itself, where there are several; older records do not hold it."""
+    cycles = record.fit.get("power_cycles", [])
+    if len(cycles) < 2:
+        return []
+    sets = [key for key in ("x", "y", "x_down", "y_down") if any(key in cycle for cycle in cycles)]
+    names = [name for name in dict.fromkeys(n for c in cycles for n in c.get(sets[0], {})) if "zeta" in name]
+    if not names:
+        return []
+    rows = []
+    for cycle in cycles:
+        for key in sets:
+            found = cycle.get(key, {})
+            cells = [
+                " ± ".join(format_uncertain(100 * z["value"], 100 * z["standard_uncertainty"])) if z else "–"
+                for z in (found.get(name) for name in names)
+            ]
+            rows.append([str(cycle["power_cycle"]), key.replace("_", " "), *cells])
+    return [
+        Table(
+            "zeta of each power cycle, %",
+            "Each K_i against K_1 of the same power cycle, ± its standard uncertainty.",
+            ["power cycle", "axis", *names],
+            rows,
+        )
+    ]
 
 
 def budget_table(record: Calibration) -> Table:
@@ -144,7 +173,7 @@ def run_table(record: Calibration) -> Table:
     columns += [*(f"{axis.upper()} drift ± u, deg/h" for axis in axes), "FOG line, deg/h"]
     rows = []
     for index, run in enumerate(runs):
-        row = [str(index + 1), run["file"]]
+        row = [str(index + 1), " ".join([run["file"], *([run["window"]] if "window" in run else [])])]
         row += [str(run["power_cycle"] if name == "cycle" else run["spin_axis"]) for name in said]
         if run["role"] == "static":
             rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])

@@ -35,12 +35,12 @@ def _centrifuge_fit(
             raise ReadError(f"{test.place(index)}: no such file")
 
     def sources() -> list[Source]:
-        named = [(manifest, manifest), *((run.file, names[run.file]) for run in test.runs)]
+        named = [(manifest, manifest), *names.items()]
         return [source for called, name in named if (source := source_of(access, name, called)) is not None]
 
     return fit_centrifuge(
         test,
-        lambda run: access.blocks(names[run.file], values["layout"]),
+        lambda run: access.blocks(names[run.file], values["layout"], window=run.window),
         method=values["method"],
         curve=values["curve"],
         sources=sources,
