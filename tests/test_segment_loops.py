@@ -132,19 +132,6 @@ def test_the_motion_of_a_hold_is_that_of_the_plain_form(length):
     np.testing.assert_allclose(sums, reference.motion(samples, length, found, number, centre), rtol=1e-11, atol=1e-11)
 
 
-def test_drift_is_the_slope_of_least_squares():
-    mean, _, _ = walk(4)
-    mean[:, 1] += 0.01 * np.arange(len(mean))
-    found = [(k, k + 2 + k % 9) for k in range(0, 380, 13)]
-    start, stop = np.array(found).T.astype(np.int64).copy()
-    slope, scatter = np.empty(3), np.empty(3)
-    spread = _segment.drift(mean, start, stop, slope, scatter)
-    expected = reference.drift(mean, found)
-    np.testing.assert_allclose(slope, expected[0], rtol=1e-10)
-    np.testing.assert_allclose(scatter, expected[1], rtol=1e-10)
-    assert spread == pytest.approx(sum(np.var(np.arange(a, b)) * (b - a) for a, b in found), rel=1e-13)
-
-
 def test_buffers_that_do_not_go_together_are_refused():
     three, many = np.zeros((4, 3)), np.zeros(40)
     index = np.zeros(4, dtype=np.int64)
@@ -171,8 +158,6 @@ def test_buffers_that_do_not_go_together_are_refused():
             many, many, many[:-1], 4, three, index, index + 1, index, three, *np.zeros((3, 4, 3, 3))
         ),
         lambda: _segment.motion(many, many, many, 4, three, index, index + 9, index, three, *np.zeros((3, 4, 3, 3))),
-        lambda: _segment.drift(three, index, index + 5, np.zeros(3), np.zeros(3)),
-        lambda: _segment.drift(three, index, index + 1, np.zeros(3), np.zeros(4)),
     )
     for call in calls:
         with pytest.raises(ValueError, match="do not go together"):

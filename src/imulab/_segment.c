@@ -1,5 +1,5 @@
 /* The inner loops of segment.py: blocks, windows, the stretches of a threshold, its attitudes, how well they agree, and
- * how they scatter and drift.
+ * how they scatter.
  *
  * What each is for stands there. A sweep of the threshold passes a few times over a few thousand blocks: as calls on
  * arrays of that size it took longer than as loops. The plain form is tests/reference/segment.py.
@@ -439,52 +439,6 @@ static PyObject *motion(PyObject *module, PyObject *args) {
     return done(v, BUFFERS, fits);
 }
 
-PyDoc_STRVAR(drift_doc,
-             "drift(block_mean, start, stop, slope, scatter) -> float\n\n"
-             "The slope (3), for each block, that stretches of blocks have in common, each about its own mean, and the mean\n"
-             "squared scatter about it (3); returns the sum of the squared distances from the middles of the stretches.");
-
-static PyObject *drift(PyObject *module, PyObject *args) {
-    enum { BLOCK, START, STOP, SLOPE, SCATTER, BUFFERS };
-    Py_buffer v[BUFFERS];
-    (void)module;
-    if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &v[BLOCK], &v[START], &v[STOP], &v[SLOPE], &v[SCATTER])) return NULL;
-    const Py_ssize_t n = v[START].len / INDEX, count = v[BLOCK].len / (AXES * ONE);
-    const int64_t *start = v[START].buf, *stop = v[STOP].buf;
-    int fits = v[STOP].len == v[START].len && v[SLOPE].len == AXES * ONE && v[SCATTER].len == AXES * ONE;
-    for (Py_ssize_t i = 0; i < n && fits; i++) fits = 0 <= start[i] && start[i] < stop[i] && stop[i] <= count;
-    double spread = 0.0, used = 0.0;
-    if (fits) {
-        const double *block = v[BLOCK].buf;
-        double *slope = v[SLOPE].buf, *scatter = v[SCATTER].buf, mean[AXES];
-        for (int axis = 0; axis < AXES; axis++) slope[axis] = scatter[axis] = 0.0;
-        for (int pass = 0; pass < 2; pass++) {
-            for (Py_ssize_t i = 0; i < n; i++) {
-                const double middle = (double)(start[i] + stop[i] - 1) / 2.0;
-                mean_of(block, start[i], stop[i], mean);
-                for (int64_t at = start[i]; at < stop[i]; at++) {
-                    const double time = (double)at - middle;
-                    if (pass == 0) spread += time * time;
-                    for (int axis = 0; axis < AXES; axis++) {
-                        const double deviation = block[AXES * at + axis] - mean[axis];
-                        if (pass == 0) slope[axis] += time * deviation;
-                        else scatter[axis] += (deviation - slope[axis] * time) * (deviation - slope[axis] * time);
-                    }
-                }
-                if (pass == 0) used += (double)(stop[i] - start[i]);
-            }
-            for (int axis = 0; axis < AXES; axis++) {
-                if (pass == 0) slope[axis] /= spread;
-                else scatter[axis] /= used;
-            }
-        }
-    }
-    PyObject *nothing = done(v, BUFFERS, fits);
-    if (nothing == NULL) return NULL;
-    Py_DECREF(nothing);
-    return PyFloat_FromDouble(spread);
-}
-
 static PyMethodDef methods[] = {{"blocks", blocks, METH_VARARGS, blocks_doc},
                                 {"windows", windows, METH_VARARGS, windows_doc},
                                 {"stretches", stretches, METH_VARARGS, stretches_doc},
@@ -492,7 +446,6 @@ static PyMethodDef methods[] = {{"blocks", blocks, METH_VARARGS, blocks_doc},
                                 {"ellipsoid_error", ellipsoid_error, METH_VARARGS, ellipsoid_error_doc},
                                 {"batches", batches, METH_VARARGS, batches_doc},
                                 {"motion", motion, METH_VARARGS, motion_doc},
-                                {"drift", drift, METH_VARARGS, drift_doc},
                                 {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef definition = {

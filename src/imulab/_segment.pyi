@@ -53,6 +53,3 @@ def motion(
     spread: NDArray[Any],
     slope: NDArray[Any],
 ) -> None: ...
-def drift(
-    block_mean: NDArray[Any], start: NDArray[Any], stop: NDArray[Any], slope: NDArray[Any], scatter: NDArray[Any]
-) -> float: ...

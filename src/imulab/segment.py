@@ -11,7 +11,6 @@ digital simulation, Management Science 24 (1978) 510.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +29,6 @@ _TREMOR_SECONDS = 0.125
 _SMALLEST_BLOCK = 4
 _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 """A step in time that is longer than both is a gap; no window reaches across it."""
-_CLEAR_DRIFT = 6.0
 _SLOW = 5.0
 _MUCH_LOST = 0.05
 _LONG_TABLE = 1000
@@ -180,7 +178,7 @@ def find_attitudes(
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
         motion=_motion(held, moments, freedom, share),
-        notes=_notes(blocks, variance) + _drift_notes(pieces, blocks, names, unit),
+        notes=_notes(blocks, variance),
     )
 
 
@@ -193,25 +191,6 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
         notes.append(f"about {rate:.3g} samples per second: is the unit of time right?")
     if lost > _MUCH_LOST:
         notes.append(f"gaps in time: {100 * lost:.0f} % of the windows reach across one and were not used")
-    return tuple(notes)
-
-
-def _drift_notes(pieces: _Pieces, blocks: _Blocks, names: list[str], unit: str) -> tuple[str, ...]:
-    """Drift of the zero, seen as a common slope within the attitudes at rest; no fit of attitudes alone shows it."""
-    slopes, scatters = np.empty(3), np.empty(3)
-    spread = _segment.drift(blocks.mean, pieces.start, pieces.stop, slopes, scatters)
-    notes = []
-    total = (int(pieces.stop[-1]) - int(pieces.start[0])) * blocks.duration
-    for name, slope, scatter in zip(names, slopes.tolist(), scatters.tolist(), strict=True):
-        error = math.sqrt(scatter / spread)
-        rate = slope / blocks.duration
-        if abs(slope) > _CLEAR_DRIFT * error and abs(rate) * total > _CLEAR_DRIFT * error * math.sqrt(
-            spread / len(pieces.start)
-        ):
-            notes.append(
-                f"{name} drifts at rest by {rate:+.3g} {unit}/s, {rate * total:+.3g} {unit} over the test: "
-                "its zero is not constant, and the uncertainties do not cover that"
-            )
     return tuple(notes)
 
 

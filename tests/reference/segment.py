@@ -100,14 +100,3 @@ def motion(samples: Array, length: int, found: list[tuple[int, int]], number: li
         for total, rows in zip(sums, (step, off, slope), strict=True):
             total[k] += rows.T @ rows
     return sums
-
-
-def drift(mean: Array, found: list[tuple[int, int]]) -> tuple[Array, Array]:
-    """Return the slope, and the variance about it, of lines through the blocks: a zero for each stretch, one slope."""
-    rows = [(k, at) for k, (start, stop) in enumerate(found) for at in range(start, stop)]
-    design = np.zeros((len(rows), len(found) + 1))
-    for i, (k, at) in enumerate(rows):
-        design[i, [k, -1]] = 1, at
-    blocks_used = mean[[at for _, at in rows]]
-    solution = np.linalg.lstsq(design, blocks_used, rcond=None)[0]
-    return solution[-1], ((blocks_used - design @ solution) ** 2).mean(axis=0)

@@ -18,6 +18,7 @@ from imulab.tumble.checks import check_prior
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, gravity_slope, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
+from imulab.tumble.patterns import direction_findings, time_findings
 from imulab.tumble.solve import Prior, Problem, Solution, data_freedom, forces
 from imulab.units import parse_unit
 
@@ -120,6 +121,7 @@ def make_record(
         warnings=(
             *_warnings(attitudes, gravity, problem, solution, observability),
             *_scatter_warnings(problem, solution, chi_square, freedom),
+            *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
             *_prior_warnings(prior, attitudes, beyond_noise(problem, chi_square, freedom)),
         ),
     )
@@ -330,6 +332,16 @@ def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, f
     return [
         "the attitudes scatter more than their own noise explains (reduced chi-square "
         f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}"
+    ]
+
+
+def _pattern_warnings(attitudes: Attitudes, problem: Problem, solution: Solution, *, order_chosen: bool) -> list[str]:
+    """Say what the residuals follow, unless a prior or an attitude that stands out bends them."""
+    if problem.prior is not None or _outliers(problem, solution) or (solution.down_weights < _DOWN_WEIGHTED).any():
+        return []
+    return [
+        *direction_findings(problem, solution, order_chosen=order_chosen),
+        *time_findings(attitudes, problem, solution),
     ]
 
 
