@@ -11,6 +11,7 @@ digital simulation, Management Science 24 (1978) 510.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np

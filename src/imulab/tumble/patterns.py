@@ -50,15 +50,19 @@ class Pattern:
 
 
 def find_pattern(columns: Array, solution: Solution) -> Pattern | None:
-    """Regress the residuals of a batch of one on `columns`, shape (n, k), beside the model; None if it cannot tell."""
-    n, k = columns.shape
+    """Regress the residuals of a batch of one on `columns`, shape (n, k), beside the model; None if it cannot tell.
+
+    Attitudes of weight 0 do not count.
+    """
+    used = solution.weights[0] > 0
+    n, k = int(used.sum()), columns.shape[1]
     size = solution.jacobian.shape[2]
     if n - size - k < _FEWEST:
         return None
-    root = np.sqrt(solution.weights[0])[:, None]
-    model = solution.jacobian[0] * root
+    root = np.sqrt(solution.weights[0, used])[:, None]
+    model = solution.jacobian[0, used] * root
     basis = np.linalg.qr(model / np.linalg.norm(model, axis=0))[0]
-    y, weighted = solution.residuals[0] * root[:, 0], columns * root
+    y, weighted = solution.residuals[0, used] * root[:, 0], columns[used] * root
     y, left = y - basis @ (basis.T @ y), weighted - basis @ (basis.T @ weighted)
     scale = np.linalg.norm(weighted, axis=0)
     u, values, vt = np.linalg.svd(left / scale, full_matrices=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -336,12 +336,15 @@ def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, f
 
 
 def _pattern_warnings(attitudes: Attitudes, problem: Problem, solution: Solution, *, order_chosen: bool) -> list[str]:
-    """Say what the residuals follow, unless a prior or an attitude that stands out bends them."""
-    if problem.prior is not None or _outliers(problem, solution) or (solution.down_weights < _DOWN_WEIGHTED).any():
+    """Say what the residuals follow, of the attitudes that do not stand out; with a prior they follow that too."""
+    if problem.prior is not None:
         return []
+    kept = np.where(solution.down_weights < _DOWN_WEIGHTED, 0.0, solution.down_weights)
+    kept[0, list(_outliers(problem, solution))] = 0.0
+    regular = replace(solution, down_weights=kept)
     return [
-        *direction_findings(problem, solution, order_chosen=order_chosen),
-        *time_findings(attitudes, problem, solution),
+        *direction_findings(problem, regular, order_chosen=order_chosen),
+        *time_findings(attitudes, problem, regular),
     ]
 
 
