@@ -9,6 +9,7 @@ from typing import Any
 from imulab.errors import OptionError, UnitError
 from imulab.units import parse_unit, to_si
 
+_BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
 
 
@@ -33,6 +34,21 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     if unit.quantity != kind:
         raise OptionError(expected)
     return to_si(float(match[1]), unit.symbol)
+
+
+def size(text: str, option: str) -> int:
+    """Return a text such as ``20GB`` or ``64 MiB`` as a number of bytes.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    match = _QUANTITY.fullmatch(text)
+    factor = _BYTES.get((match[2] or "B").strip()) if match else None
+    if match is None or factor is None or not 1 <= float(match[1]) * factor < 2**63:
+        raise OptionError(f"{option} {text!r}: expected a size such as 500MB, 20GB or 8GiB")
+    return int(float(match[1]) * factor)
 
 
 def whole_number(text: str, option: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Annotated, Any
 
 import typer
@@ -70,7 +71,30 @@ def command() -> Any:
         for name in path.split():
             found = found.commands[name]
         found.short_help = summary
+    _offer_unpack_limit(root)
     return root
+
+
+def _offer_unpack_limit(group: Any) -> None:
+    """Give every command that reads recordings the option ``--unpack-limit``, which none of them needs to know of."""
+    for command in group.commands.values():
+        if hasattr(command, "commands"):
+            _offer_unpack_limit(command)
+            continue
+        layout = next((parameter for parameter in command.params if parameter.name == "layout"), None)
+        if layout is not None:
+            option = copy(layout)
+            option.name, option.opts, option.metavar = "unpack_limit", ["--unpack-limit"], "SIZE"
+            option.help = "How much a compressed file may unpack to, such as 20GB."
+            option.callback, option.expose_value = _set_unpack_limit, False
+            command.params.append(option)
+
+
+def _set_unpack_limit(context: Any, parameter: Any, value: str | None) -> None:
+    from imulab.readers.unpacking import raise_limit
+    from imulab.texts import size
+
+    raise_limit(None if value is None else size(value, "--unpack-limit"))
 
 
 def _version(wanted: bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from imulab.errors import ReadError
 from imulab.readers.arrays import origins, recordings, sliced, to_floats
 from imulab.readers.formats import library
 from imulab.readers.layout import Layout
+from imulab.readers.unpacking import Budget
 from imulab.recording import Array, Recording
 
 _LISTED = 20
@@ -41,6 +43,8 @@ def _recordings(h5py: Any, file: Any, name: str, layout: Layout | None) -> Itera
         raise ReadError(
             f"{name}: say with --layout FILE.toml which dataset is which column; datasets found: {_list(h5py, file)}"
         )
+    budget = Budget(Path(file.filename), name)
+    counted: set[Any] = set()
     take: dict[str, Callable[[int, int], Array]] = {}
     lengths: dict[str, int] = {}
     for column, (variable, number) in origins(layout, name, "HDF5").items():
@@ -48,10 +52,25 @@ def _recordings(h5py: Any, file: Any, name: str, layout: Layout | None) -> Itera
         dataset, member = _dataset(h5py, file, variable)
         if dataset is None:
             raise ReadError(f"{where}, found {_list(h5py, file)}")
+        _check_storage(dataset, where)
+        if dataset.id not in counted and _unpacked(dataset) > dataset.id.get_storage_size():
+            budget.take(_unpacked(dataset))
+        counted.add(dataset.id)
         lengths[column], rows = sliced(dataset.shape or (), number, "MATLAB_class" in dataset.attrs, where)
         source = dataset if member is None else dataset.fields(member)
         take[column] = partial(_floats, rows, source, where)
     yield from recordings(take, lengths, layout, name)
+
+
+def _check_storage(dataset: Any, where: str) -> None:
+    if dataset.external or dataset.is_virtual:
+        raise ReadError(f"{where}: its numbers lie in other files; expected a file that holds its own data")
+
+
+def _unpacked(dataset: Any) -> int:
+    """Return the bytes that a dataset has in memory, or one of its chunks if that is more."""
+    chunk = prod(dataset.chunks) * dataset.dtype.itemsize if dataset.chunks else 0
+    return max(int(dataset.nbytes), chunk)
 
 
 def _floats(rows: Callable[[Any, int, int], Any], source: Any, where: str, start: int, stop: int) -> Array:
@@ -60,14 +79,26 @@ def _floats(rows: Callable[[Any, int, int], Any], source: Any, where: str, start
 
 def _dataset(h5py: Any, file: Any, variable: str) -> tuple[Any, str | None]:
     """Return a dataset, or a table's dataset and the name of its member."""
-    found = file.get(variable) if variable else None
+    found = _get(h5py, file, variable)
     if isinstance(found, h5py.Dataset):
         return found, None
     parent, _, member = variable.rpartition("/")
-    found = file.get(parent) if parent else None
+    found = _get(h5py, file, parent)
     if isinstance(found, h5py.Dataset) and found.dtype.names and member in found.dtype.names:
         return found, member
     return None, None
+
+
+def _get(h5py: Any, file: Any, path: str) -> Any:
+    """Return what lies at a path of this file, or None; links that lead into other files are not followed."""
+    found = file
+    for part in path.strip("/").split("/"):
+        if not part or not isinstance(found, h5py.Group):
+            return None
+        if isinstance(found.get(part, getlink=True), h5py.ExternalLink):
+            return None
+        found = found.get(part)
+    return found
 
 
 def _list(h5py: Any, file: Any) -> str:

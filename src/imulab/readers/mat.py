@@ -20,6 +20,7 @@ import numpy as np
 from imulab.errors import ReadError
 from imulab.readers.arrays import origins, recordings, sliced, to_floats
 from imulab.readers.layout import Layout
+from imulab.readers.unpacking import Budget, unpack
 from imulab.recording import Array, Recording
 
 _HEAD = 128
@@ -65,9 +66,10 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
     wanted = origins(layout, name, "MATLAB") if layout is not None else {}
     roots = {variable.partition("/")[0] for variable, _ in wanted.values()}
     try:
+        budget = Budget(path, name)
         with path.open("rb") as stream:
-            variables = {found.name: found for found in _variables(stream.read(), roots if layout else None)}
-    except (_DamagedError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
+            variables = {found.name: found for found in _variables(stream.read(), roots if layout else None, budget)}
+    except (_DamagedError, EOFError, zlib.error, struct.error, UnicodeDecodeError, ValueError, MemoryError) as error:
         raise ReadError(f"{name}: truncated or damaged, not a whole MATLAB file: {error}") from None
     if layout is None:
         names = [name for variable in variables.values() for name in variable.describe()]
@@ -107,7 +109,7 @@ def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarr
 # --- the format ----------------------------------------------------------------------------------------------------
 
 
-def _variables(data: bytes, wanted: set[str] | None) -> Iterator[_Variable]:
+def _variables(data: bytes, wanted: set[str] | None, budget: Budget) -> Iterator[_Variable]:
     """Yield the variables of a file, the numbers only of those that are wanted; all where that is None."""
     if len(data) < _HEAD:
         raise _DamagedError(f"the head has {len(data)} bytes, expected {_HEAD}")
@@ -119,13 +121,11 @@ def _variables(data: bytes, wanted: set[str] | None) -> Iterator[_Variable]:
         kind, size = struct.unpack_from(f"{order}II", data, at) if at + 8 <= len(data) else (0, len(data))
         if size > len(data) - at - 8:
             raise _DamagedError(f"no whole variable at byte {at}")
-        payload = data[at + 8 : at + 8 + size]
+        payload: bytes | memoryview = data[at + 8 : at + 8 + size]
         at += 8 + size
         if kind == _COMPRESSED:
-            unpacker = zlib.decompressobj()
-            payload = unpacker.decompress(payload)
-            if not unpacker.eof:
-                raise _DamagedError(f"the variable before byte {at} does not unpack to its end")
+            payload = unpack(zlib.decompressobj, payload, budget.left)
+            budget.take(len(payload))
             elements = list(_elements(payload, order))
             if len(elements) != 1:
                 raise _DamagedError(f"no single variable before byte {at}")
@@ -135,9 +135,9 @@ def _variables(data: bytes, wanted: set[str] | None) -> Iterator[_Variable]:
         yield _matrix(payload, order, wanted, 0)
 
 
-def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+def _elements(data: bytes | memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     """Yield type and payload of the elements within another; small ones have theirs in the tag."""
-    at = 0
+    view, at = memoryview(data), 0  # views: a variable may be as large as memory allows
     while at < len(data):
         if len(data) - at < 8:
             raise _DamagedError("an element is cut")
@@ -147,11 +147,11 @@ def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         kind, size = (kind & 0xFFFF, small) if small else (kind, size)
         if size > (4 if small else len(data) - start):
             raise _DamagedError(f"an element of {size} bytes in {len(data) - start}")
-        yield kind, data[start : start + size]
+        yield kind, view[start : start + size]
         at = at + 8 if small else start + size + (-size % 8)
 
 
-def _matrix(data: bytes, order: str, wanted: set[str] | None, depth: int) -> _Variable:
+def _matrix(data: bytes | memoryview, order: str, wanted: set[str] | None, depth: int) -> _Variable:
     """Take a matrix apart; `wanted` None: whatever its name."""
     if not data:
         return _Variable("", (0, 0), 0)  # an empty field
@@ -160,7 +160,7 @@ def _matrix(data: bytes, order: str, wanted: set[str] | None, depth: int) -> _Va
     shape = tuple(int(n) for n in np.frombuffer(_next(elements, (5,)), f"{order}i4"))
     if len(shape) < 2 or min(shape) < 0:
         raise _DamagedError(f"dimensions {shape}")
-    name = _next(elements, (1, 2)).decode("utf-8")
+    name = bytes(_next(elements, (1, 2))).decode("utf-8")
     kind = flags & 0xFF
     if wanted is not None and name not in wanted:
         return _Variable(name, shape, kind)
@@ -168,7 +168,7 @@ def _matrix(data: bytes, order: str, wanted: set[str] | None, depth: int) -> _Va
         return _Variable(name, shape, kind, fields=_fields(elements, order, depth))
     if not _FIRST_NUMBER <= kind <= _LAST_NUMBER or flags & _COMPLEX:
         return _Variable(name, shape, kind)
-    stored, payload = next(elements, (0, b""))
+    stored, payload = next(elements, (0, memoryview(b"")))
     if stored not in _STORED:
         raise _DamagedError(f"numbers of type {stored} in {name!r}")
     numbers = np.frombuffer(payload, order + _STORED[stored] if _STORED[stored][1] != "1" else _STORED[stored])
@@ -177,9 +177,9 @@ def _matrix(data: bytes, order: str, wanted: set[str] | None, depth: int) -> _Va
     return _Variable(name, shape, kind, numbers=numbers.reshape(shape, order="F"))
 
 
-def _fields(elements: Iterator[tuple[int, bytes]], order: str, depth: int) -> dict[str, _Variable]:
+def _fields(elements: Iterator[tuple[int, memoryview]], order: str, depth: int) -> dict[str, _Variable]:
     width = struct.unpack_from(f"{order}i", _next(elements, (5,)))[0]
-    names = _next(elements, (1, 2))
+    names = bytes(_next(elements, (1, 2)))
     if width < 1 or len(names) % width:
         raise _DamagedError(f"names of {width} in {len(names)} bytes")
     fields = {}
@@ -189,8 +189,8 @@ def _fields(elements: Iterator[tuple[int, bytes]], order: str, depth: int) -> di
     return fields
 
 
-def _next(elements: Iterator[tuple[int, bytes]], kinds: tuple[int, ...]) -> bytes:
-    kind, payload = next(elements, (0, b""))
+def _next(elements: Iterator[tuple[int, memoryview]], kinds: tuple[int, ...]) -> memoryview:
+    kind, payload = next(elements, (0, memoryview(b"")))
     if kind not in kinds:
         raise _DamagedError(f"an element of type {kind}, expected {kinds[0]}")
     return payload

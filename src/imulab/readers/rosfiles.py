@@ -13,12 +13,13 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers import logs
+from imulab.readers.unpacking import Budget, unpack
 
 BAG_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -26,6 +27,7 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 _BAG_LINE = b"#ROSBAG V2.0\n"
 _FOOTER = 29
 _LARGEST_CHUNK = 1 << 31
+_LARGEST_VALUE = 1 << 28
 _AT_ONCE = 1 << 13
 
 
@@ -102,6 +104,7 @@ class Bag:
     def messages(self, numbers: Iterable[int]) -> Iterator[logs.Records]:
         """Yield the messages of some connections, a chunk at a time."""
         wanted = [2 | number << 8 for number in numbers]
+        budget = Budget(self._path, self._name)
         with self._path.open("rb") as stream:
             stream.seek(self._start)
             while stream.tell() < self._end:
@@ -112,7 +115,9 @@ class Bag:
                     continue
                 where = f"the chunk at byte {place}"
                 method = fields.get(b"compression", b"?").decode("ascii", "replace")
-                chunk = _decompressed(stream.read(size), method, self._number(fields, b"size", 4), self._name, where)
+                chunk = _decompressed(
+                    stream.read(size), method, self._number(fields, b"size", 4), budget, self._name, where
+                )
                 records, position, _ = logs.walk_all(logs.ROSBAG, chunk)
                 if position != len(chunk):
                     raise ReadError(f"{self._name}: {where} is damaged")
@@ -228,17 +233,18 @@ class Mcap:
 
     def _blocks(self) -> Iterator[logs.Records]:
         ending: list[logs.Ending] = []
+        budget = Budget(self._path, self._name)
         with self._path.open("rb") as stream:
             for records in logs.walk_stream(stream, logs.MCAP, len(MCAP_MAGIC), self._end, ending):
                 for index in records.of(6).tolist():
-                    yield self._chunk(records.payload(index))
+                    yield self._chunk(records.payload(index), budget)
                 if not (records.keys == 6).all():
                     yield records
         (end,) = ending
         if end.left or end.position != self._end:
             raise ReadError(f"{self._name}: damaged: no whole record at byte {end.position}")
 
-    def _chunk(self, data: bytes) -> logs.Records:
+    def _chunk(self, data: bytes, budget: Budget) -> logs.Records:
         """Take a chunk apart: u64 first and last time, u64 size, u32 CRC, compression, u64 size of the records."""
         where = f"the chunk that begins at {int.from_bytes(data[:8], 'little')} ns"
         size, crc = int.from_bytes(data[16:24], "little"), int.from_bytes(data[24:28], "little")
@@ -246,7 +252,7 @@ class Mcap:
         method = data[32:at].decode("ascii", "replace")
         if at + 8 > len(data) or int.from_bytes(data[at : at + 8], "little") != len(data) - at - 8:
             raise ReadError(f"{self._name}: {where} is damaged")
-        chunk = _decompressed(data[at + 8 :], method or "none", size, self._name, where)
+        chunk = _decompressed(data[at + 8 :], method or "none", size, budget, self._name, where)
         if crc and zlib.crc32(chunk) != crc:
             raise ReadError(f"{self._name}: {where} is damaged (its CRC-32 does not match)")
         records, position, _ = logs.walk_all(logs.MCAP, chunk)
@@ -275,6 +281,7 @@ class Sqlite:
                     f"{name}: the bag was not closed: {beside.name} holds changes that are not in it yet; put them in "
                     f"with: sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
                 )
+        self._check_tables()
         rows = [row for rows in self._query("SELECT id, name, type, serialization_format FROM topics") for row in rows]
         if not all(isinstance(number, int) for number, *_ in rows):
             raise ReadError(f"{name}: damaged: a topic without a number")
@@ -292,9 +299,22 @@ class Sqlite:
             keys = np.array([number for number, _ in rows], dtype=np.int64)
             yield logs.Records(b"".join(data for _, data in rows), offsets, sizes, keys)
 
+    def _check_tables(self) -> None:
+        """Refuse a view or a computed column in the place of a table: what they give is bounded by no file's size."""
+        for table in ("topics", "messages"):
+            found = [
+                row
+                for rows in self._query(f"SELECT type, sql FROM sqlite_master WHERE name = '{table}'")
+                for row in rows
+            ]
+            computed = [row for rows in self._query(f"PRAGMA table_xinfo({table})") for row in rows if row[6]]
+            if [kind for kind, _ in found] != ["table"] or computed or "VIRTUAL" in str(found[0][1]).upper():
+                raise ReadError(f"{self._name}: not a ROS 2 bag, or damaged: expected a plain table {table}")
+
     def _query(self, text: str) -> Iterator[list[tuple[Any, ...]]]:
         try:
             connection = sqlite3.connect(f"{self._path.resolve().as_uri()}?immutable=1", uri=True)
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_VALUE)
             connection.text_factory = lambda data: data.decode("utf-8", "replace")
             try:
                 cursor = connection.execute(text)
@@ -350,36 +370,38 @@ def _kept(records: logs.Records, indices: logs.Integers) -> logs.Records:
     return logs.Records(records.block, records.offsets[indices], records.sizes[indices], records.keys[indices] >> 8)
 
 
-def _decompressed(data: bytes, method: str, size: int, name: str, where: str) -> bytes:
+def _decompressed(data: bytes, method: str, size: int, budget: Budget, name: str, where: str) -> bytes:
     if size > _LARGEST_CHUNK:
         raise ReadError(f"{name}: {where} is damaged: it says that it holds {size} bytes")
     if method == "none":
         chunk = data
     else:
-        decompress = _decompressor(method, name)
+        decoder = _decoder(method, name)
+        budget.take(size)
         try:
-            chunk = decompress(data)
+            chunk = unpack(decoder, data, size)
         except Exception as error:  # each library has errors of its own
             raise ReadError(f"{name}: {where} is damaged: {method} says {error}") from None
     if len(chunk) != size:
-        raise ReadError(f"{name}: {where} is damaged: expected {size} bytes, found {len(chunk)}")
+        found = len(chunk) if len(chunk) <= size else f"more than {size}"
+        raise ReadError(f"{name}: {where} is damaged: expected {size} bytes, found {found}")
     return chunk
 
 
-def _decompressor(method: str, name: str) -> Callable[[bytes], bytes]:
+def _decoder(method: str, name: str) -> Callable[[], Any]:
     if method == "bz2":
-        return bz2.decompress
+        return bz2.BZ2Decompressor
     try:
         if method == "lz4":
-            from lz4.frame import decompress as lz4
+            from lz4.frame import LZ4FrameDecompressor
 
-            return lambda data: bytes(lz4(data))
+            return cast("Callable[[], Any]", LZ4FrameDecompressor)
         if method == "zstd":
             try:
                 from compression import zstd  # type: ignore[import-not-found, unused-ignore]
             except ImportError:
                 from backports import zstd
-            return lambda data: bytes(zstd.decompress(data))
+            return cast("Callable[[], Any]", zstd.ZstdDecompressor)
     except ImportError:
         raise ReadError(f"{name}: compressed with {method}; reading it needs pip install 'imulab[ros]'") from None
     raise ReadError(f"{name}: compressed with {method!r}; expected none, bz2, lz4 or zstd")

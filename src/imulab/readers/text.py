@@ -257,7 +257,9 @@ class TextFile:
 
     def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
         for _ in range(layout.skip_lines):
-            line = self._line() or ""
+            line = self._line()
+            if line is None:
+                break
             if line.startswith("#"):
                 self._note(line)
         if layout.header:
@@ -305,7 +307,8 @@ class TextFile:
         """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
         if self._layout and self._layout.decimal == ",":
             block = block.replace(b",", b".")
-        capacity = block.count(b"\n") + 1
+        # A whole row has at least a sign for each of its fields; the first that has not is refused.
+        capacity = min(block.count(b"\n"), len(block) // len(self._slots) + 1) + 1
         room, first = self._place_for(capacity, len(block))
         job = partial(_text.parse, block, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
         return block, room[:, first : first + capacity], crew.begin(job) if len(block) >= _WORTH_SHARING else job
