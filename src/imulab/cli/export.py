@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.options import naming, whole_number
+from imulab.cli.options import naming, warn, whole_number
 from imulab.errors import OptionError
 
 _DEVICE_IDS = 2**32
@@ -18,7 +18,9 @@ def export(
     records: Annotated[list[str], typer.Argument(metavar="RECORD...", help="Calibration records of one unit.")],
     to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c blob px4 ardupilot kalibr openvins ros.")],
     output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
-    lossy: Annotated[bool, typer.Option("--lossy", help="Leave out what the target cannot hold.")] = False,
+    lossy: Annotated[
+        bool, typer.Option("--lossy", help="Leave out what the target cannot hold, and fit the rest anew.")
+    ] = False,
     device_id: Annotated[str, typer.Option("--device-id", metavar="N", help="PX4: number of the sensor.")] = "0",
     noise: Annotated[
         str | None, typer.Option("--noise", metavar="FILE", help="What 'allan --json' printed, for noise keys.")
@@ -39,7 +41,9 @@ def export(
         raise OptionError("-o '': expected a folder to write to")
     if Path(output).exists() and not Path(output).is_dir():
         raise OptionError(f"{output}: expected a folder to write to, found a file")
-    options = ExportOptions(lossy=lossy, device_id=number, noise=_noise(noise) if noise else {}, noise_file=noise or "")
+    options = ExportOptions(
+        lossy=lossy, device_id=number, noise=_noise(noise) if noise else {}, noise_file=noise or "", tell=warn
+    )
     loaded = [load(name) for name in records]
     if to in ("c", "blob"):
         for name, record in zip(records, loaded, strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +23,10 @@ EXPORTERS = {
 """Target to module; each has ``export(records, folder, options) -> list of the files written``."""
 
 
+def _nothing(message: str) -> None:
+    """Tell nobody."""
+
+
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
     """What the command line of ``export`` offers.
@@ -30,19 +34,22 @@ class ExportOptions:
     Attributes
     ----------
     lossy
-        Whether parameters that the target cannot hold may be left out.
+        Whether parameters that the target cannot hold may be left out; what it can hold is then fitted anew.
     device_id
         PX4's number of the sensor; 0 where it is not known.
     noise
         What ``allan --json`` found, for targets with noise keys.
     noise_file
         What messages call the file that it came from.
+    tell
+        Called with a sentence on each loss that was allowed.
     """
 
     lossy: bool = False
     device_id: int = 0
     noise: Mapping[str, Any] = field(default_factory=dict)
     noise_file: str = "the noise file"
+    tell: Callable[[str], object] = _nothing
 
 
 def export(

@@ -14,9 +14,9 @@ from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
     AXES,
-    accel_loss,
     accel_terms,
     gyro_terms,
+    held_accelerometers,
     one_unit,
     refuse_raw,
     settle_losses,
@@ -38,9 +38,11 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     """
     unit = one_unit(records, "ardupilot")
     refuse_raw(unit, "ardupilot")
-    accel, gyro = unit.accel, unit.gyro
-    scale = 1 / accel.scale
-    offset = accel.scale * accel.bias
+    gyro = unit.gyro
+    accel, error, how = held_accelerometers(
+        unit, lambda held: lambda output: (output - held.scale * held.bias) / held.scale, misalignment=False
+    )
+    scale, offset = 1 / accel.scale, accel.scale * accel.bias
     for axis, s, o in zip(AXES, scale, offset, strict=True):
         if not _SCALES[0] <= s <= _SCALES[1]:
             raise OptionError(
@@ -50,12 +52,12 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
             raise OptionError(
                 f"ardupilot: offset of axis {axis} is {o:.4g} m/s^2; ArduPilot takes at most {_LARGEST_OFFSET}"
             )
-    error = accel_loss(accel, lambda output: (output - offset) * scale)
     lost = settle_losses(
         "ardupilot",
-        (accel_terms(accel, misalignment=True), error),
+        (accel_terms(unit.accel, misalignment=True), error),
         gyro_terms(gyro, bias=False) if gyro is not None else ([], []),
-        lossy=options.lossy,
+        how=how,
+        options=options,
     )
     rows = [(f"INS_ACCOFFS_{a.upper()}", v) for a, v in zip(AXES, offset, strict=True)]
     rows += [(f"INS_ACCSCAL_{a.upper()}", v) for a, v in zip(AXES, scale, strict=True)]

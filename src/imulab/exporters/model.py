@@ -16,9 +16,12 @@ import numpy as np
 from imulab._version import VERSION
 from imulab.calibration import Calibration
 from imulab.errors import OptionError, RecordError
+from imulab.exhibit import plain_number
+from imulab.exporters import ExportOptions
 from imulab.files import write_text
 from imulab.printable import printable
 from imulab.recording import Array
+from imulab.refitting import linear_record
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
 AXES = "xyz"
@@ -188,6 +191,54 @@ def accel_loss(accel: Accelerometers, correct: Callable[[Array], Any]) -> float:
     return float(np.abs(correct(accel.output(force)) - force).max())
 
 
+def inverse_gain(held: Accelerometers) -> Callable[[Array], Array]:
+    """Return the correction of a target with a full matrix and a bias: ``(S T)^-1 (output - S b)``."""
+    inverse = np.linalg.inv(held.gain).T
+    return lambda output: (output - held.scale * held.bias) @ inverse
+
+
+def held_accelerometers(
+    unit: Unit, correction: Callable[[Accelerometers], Callable[[Array], Any]], *, misalignment: bool
+) -> tuple[Accelerometers, float, list[str]]:
+    """Return the linear model that a target should hold: the record's own, or one fitted anew where more is left out.
+
+    Parameters
+    ----------
+    unit
+        Whose record may have nonlinearity (and misalignment) that the target has not.
+    correction
+        From a linear model to what the target makes of outputs, shape (n, 3), with it.
+    misalignment
+        Whether the target holds misalignment.
+
+    Returns
+    -------
+    tuple
+        The model; the largest error, m/s^2, against the record's within +-1 g; and comments on how it was found.
+    """
+    accel = unit.accel
+    error = accel_loss(accel, correction(accel))
+    if error <= _NEGLIGIBLE * STANDARD_GRAVITY:
+        return accel, error, []
+    what = "bias, scale factor and misalignment" if misalignment else "bias and scale factor"
+    record = linear_record(unit.record, misalignment=misalignment)
+    if record is None:
+        return accel, error, [f"{what} are those of the whole model: the record holds no attitudes to fit them to anew"]
+    held = _accelerometers(record)
+    uncertain = {name: p.standard_uncertainty or 0.0 for name, p in record.parameters.items()}
+    bias = max(uncertain[f"bias_{axis}"] for axis in AXES)
+    scale = max(uncertain[f"scale_factor_{axis}"] / record.value(f"scale_factor_{axis}") for axis in AXES)
+    return (
+        held,
+        accel_loss(accel, correction(held)),
+        [
+            f"{what} were fitted anew to the record's {record.fit['attitudes']} attitudes, without what is left out: "
+            f"|f| - g there is {_in_g(record.fit['rms']['value'])} rms, {_in_g(unit.record.fit['rms']['value'])} by "
+            f"the whole model; standard uncertainties up to {_in_g(bias)} and {plain_number(1e6 * scale, 3)} ppm"
+        ],
+    )
+
+
 def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
     """Name the accelerometers' parameters that a target leaves out."""
     names = []
@@ -232,9 +283,10 @@ def settle_losses(
     accel: tuple[list[str], float],
     gyro: tuple[list[str], list[str]] = ([], []),
     *,
-    lossy: bool,
+    how: Sequence[str] = (),
+    options: ExportOptions,
 ) -> list[str]:
-    """Refuse what would be lost, or return the comment that says so.
+    """Refuse what would be lost, or return the comments that say so, and tell them.
 
     Parameters
     ----------
@@ -242,11 +294,15 @@ def settle_losses(
         Names of the accelerometers' parameters that are left out, and the largest error that this causes, m/s^2.
     gyro
         Names of the gyroscopes', and phrases for the errors.
+    how
+        Comments on what was done about it.
+    options
+        Whether anything may be lost, and who is told.
 
     Raises
     ------
     OptionError
-        Something that matters would be lost, and `lossy` was not asked for.
+        Something that matters would be lost, and that was not asked for.
     """
     names, costs = list(gyro[0]), list(gyro[1])
     if accel[0] and accel[1] > _NEGLIGIBLE * STANDARD_GRAVITY:
@@ -255,9 +311,12 @@ def settle_losses(
     if not costs:
         return []
     what = f"{' '.join(names)}, which changes outputs by {', '.join(costs)}"
-    if not lossy:
+    if not options.lossy:
         raise OptionError(f"{target} cannot hold {what}; add --lossy to leave it out")
-    return [f"left out (lossy): {what}"]
+    comments = [f"left out (lossy): {what}", *how]
+    for comment in comments:
+        options.tell(f"{target}: {comment}")
+    return comments
 
 
 def _in_g(error: float) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from imulab.calibration import Calibration
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import lower_times_rotation, one_unit, write_one, yaml_matrix
-from imulab.exporters.yamlimu import bias_lines, noise_lines, nonlinearity_lost, unit_lines
+from imulab.exporters.yamlimu import bias_lines, noise_lines, unit_lines, without_nonlinearity
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
@@ -24,9 +24,8 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     OptionError
         OpenVINS cannot hold the record, or the noise file is none.
     """
-    unit = one_unit(records, "openvins")
+    unit, lost = without_nonlinearity(one_unit(records, "openvins"), "openvins", options)
     accel, gyro = unit.accel, unit.gyro
-    lost = nonlinearity_lost(unit, np.linalg.inv(accel.gain), "openvins", options)
     rotation, lower, sensitivity = np.eye(3), np.eye(3), np.zeros((3, 3))
     if gyro is not None:
         lower, rotation = lower_times_rotation(gyro.gain)

@@ -16,9 +16,9 @@ from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
     AXES,
-    accel_loss,
     accel_terms,
     gyro_terms,
+    held_accelerometers,
     one_unit,
     refuse_raw,
     settle_losses,
@@ -41,20 +41,22 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     """
     unit = one_unit(records, "px4")
     refuse_raw(unit, "px4")
-    accel, gyro = unit.accel, unit.gyro
-    scale = 1 / accel.scale
-    offset = accel.scale * accel.bias
+    gyro = unit.gyro
+    accel, error, how = held_accelerometers(
+        unit, lambda held: lambda output: (output - held.scale * held.bias) / held.scale, misalignment=False
+    )
+    scale, offset = 1 / accel.scale, accel.scale * accel.bias
     for axis, value in zip(AXES, scale, strict=True):
         if not _SCALES[0] <= value <= _SCALES[1]:
             raise OptionError(f"px4: scale of axis {axis} is {value:.4g}; PX4 takes {_SCALES[0]} to {_SCALES[1]}")
     if options.device_id > _LARGEST_ID:
         raise OptionError(f"px4: device id {options.device_id}; expected at most {_LARGEST_ID}")
-    error = accel_loss(accel, lambda output: (output - offset) * scale)
     lost = settle_losses(
         "px4",
-        (accel_terms(accel, misalignment=True), error),
+        (accel_terms(unit.accel, misalignment=True), error),
         gyro_terms(gyro, bias=False) if gyro is not None else ([], []),
-        lossy=options.lossy,
+        how=how,
+        options=options,
     )
     rows = [("CAL_ACC0_ID", str(options.device_id), _INT32)]
     rows += [(f"CAL_ACC0_{a.upper()}OFF", single_precision(v), _FLOAT) for a, v in zip(AXES, offset, strict=True)]

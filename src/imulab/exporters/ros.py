@@ -12,7 +12,16 @@ import numpy as np
 
 from imulab.calibration import Calibration
 from imulab.exporters import ExportOptions
-from imulab.exporters.model import accel_loss, accel_terms, gyro_terms, one_unit, settle_losses, write_one, yaml_number
+from imulab.exporters.model import (
+    accel_terms,
+    gyro_terms,
+    held_accelerometers,
+    inverse_gain,
+    one_unit,
+    settle_losses,
+    write_one,
+    yaml_number,
+)
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
@@ -24,15 +33,16 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
         imu_calib cannot hold the record.
     """
     unit = one_unit(records, "ros")
-    accel, gyro = unit.accel, unit.gyro
+    gyro = unit.gyro
+    accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
     matrix = np.linalg.inv(accel.gain)
     bias = np.linalg.solve(accel.matrix, accel.bias)
-    error = accel_loss(accel, lambda output: output @ matrix.T - bias)
     lost = settle_losses(
         "ros",
-        (accel_terms(accel, misalignment=False), error),
+        (accel_terms(unit.accel, misalignment=False), error),
         gyro_terms(gyro, bias=True) if gyro is not None else ([], []),
-        lossy=options.lossy,
+        how=how,
+        options=options,
     )
     comments = [
         "ROS imu_calib, " + unit.origin[0],

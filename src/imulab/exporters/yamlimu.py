@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
-from imulab.exporters.model import AXES, Unit, accel_loss, accel_terms, settle_losses, yaml_number
+from imulab.exporters.model import (
+    AXES,
+    Unit,
+    accel_terms,
+    held_accelerometers,
+    inverse_gain,
+    settle_losses,
+    yaml_number,
+)
 
 _KEYS = {
     "accelerometer_noise_density": ("accel", "angle_random_walk", "m/s^2/sqrt(Hz)"),
@@ -96,8 +105,8 @@ def unit_lines(unit: Unit) -> list[str]:
     return lines
 
 
-def nonlinearity_lost(unit: Unit, inverse: Any, target: str, options: ExportOptions) -> list[str]:
-    """Refuse, or return the comment on, nonlinearity that a target with a full matrix and a bias leaves out."""
-    accel = unit.accel
-    error = accel_loss(accel, lambda output: (output - accel.scale * accel.bias) @ inverse.T)
-    return settle_losses(target, (accel_terms(accel, misalignment=False), error), lossy=options.lossy)
+def without_nonlinearity(unit: Unit, target: str, options: ExportOptions) -> tuple[Unit, list[str]]:
+    """Return the unit as a target with a full matrix and a bias holds it, and the comment on what is left out."""
+    accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
+    lost = settle_losses(target, (accel_terms(unit.accel, misalignment=False), error), how=how, options=options)
+    return replace(unit, accel=accel), lost
