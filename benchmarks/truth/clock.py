@@ -17,9 +17,9 @@ from imulab.tumble.gyrorecord import with_gyro
 from imulab.verdict import Note
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-from reference import turns
+from reference import moving_array, turns
 
-GYRO = "Gyroscopes of a tumble"
+GYRO, ARRAY = "Gyroscopes of a tumble", "Gyro array, calibration in motion"
 RATE = 100.0
 
 
@@ -82,6 +82,31 @@ def gyro(
     return Trial(tuple((np.abs(found - wanted) < half).tolist()), any(words in w for w in said), error)
 
 
+def array(seed: int, *, late: tuple[float, ...], axes: int = 1) -> Trial:
+    """Calibrate six elements at rest and in motion, and ask for their scale factors (three axes: matrices) and u."""
+    rng = np.random.default_rng(seed)
+    every = (*late, *([0.0] * (6 - len(late))))
+    sensing = np.eye(axes) + rng.normal(0, 0.01, (6, axes, axes))
+    time, noise = np.arange(0, 30, 1 / RATE), np.radians(0.05)
+    made = []
+    for still in (True, False):
+        data = moving_array.columns(moving_array.moving_array(rng, time, sensing, every, noise, still=still))
+        units = {"time": "s"} | dict.fromkeys(data, "rad/s")
+        made.append(il.Recording(columns={"time": time, **data}, units=units, name="array.csv"))
+    record = il.calibrate_array(*made).calibration
+    said = any("come later than" in w for w in record.warnings)
+    if axes == 3:  # the frame is the array's own: what can be compared is an element against the first
+        matrices = [np.linalg.inv(np.array(e["matrix"]["value"])) for e in record.sections["elements"]]
+        relative = np.array([m @ np.linalg.inv(matrices[0]) for m in matrices])
+        error = relative - sensing @ np.linalg.inv(sensing[0])
+        return Trial((), said, 1e6 * float(np.sqrt(np.mean(error[1:] ** 2))))
+    wanted = sensing[:, 0, 0] / sensing[:, 0, 0].mean()
+    found = [record.parameters[f"scale_factor_{i + 1}"] for i in range(6)]
+    error = np.array([p.value for p in found]) - wanted
+    half = student.ppf(0.975, 19) * np.array([p.standard_uncertainty for p in found])
+    return Trial(tuple((np.abs(error) < half).tolist()), said, 1e6 * float(np.sqrt(np.mean(error**2))))
+
+
 def row(name: str, **options: object) -> Scenario:
     """Return a scenario of the gyroscopes: settings of `Scenario` and arguments of `gyro`."""
     settings = {key: options.pop(key) for key in ("coverage", "warned", "false_alarms", "trials") if key in options}
@@ -108,4 +133,11 @@ SCENARIOS = [
     row("a range of 130 deg/s", limit=np.radians(130.0)),
     row("deg/s labelled rad/s", scale=57.29578, words="in deg/s?", coverage=None, warned=95.0, trials=20),
     row("time stamps of half the rate", fast=1.0, words="twice what", coverage=None, warned=95.0, trials=20),
+    Scenario(ARRAY, "no latency", partial(array, late=()), 100, false_alarms=5.0, unit="ppm"),
+    Scenario(ARRAY, "one element 10 ms late", partial(array, late=(0.01,)), 100, warned=95.0, largest_error=50,
+             unit="ppm"),
+    Scenario(ARRAY, "three late: 10, -20, 5 ms", partial(array, late=(0.01, -0.02, 0.005)), 100, warned=95.0,
+             largest_error=50, unit="ppm"),
+    Scenario(ARRAY, "the same, three axes", partial(array, late=(0.01, -0.02, 0.005), axes=3), 20, None, warned=95.0,
+             largest_error=100, unit="ppm"),
 ]  # fmt: skip

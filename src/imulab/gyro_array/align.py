@@ -32,15 +32,19 @@ class Alignment:
         Rms of what the consensus leaves of each element, rad/s, shape (n, axes).
     gauge
         The convention that fixes the frame.
+    latency, latency_uncertainty
+        By how much each element's readings come later than the median's (than the truth), s, shape (n,), or None.
     """
 
     sensing: Array
     standard_uncertainty: Array
     residual: Array
     gauge: str
+    latency: Array | None = None
+    latency_uncertainty: Array | None = None
 
 
-def align(readings: Array, white: Array, truth: Array | None = None) -> Alignment:
+def align(readings: Array, white: Array, truth: Array | None = None, *, strict: bool = True) -> Alignment:
     """Estimate what each element senses of the array's rate.
 
     Without `truth`, element 1 in its nominal orientation gives the directions and the mean over all elements of
@@ -55,6 +59,8 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
         Standard deviation of a sample at rest, shape (axes, n).
     truth
         True rate, shape (m, axes), or None.
+    strict
+        Whether to refuse what is not fixed to 5 %.
 
     Raises
     ------
@@ -76,7 +82,7 @@ def align(readings: Array, white: Array, truth: Array | None = None) -> Alignmen
     uncertainty = np.sqrt((blocks - 1) / blocks * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     size = n * axes
     weakest = np.linalg.eigvalsh(total[:size, :size] / np.outer(sigma, sigma))[-axes] / m
-    if not np.isfinite(uncertainty).all() or uncertainty.max() > _WORST or weakest < _VISIBLE:
+    if strict and (not np.isfinite(uncertainty).all() or uncertainty.max() > _WORST or weakest < _VISIBLE):
         # Its own first element is nearest to the frame: the axis about which it moves least against its noise.
         worst = int(np.argmin(readings[:, :, 0].std(axis=0) / white[:, 0]))
         axis = f" about {'xyz'[worst]}" if axes == 3 else ""

@@ -12,11 +12,12 @@ from imulab.allan import ColumnNoise, column_noise, noise_lines
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.coefficients import COEFFICIENTS, coefficients_dict
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
-from imulab.gyro_array.align import Alignment, align
+from imulab.gyro_array.align import Alignment
 from imulab.gyro_array.clocks import on_one_clock
+from imulab.gyro_array.latency import align_in_time, latency_notes
 from imulab.gyro_array.model import Elements, find_elements, fixed_weights
 from imulab.noise import AllanCurve
-from imulab.recording import Array, Recording, check_finite
+from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.sampling import sampling_rate
 from imulab.units import parse_unit, to_si
 
@@ -155,9 +156,12 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
     if len(kept) < _FEWEST_SAMPLES:
         raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
     try:
-        return align(kept, rest.white, truth), notes
+        time = check_time(moving) if "time" in moving else np.arange(len(moving)) / rest.rate
+        found = align_in_time(time[~clipped], kept, rest.white, truth)
     except ObservabilityError as error:
         raise ObservabilityError(f"{moving.name}: {error}") from None
+    names = its.names[0] if len(its.axes) == 1 else [f"element {i + 1}" for i in range(its.count)]
+    return found, [*notes, *(f"{moving.name}: {line}" for line in latency_notes(found, names))]
 
 
 def _clipped(readings: Array) -> np.ndarray:
@@ -246,6 +250,8 @@ def _record(
             else:
                 entry["matrix"] = _with_unit(inverse.tolist(), carried.tolist(), "1")
             entry["residual"] = {"value": scalar(aligned.residual[i]), "unit": "rad/s"}
+            if aligned.latency is not None and aligned.latency_uncertainty is not None:
+                entry["latency"] = _with_unit(float(aligned.latency[i]), float(aligned.latency_uncertainty[i]), "s")
         dicts = [coefficients_dict(rest.noise[a][i].coefficients, "rad/s") for a in range(axes)]
         for name in COEFFICIENTS:
             entry[name] = dicts[0][name] if one else _over_axes([found[name] for found in dicts])
