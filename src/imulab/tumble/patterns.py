@@ -21,8 +21,8 @@ from imulab.recording import Array
 from imulab.tumble.model import AXES
 from imulab.tumble.solve import Problem, Solution, forces
 
-FALSE_ALARM = 0.02
-"""Share of tests without any pattern in which one is named: 2 % for direction, 2 % for time."""
+FALSE_ALARM = 0.01
+"""Share of tests without any pattern in which one is named: 1 % for direction, 1 % for time."""
 _FEWEST = 4  # degrees of freedom that must be left beside a pattern
 _TOLD_APART = 0.02  # share of a column that the model must leave of it
 _TINY = 1e-7  # g: patterns below 0.1 µg are rounding
