@@ -51,7 +51,8 @@ def noise_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     def none(residuals: Array, variance: Array, spare: Array) -> tuple[Array, Array]:
         return np.zeros(len(residuals)), np.full(len(residuals), np.inf)
 
-    monkeypatch.setattr("imulab.tumble.solve.plausible_excess", none)
+    for room in ("solve", "prior"):
+        monkeypatch.setattr(f"imulab.tumble.{room}.plausible_excess", none)
 
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -32,7 +32,7 @@ def truth():
 def test_residuals_of_a_check_are_those_of_the_transcribed_inverse(truth):
     record, _ = fitted(truth, 1)
     _, fresh = fitted(truth, 1, seed=5)
-    found = check_tumble(record, fresh, limit=1.0).residuals
+    found = check_tumble(record, fresh).residuals
     values = {name: p.value for name, p in record.parameters.items()}
     np.testing.assert_allclose(found, reference.residual(fresh.mean, values, 1, G), atol=1e-12)
 
@@ -42,8 +42,10 @@ def test_a_check_passes_until_something_changed(truth):
     _, fresh = fitted(truth, 1, seed=6)
     assert check_tumble(record, fresh, limit=5e-3).passed
     _, shifted = fitted(truth | {"bias_x": truth["bias_x"] + 0.05}, 1, seed=6)
-    check = check_tumble(record, shifted, limit=5e-3)
+    check = check_tumble(record, shifted)
     assert not check.passed
+    assert check.probability < 1e-6
+    assert not check_tumble(record, fresh, limit=1e-4).passed
     assert abs(check.residuals[check.worst]) == np.abs(check.residuals).max() > 0.03
 
 
@@ -51,6 +53,92 @@ def test_a_check_elsewhere_uses_the_gravity_of_that_place(truth):
     record, _ = fitted(truth, 1)
     _, fresh = fitted(truth, 1, seed=6)
     assert check_tumble(record, fresh, limit=1.0, gravity=G + 0.02).residuals.mean() == pytest.approx(-0.02, abs=1e-3)
+
+
+G_KNOWN, RECORD_NOISE, NOISE = 24, 20e-6 * G, 60e-6 * G
+
+
+def alarms(change, count, trials, stated=True, record_stated=True):
+    """Share of trials in which attitudes of a unit that has changed fail."""
+    found = []
+    for seed in range(trials):
+        rng = np.random.default_rng([seed, count])
+        truth = reference.random_truth(rng, 1)
+        record, _ = fitted(truth, 1, 3 * seed, RECORD_NOISE, RECORD_NOISE if record_stated else None, count=G_KNOWN)
+        noise = NOISE if record_stated else RECORD_NOISE
+        new = truth | {name: truth[name] + size * rng.choice([-1, 1]) for name, size in change.items()}
+        ups = reference.random_attitudes(rng, count)
+        data = np.array([reference.forward(G * u, new, 1) for u in ups]) + noise * rng.standard_normal((count, 3))
+        found.append(
+            not check_tumble(record, il.find_attitudes(table(data, "m/s^2", noise if stated else None))).passed
+        )
+    return float(np.mean(found))
+
+
+@pytest.mark.parametrize(
+    ("count", "stated", "record_stated"), [(4, True, True), (12, True, True), (12, False, False), (24, True, True)]
+)
+def test_a_record_that_holds_fails_once_in_twenty(count, stated, record_stated):
+    share = alarms({}, count, 200, stated, record_stated)
+    low, high = stats.binom.ppf([0.001, 0.999], 200, 0.05) / 200
+    assert low <= share <= high
+
+
+@pytest.mark.parametrize(("count", "least"), [(4, 0.70), (12, 0.97)])
+def test_a_tenth_of_a_milligram_is_found(count, least):
+    """All three biases moved by 100 µg, the noise 60 µg in an attitude; the figures are the method's."""
+    share = alarms({f"bias_{axis}": 1e-4 * G for axis in "xyz"}, count, 100)
+    assert share >= stats.binom.ppf(0.001, 100, least) / 100
+
+
+def test_a_check_without_noise_takes_that_of_the_record_and_says_so(truth):
+    record, _ = fitted(truth, 1, seed=1, stated=1e-3)
+    _, fresh = fitted(truth, 1, seed=2)
+    check = check_tumble(record, fresh)
+    assert check.passed
+    assert any("nothing is known of the noise of these attitudes: the 1e+02 µg" in note for note in check.notes)
+
+
+def test_disturbed_holds_are_no_change_of_the_unit(truth):
+    """Attitudes that scatter ten times more than they say fail by that alone once in twenty."""
+    failed = 0
+    for seed in range(60):
+        record, _ = fitted(truth, 1, seed=2 * seed, sigma=1e-4, stated=1e-4)
+        _, fresh = fitted(truth, 1, seed=2 * seed + 1, sigma=1e-3, stated=1e-4)
+        check = check_tumble(record, fresh)
+        failed += not check.passed
+        assert any("scatter by" in note for note in check.notes)
+    assert failed <= stats.binom.ppf(0.999, 60, 0.1)
+
+
+def test_a_record_without_uncertainties_needs_a_limit(imulab, tmp_path, truth):
+    bare, attitudes = fitted(truth, 1, count=9)
+    with pytest.raises(RecordError, match="states no uncertainties to test against; expected a fixed limit"):
+        check_tumble(bare, attitudes)
+    assert check_tumble(bare, attitudes, limit=1.0).probability is None
+    assert check_tumble(bare, attitudes, limit=1.0).passed
+
+
+def test_gravity_of_another_place_is_part_of_the_test(truth):
+    """A record made under a gravity off by 1 mg: found where that is not known, and where it is known, not."""
+    rng = np.random.default_rng(5)
+    data = np.array([reference.forward((G + 0.01) * u, truth, 1) for u in reference.random_attitudes(rng, 60)])
+    attitudes = il.find_attitudes(table(data + 1e-3 * rng.standard_normal(data.shape), "m/s^2", 1e-3))
+    first, second = attitudes_of_half(attitudes, slice(0, 30)), attitudes_of_half(attitudes, slice(30, 60))
+    for stated, here, passes in (
+        (f"{G}+-0", G + 0.01, False),
+        (f"{G}+-0.01", G + 0.01, True),
+        (f"{G}+-0", f"{G + 0.01}+-0.01", True),
+        (f"{G}+-0.01", f"{G}+-0.01", True),
+        (f"{G}+-0.01", None, True),
+    ):
+        record = il.fit_tumble(first, order=1, gravity=stated).calibration
+        assert check_tumble(record, second, gravity=here).passed == passes, (stated, here)
+
+
+def attitudes_of_half(attitudes, rows):
+    columns = {n: v[rows] for n, v in attitudes.recording.columns.items()}
+    return il.find_attitudes(il.Recording(columns, attitudes.recording.units, name="half.csv"))
 
 
 def test_a_check_needs_the_unit_of_the_record(truth):
@@ -113,10 +201,17 @@ def test_the_commands(imulab, tmp_path):
         imulab("tumble", "fit", f"{name}.csv", "--gravity", str(G), "--order", "1", "-o", f"{name}.json")
     done = imulab("tumble", "check", "a.json", "b.csv")
     assert done.returncode == 0, done.stderr
-    assert re.search(r"^pass: 20 attitudes, largest \|f\| - g -?\d+", done.stdout, re.MULTILINE)
+    assert re.match(r"pass: p = [\d.]+ \(chi-square [\d.]+ of 20\), 20 attitudes, largest \|f\| - g -?\d+", done.stdout)
+    assert "the record was made from this recording" in imulab("tumble", "check", "a.json", "a.csv").stderr
     strict = imulab("tumble", "check", "a.json", "b.csv", "--limit", "1ug")
     assert strict.returncode == 1
-    assert "fail: 20 attitudes" in strict.stdout
+    assert strict.stdout.startswith("fail: p = ")
+    assert "imulab tumble fit b.csv --prior a.json" in strict.stdout
+    told = json.loads(imulab("tumble", "check", "a.json", "b.csv", "--limit", "1ug", "--json").stdout)
+    assert told["verdict"] == "fail"
+    assert told["p"] > 0.05
+    assert told["limit"] == {"value": pytest.approx(9.80665e-6), "unit": "m/s^2"}
+    assert next(row["label"] for row in told["attitudes"]).startswith("attitude 1 (")
     assert "beyond the limit" in strict.stdout
     assert imulab("tumble", "check", "a.json", "b.csv", "--limit", "soft").returncode == 2
     shown = imulab("show", "a.json", "b.json")

@@ -50,6 +50,11 @@ class Gravity:
     standard_uncertainty: float = 0.0
     note: str = ""
 
+    @property
+    def name(self) -> str:
+        """What records share that rest on this gravity: its error is the same in all of them."""
+        return f"gravity {self.value!r} +- {self.standard_uncertainty!r} m/s^2"
+
     def entry(self) -> dict[str, Any]:
         """Return it as it stands in a record's model."""
         return {

@@ -38,18 +38,18 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
 
 def _tumble(record: Calibration) -> tuple[Table, ...]:
     order, output = record.model["order"], str(record.model["output_unit"])
-    if type(order) is not int or not 1 <= order <= 5:
-        raise RecordError(f"the record has order {order!r}, expected a whole number from 1 to 5")
+    if type(order) is not int or not 0 <= order <= 5:
+        raise RecordError(f"the record has order {order!r}, expected a whole number from 0 to 5")
     scale = _each(record, "scale_factor_{}", _AXES, f"{output}/(m/s^2)")
     nonlinearity = np.array(
         [_each(record, f"k{p}_{{}}", _AXES, "1/(m/s^2)" + (f"^{p - 1}" if p > 2 else "")) for p in range(2, order + 1)]
-    ).reshape(order - 1, 3)
+    ).reshape(-1, 3)
     ends = np.array([monotone_range(nonlinearity[:, axis]) for axis in range(3)])
     largest = float(np.finfo(np.float32).max)
     table = Table(
         "tumble",
         (
-            Field("order", _whole(order)),
+            Field("order", _whole(max(order, 1))),
             Field("gain", 1.0 / _nonzero(scale)),
             Field("bias", _each(record, "bias_{}", _AXES, "m/s^2")),
             Field("misalignment", _each(record, "misalignment_{}", ("yx", "zx", "zy"), "rad")),

@@ -133,7 +133,7 @@ def _accelerometers(record: Calibration) -> Accelerometers:
         scale=np.array([record.value(f"scale_factor_{axis}") for axis in AXES]) * factor,
         matrix=matrix,
         bias=np.array([record.value(f"bias_{axis}") for axis in AXES]),
-        nonlinearity=np.array(terms).reshape(order - 1, 3),
+        nonlinearity=np.array(terms).reshape(-1, 3),
         unit=kept,
     )
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import DataError, RecordError
+from imulab.errors import DataError, OptionError, RecordError
 from imulab.tasks.task import Files, Task
-from imulab.texts import chosen, whole_number
+from imulab.texts import chosen, quantity, whole_number
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
@@ -27,12 +27,13 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "gravity": gravity_option(texts.get("gravity"), texts.get("latitude"), texts.get("height"), label),
         "monte_carlo": None if trials is None else whole_number(trials, label.format("monte-carlo")),
         "prior": texts.get("prior"),
+        "ageing": _ageing(texts.get("ageing"), label.format("ageing")),
         "layout": texts.get("layout"),
         "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
     }
     check_options(
         values["order"], values["method"], values["loss"],
-        monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None,
+        monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
     )  # fmt: skip
     return values
 
@@ -53,9 +54,21 @@ def _tumble_fit(
         method=values["method"],
         loss=values["loss"],
         prior=prior,
+        ageing=values["ageing"],
         monte_carlo=values["monte_carlo"],
         progress=progress,
     ).calibration
+
+
+def _ageing(text: str | None, name: str) -> tuple[float, ...]:
+    """Standard deviations of what biases, scale factors and misalignments changed, in SI, as many as are given."""
+    if text is None:
+        return ()
+    kinds = (("acceleration", "ug"), ("number", "ppm"), ("angle", "urad"))
+    parts = text.split(",")
+    if len(parts) > len(kinds):
+        raise OptionError(f"{name} {text!r}: expected up to three, as in 100ug,100ppm,50urad")
+    return tuple(quantity(part, name, *kind) for part, kind in zip(parts, kinds, strict=False))
 
 
 def _prior(file: str, recording: Recording, access: Files) -> Calibration:
@@ -89,6 +102,7 @@ TASK = Task(
         "loss",
         "monte_carlo",
         "prior",
+        "ageing",
         "layout",
         "topic",
         "instance",

@@ -163,7 +163,7 @@ PyObject *fit(PyObject *module, PyObject *args) {
     }
     const Py_ssize_t one = (Py_ssize_t)sizeof(double), problems = v[CONVERGED].len, p = 3 * ((Py_ssize_t)order + 2);
     const Py_ssize_t n = problems > 0 ? v[WEIGHTS].len / one / problems : 0;
-    const int fits = order > 0 && v[THETA].len == problems * p * one && v[WEIGHTS].len == problems * n * one &&
+    const int fits = order >= 0 && v[THETA].len == problems * p * one && v[WEIGHTS].len == problems * n * one &&
                      v[LENGTHENING].len == v[WEIGHTS].len && v[RESIDUALS].len == v[WEIGHTS].len &&
                      v[JACOBIAN].len == v[WEIGHTS].len * p && v[ITERATIONS].len == problems * (Py_ssize_t)sizeof(int64_t) &&
                      (v[READING].len == 3 * n * one || v[READING].len == 3 * v[WEIGHTS].len);
@@ -240,7 +240,7 @@ PyObject *left_out(PyObject *module, PyObject *args) {
         return NULL;
     }
     const Py_ssize_t one = (Py_ssize_t)sizeof(double), p = 3 * ((Py_ssize_t)order + 2), n = v[ERRORS].len / one;
-    const int fits = order > 0 && v[THETA].len == p * one && v[READING].len == 3 * n * one && v[ERRORS].len == n * one &&
+    const int fits = order >= 0 && v[THETA].len == p * one && v[READING].len == 3 * n * one && v[ERRORS].len == n * one &&
                      v[WEIGHTS].len == v[ERRORS].len && v[LENGTHENING].len == v[ERRORS].len;
     double *room = fits ? PyMem_Malloc(sizeof(double) * (2 * needed((size_t)n, (size_t)p) + (size_t)n)) : NULL;
     if (room != NULL) {

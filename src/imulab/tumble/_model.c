@@ -41,8 +41,10 @@ static void inverted(const double *a, const double *k, int count, double *s, dou
     }
 }
 
+static const double ALIGNED[3] = {0.0, 0.0, 0.0}; /* order 0 has no misalignment */
+
 double length(const double *theta, const double *reading, int order, double *derivative, double *f) {
-    const double *scale = theta + 3, *m = theta + 6, *k = theta + 9;
+    const double *scale = theta + 3, *m = order > 0 ? theta + 6 : ALIGNED, *k = theta + 9;
     double a[3], s[3], slope[3];
     for (int i = 0; i < 3; i++) a[i] = (reading[i] - theta[i]) / scale[i];
     inverted(a, k, order - 1, s, slope);
@@ -66,6 +68,7 @@ double length(const double *theta, const double *reading, int order, double *der
             derivative[9 + 3 * j + i] = -per_reading * power;
         }
     }
+    if (order == 0) return norm;
     derivative[6] = -v[1] * f[0];
     derivative[7] = -v[2] * f[0];
     derivative[8] = -v[2] * f[1];
@@ -83,9 +86,9 @@ static PyObject *lengths(PyObject *module, PyObject *args) {
     (void)module;
     if (!PyArg_ParseTuple(args, "y*y*iw*w*w*", &theta, &reading, &order, &norm, &jacobian, &force)) return NULL;
     const Py_ssize_t one = (Py_ssize_t)sizeof(double), p = 3 * ((Py_ssize_t)order + 2);
-    const Py_ssize_t problems = order > 0 ? theta.len / one / p : 0;
+    const Py_ssize_t problems = order >= 0 ? theta.len / one / p : 0;
     const Py_ssize_t n = problems > 0 ? norm.len / one / problems : 0;
-    const int fits = order > 0 && theta.len == problems * p * one && norm.len == problems * n * one &&
+    const int fits = order >= 0 && theta.len == problems * p * one && norm.len == problems * n * one &&
                      jacobian.len == norm.len * p && force.len == norm.len * 3 &&
                      (reading.len == n * 3 * one || reading.len == force.len);
     if (fits) {
@@ -142,7 +145,7 @@ static PyObject *noise(PyObject *module, PyObject *args) {
     const Py_ssize_t n = problems > 0 ? all / problems : 0;
     const int size = v[LENGTHENING].len == 0 ? MOMENTS : AXES;
     const Py_ssize_t square = size * size;
-    const int fits = p >= 9 && n > 0 && v[THETA].len == problems * p * one && all == problems * n &&
+    const int fits = p >= 6 && n > 0 && v[THETA].len == problems * p * one && all == problems * n &&
                      v[JACOBIAN].len == all * p * one && (size == MOMENTS || v[LENGTHENING].len == v[VARIANCE].len) &&
                      (v[COVARIANCE].len == square * n * one || v[COVARIANCE].len == square * all * one);
     if (fits) {
@@ -151,7 +154,7 @@ static PyObject *noise(PyObject *module, PyObject *args) {
         double *lengthening = v[LENGTHENING].buf, *variance = v[VARIANCE].buf;
         for (Py_ssize_t b = 0; b < problems; b++, theta += p, covariance += next) {
             /* df/dM = T^-1 diag(1 / (slope S)); the nonlinearity's slope is 1 to the order that matters here. */
-            const double *scale = theta + 3, *m = theta + 6;
+            const double *scale = theta + 3, *m = p > 6 ? theta + 6 : ALIGNED;
             const double carried[3][3] = {{1.0 / scale[0], 0.0, 0.0},
                                           {-m[0] / scale[0], 1.0 / scale[1], 0.0},
                                           {(m[2] * m[0] - m[1]) / scale[0], -m[2] / scale[1], 1.0 / scale[2]}};

@@ -222,8 +222,7 @@ def _shares(record: Calibration) -> Table:
     return Table(
         title="Prior and data",
         caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior['created']}) or "
-        "these attitudes; variance now over variance in the prior. A prior that no longer holds shows as scatter "
-        "beyond the noise.",
+        "these attitudes; variance now over that of the prior with what it aged since.",
         columns=["parameter", "from the prior", "from the data"],
         rows=rows,
     )

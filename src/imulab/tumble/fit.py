@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +24,10 @@ from imulab.tumble.axes import check_axes
 from imulab.tumble.checks import check_attitudes, check_residuals
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
 from imulab.tumble.montecarlo import check_trials, propagate
+from imulab.tumble.order_zero import with_assumed_alignment
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
-from imulab.tumble.record import Scaling, make_record, prior_of
+from imulab.tumble.prior import GROUPS, Aged, Known, entries, findings, known_of, put_together
+from imulab.tumble.record import Scaling, make_record
 from imulab.tumble.solve import Problem, Solution, forces, informed_rows, solve_linearised, solve_norm
 from imulab.units import parse_unit, to_si
 
@@ -68,6 +71,7 @@ def fit_tumble(
     method: str = "norm",
     loss: str = "square",
     prior: Calibration | None = None,
+    ageing: Sequence[float] = (),
     monte_carlo: int | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> TumbleFit:
@@ -90,8 +94,12 @@ def fit_tumble(
     loss
         ``"square"``, or ``"huber"`` against single disturbed attitudes (method norm only).
     prior
-        Earlier tumble record of the same unit, taken as a normal distribution of the parameters; gives the order under
-        ``"auto"``. Needs method norm, loss square and stated or measured noise.
+        Earlier tumble record of the same unit, taken as a normal distribution of the parameters, which is widened by
+        what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square and stated
+        or measured noise.
+    ageing
+        Standard deviations of what biases (m/s^2), scale factors (1) and misalignments (rad) changed since the prior
+        was made, as many as are known; the attitudes tell the others.
     monte_carlo
         Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
     progress
@@ -108,7 +116,7 @@ def fit_tumble(
     RecordError
         The prior lacks a parameter, or has outputs in another unit.
     """
-    check_options(order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None)
+    check_options(order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing)
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
@@ -121,18 +129,22 @@ def fit_tumble(
     known = None
     if prior is not None:
         order = _prior_order(prior, order, attitudes)
-        known = prior_of(prior, scaling, local.value, attitudes.unit)
+        known = known_of(prior, scaling, local, attitudes.unit)
     if order == "auto":
         if len(attitudes) >= parameter_count(1):
             choice = choose_order(problem, local.value)
         chosen = choice.order if choice else 1
     else:
         chosen = int(order)
-    problem = replace(problem, order=chosen, prior=known)
-    solution, seen = _solve(problem, attitudes, method, choice)
+    problem = replace(problem, order=chosen)
+    aged = None
+    if known is not None:
+        aged = put_together(problem, known, local, _scaled_ageing(ageing, local.value))
+        problem = aged.problem
+    solution, seen = _solve(problem, attitudes, method, choice, aged)
     check_residuals(attitudes, solution, local.value)
     check_axes(attitudes, forces(problem, solution)[0])
-    matrix, freedom = _covariance(problem, solution)
+    matrix, freedom = (aged.covariance, aged.freedom) if aged else _covariance(problem, solution)
     trials = None
     if monte_carlo is not None:
         if matrix is None:
@@ -154,10 +166,10 @@ def fit_tumble(
         options={"order": order, "method": method, "loss": loss, "gravity": local.value}
         | ({} if monte_carlo is None else {"monte_carlo": monte_carlo}),
         monte_carlo=trials,
-        prior=prior,
+        **_prior_found(prior, known, aged, scaling, local, attitudes),
     )
     return TumbleFit(
-        calibration=record,
+        calibration=with_assumed_alignment(record) if problem.order == 0 else record,
         observability=seen,
         orders=choice.rows if choice else (),
         residuals=local.value * solution.deviations[0],
@@ -166,7 +178,13 @@ def fit_tumble(
 
 
 def check_options(
-    order: int | str, method: str, loss: str, *, monte_carlo: int | None = None, with_prior: bool = False
+    order: int | str,
+    method: str,
+    loss: str,
+    *,
+    monte_carlo: int | None = None,
+    with_prior: bool = False,
+    ageing: Sequence[float] = (),
 ) -> None:
     """Check what can be checked before there is data.
 
@@ -175,7 +193,7 @@ def check_options(
     OptionError
         An option has an unknown value, or does not go with another.
     """
-    known = ("auto", *range(1, HIGHEST_ORDER + 1))
+    known = ("auto", *range(HIGHEST_ORDER + 1))
     if order not in known or isinstance(order, bool):
         raise OptionError(f"order {order!r}: expected one of {' '.join(map(str, known))}")
     if method not in METHODS:
@@ -184,8 +202,17 @@ def check_options(
         raise OptionError(f"loss {loss!r}: expected one of {' '.join(LOSSES)}")
     if loss == "huber" and method == "linearised":
         raise OptionError("loss huber needs method norm, found method linearised")
+    if order == 0 and method == "linearised":
+        raise OptionError("order 0 needs method norm, found method linearised")
     if with_prior and (method != "norm" or loss != "square"):
         raise OptionError(f"a prior needs method norm and loss square, found method {method} and loss {loss}")
+    if ageing and not with_prior:
+        raise OptionError("ageing without a prior: expected both, it is that of the prior's unit")
+    if len(ageing) > len(GROUPS) or not all(0 <= value < np.inf for value in ageing):
+        raise OptionError(
+            f"ageing {' '.join(f'{value:g}' for value in ageing)}: expected up to three standard deviations of 0 or "
+            "more, of biases (m/s^2), scale factors (1) and misalignments (rad)"
+        )
     if monte_carlo is None:
         return
     check_trials(monte_carlo)
@@ -193,6 +220,24 @@ def check_options(
         raise OptionError(f"monte-carlo needs method norm, found method {method}")
     if with_prior:
         raise OptionError("monte-carlo draws the attitudes anew, not a prior: expected one of the two options")
+
+
+def _prior_found(
+    prior: Calibration | None,
+    known: Known | None,
+    aged: Aged | None,
+    scaling: Scaling,
+    gravity: Gravity,
+    attitudes: Attitudes,
+) -> dict[str, Any]:
+    """Return what the record is to say of its prior."""
+    if prior is None or known is None or aged is None:
+        return {}
+    return {
+        "with_gravity": aged.with_gravity,
+        "entries": {"prior": entries(prior, known, aged, scaling, gravity)},
+        "findings": findings(prior, aged, attitudes.recording, len(attitudes)),
+    }
 
 
 def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:
@@ -210,6 +255,12 @@ def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> 
     return own
 
 
+def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | None, ...]:
+    """Return what is known of the ageing of each group in g, 1 and rad, None where nothing is."""
+    known = [value / unit for value, unit in zip(ageing, (gravity, 1.0, 1.0), strict=False)]
+    return (*known, *[None] * (len(GROUPS) - len(known)))
+
+
 def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
     """Nominal sensor: by its unit, or for counts and volts from the span of each axis."""
     unit = parse_unit(attitudes.unit)
@@ -220,14 +271,14 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 
 
 def _solve(
-    problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None
+    problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None, aged: Aged | None
 ) -> tuple[Solution, Observability]:
     """Solve the problem, unless the `choice` of the order has done so by norm, and see what it determines."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "norm" and choice is not None:
         solution, seen = choice.solution, choice.observability
     else:
-        solution = _solved(problem, attitudes, method)
+        solution = aged.solution if aged else _solved(problem, attitudes, method)
         seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
     if seen.rank < size:
         names = parameter_names(problem.order)
@@ -253,16 +304,13 @@ def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "linearised" and n >= size:
         return solve_linearised(problem, attitudes.recording.name)
-    return solve_norm(problem, None if problem.prior is None else problem.prior.mean[None])
+    return solve_norm(problem)
 
 
 def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
     """Covariance of theta, shape (p, p), and the degrees of freedom of its scale (None: noise known)."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     freedom = n - size
-    if problem.prior is not None:
-        rows, weights = informed_rows(problem, solution.jacobian[0], 1 / solution.variance[0])
-        return covariance(rows[None], weights[None])[0], _finite(solution.freedom[0])
     base = covariance(solution.jacobian, 1 / solution.variance)[0]
     known = problem.covariance is not None
     if problem.robust and freedom > 0:

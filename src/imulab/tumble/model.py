@@ -27,7 +27,7 @@ GAUGE = "x input axis along body x, y input axis in the body xy plane"
 
 
 def parameter_count(order: int) -> int:
-    """Return the number of parameters of the model, 3 (order + 2)."""
+    """Return the number of parameters of the model, 3 (order + 2); order 0 is order 1 without misalignment."""
     return 3 * (order + 2)
 
 
@@ -36,7 +36,7 @@ def parameter_names(order: int) -> list[str]:
     return [
         *(f"bias_{axis}" for axis in AXES),
         *(f"scale_factor_{axis}" for axis in AXES),
-        *(f"misalignment_{pair}" for pair in MISALIGNMENTS),
+        *(f"misalignment_{pair}" for pair in MISALIGNMENTS if order > 0),
         *(f"k{power}_{axis}" for power in range(2, order + 1) for axis in AXES),
     ]
 
@@ -44,7 +44,12 @@ def parameter_names(order: int) -> list[str]:
 def parameter_units(order: int, output: str) -> list[str]:
     """Return the units of the parameters in a record, in the same order."""
     nonlinearity = ["1/(m/s^2)" if j == 1 else f"1/(m/s^2)^{j}" for j in range(1, order)]
-    return ["m/s^2"] * 3 + [f"{output}/(m/s^2)"] * 3 + ["rad"] * 3 + [unit for unit in nonlinearity for _ in AXES]
+    return (
+        ["m/s^2"] * 3
+        + [f"{output}/(m/s^2)"] * 3
+        + ["rad"] * 3 * (order > 0)
+        + [unit for unit in nonlinearity for _ in AXES]
+    )
 
 
 def gravity_slope(values: Array) -> Array:

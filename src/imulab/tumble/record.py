@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import RecordError
 from imulab.estimate import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.recording import Array
-from imulab.tumble.checks import check_prior
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, gravity_slope, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
 from imulab.tumble.patterns import direction_findings, time_findings
-from imulab.tumble.solve import Prior, Problem, Solution, data_freedom, forces
+from imulab.tumble.solve import Problem, Solution, data_freedom, forces
 from imulab.units import parse_unit
 
 _STANDS_OUT = 5.0
@@ -56,18 +55,21 @@ def make_record(
     orders: tuple[OrderRow, ...],
     options: Mapping[str, Any],
     monte_carlo: MonteCarlo | None = None,
-    prior: Calibration | None = None,
+    with_gravity: bool = False,
+    entries: Mapping[str, Any] = MappingProxyType({}),
+    findings: Sequence[str] = (),
 ) -> Calibration:
     """Turn a solution in units of g into the record.
 
     ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; `covariance` is carried along by
     their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `effective`
-    degrees of freedom are those of its scale: None where the noise is known.
+    degrees of freedom are those of its scale: None where the noise is known. `with_gravity` says that the covariance
+    holds gravity's uncertainty already; `entries` and `findings` are added to the fit's and to the warnings.
     """
     g, order = gravity.value, problem.order
     names = parameter_names(order)
     values, derivative = _to_si(solution.theta[0], scaling, g, order)
-    shared = gravity.standard_uncertainty / g * gravity_slope(values)
+    shared = (not with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values)
     matrix = None if covariance is None else derivative @ covariance @ derivative.T + np.outer(shared, shared)
     recording = attitudes.recording
     n, size = len(attitudes), len(names)
@@ -100,7 +102,7 @@ def make_record(
             "attitudes": n,
             "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
             "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
-            "degrees_of_freedom": n - size if prior is None else freedom,
+            "degrees_of_freedom": n - size if problem.prior is None else freedom,
             "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
             "noise": "known" if known else "estimated from the residuals",
             "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
@@ -110,9 +112,9 @@ def make_record(
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
             "orders": [dict(vars(row)) for row in orders],
-            **_shared(gravity, names, shared),
+            **({"shared": {gravity.name: dict(zip(names, shared.tolist(), strict=True))}} if shared.any() else {}),
             **_propagated(monte_carlo, scaling, gravity, order),
-            **_prior_shares(prior, names, matrix),
+            **entries,
         },
         options=dict(options),
         data=_data(attitudes, scaling, problem, solution, g),
@@ -122,7 +124,7 @@ def make_record(
             *_warnings(attitudes, gravity, problem, solution, observability),
             *_scatter_warnings(problem, solution, chi_square, freedom),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
-            *_prior_warnings(prior, attitudes, beyond_noise(problem, chi_square, freedom)),
+            *findings,
         ),
     )
 
@@ -139,14 +141,6 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
             uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
         found[axis] = Parameter(s.value * b.value, uncertainty, str(record.model["output_unit"]))
     return found
-
-
-def _shared(gravity: Gravity, names: list[str], shared: Array) -> dict[str, Any]:
-    """Errors that records have in common where they rest on the same gravity, for whoever compares them."""
-    if not gravity.standard_uncertainty:
-        return {}
-    what = f"gravity {gravity.value!r} +- {gravity.standard_uncertainty!r} m/s^2"
-    return {"shared": {what: dict(zip(names, shared.tolist(), strict=True))}}
 
 
 def _propagated(trials: MonteCarlo | None, scaling: Scaling, gravity: Gravity, order: int) -> dict[str, Any]:
@@ -177,23 +171,11 @@ def _si_values(theta: Array, scaling: Scaling, g: float | Array, order: int) -> 
     return np.hstack([bias, scale_factor, theta[:, 6:9], theta[:, 9:] / g**powers])
 
 
-def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prior:
-    """Return a record's parameters as a prior of the scaled parameters: the inverse of `_si_values`.
-
-    Raises
-    ------
-    RecordError
-        The record cannot be a prior, or its outputs have another unit.
-    """
-    check_prior(record)
-    if record.model["output_unit"] != unit:
-        raise RecordError(f"the prior has outputs in {record.model['output_unit']}, the recording in {unit}")
-    order = int(record.model["order"])
-    names = parameter_names(order)
-    values = np.array([record.value(name) for name in names])
+def scaled_parameters(values: Array, scaling: Scaling, g: float) -> Array:
+    """Return parameters in SI, shape (p,), as scaled ones: the inverse of `_si_values`."""
     bias, scale_factor = values[:3], values[3:6]
-    powers = np.repeat(np.arange(1, order), 3)
-    theta = np.concatenate(
+    powers = np.repeat(np.arange(1, len(values) // 3 - 2), 3)
+    return np.concatenate(
         [
             (scale_factor * bias - scaling.zero) / scaling.scale,
             scale_factor * g / scaling.scale,
@@ -201,40 +183,11 @@ def prior_of(record: Calibration, scaling: Scaling, g: float, unit: str) -> Prio
             values[9:] * g**powers,
         ]
     )
-    derivative = np.linalg.inv(_to_si(theta, scaling, g, order)[1])
-    covariance = derivative @ record.covariance.block(names) @ derivative.T
-    spread = np.sqrt(np.diag(covariance))
-    root = np.linalg.cholesky(covariance / np.outer(spread, spread))
-    return Prior(theta, np.linalg.inv(root) / spread)
 
 
-def _prior_shares(prior: Calibration | None, names: list[str], matrix: Array | None) -> dict[str, Any]:
-    """Say what came from the prior: variance now over variance before, 1 where the data added nothing."""
-    if prior is None or matrix is None:
-        return {}
-    shares = np.diag(matrix) / np.diag(prior.covariance.block(names))
-    return {
-        "prior": {
-            "content_sha256": prior.to_dict()["content_sha256"],
-            "created": prior.created,
-            "shares": {n: float(s) for n, s in zip(names, shares, strict=True)},
-        }
-    }
-
-
-def _prior_warnings(prior: Calibration | None, attitudes: Attitudes, beyond: bool) -> list[str]:
-    if prior is None:
-        return []
-    found = []
-    mine, its = prior.sensor.get("serial"), attitudes.recording.metadata.get("serial")
-    if mine and its and mine != its:
-        found.append(f"the prior is a record of {mine}, the recording one of {its}")
-    if beyond:
-        found.append(
-            "prior and attitudes contradict each other: if the unit has changed since the prior was made, the values "
-            "still lean on it and the uncertainties do not cover the change; fit without the prior and compare"
-        )
-    return found
+def si_derivative(theta: Array, scaling: Scaling, g: float) -> Array:
+    """Return the derivatives of the parameters in SI by the scaled ones, shape (p, p)."""
+    return _to_si(theta, scaling, g, len(theta) // 3 - 2)[1]
 
 
 def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
@@ -243,7 +196,9 @@ def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array,
     bias, scale_factor, sigma = values[:3], values[3:6], theta[3:6]
     powers = np.repeat(np.arange(1, order), 3)
     derivative = np.diag(
-        np.concatenate([scaling.scale / scale_factor, scaling.scale / g, np.ones(3), g ** -powers.astype(float)])
+        np.concatenate(
+            [scaling.scale / scale_factor, scaling.scale / g, np.ones(len(theta[6:9])), g ** -powers.astype(float)]
+        )
     )
     derivative[range(3), range(3, 6)] = -bias / sigma
     return values, derivative
@@ -398,7 +353,7 @@ def _size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
         ]
     found += [
         f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
-        for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=True)
+        for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
         if abs(value) > _WORST_MISALIGNMENT
     ]
     return found

@@ -19,7 +19,6 @@ from imulab.errors import DataError
 from imulab.estimate import (
     Fit,
     huber_weights,
-    levenberg_marquardt,
     leverage,
     plausible_excess,
     robust_scale,
@@ -35,6 +34,7 @@ _REWEIGHTING_PASSES = {False: 4, True: 30}
 _WEIGHTS_AT_REST = 1e-4
 _DIVERGED = 0.98
 """A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
+_FIT_STEPS = 40
 _REFIT_STEPS = 15  # without one attitude of many the solution is near; what wanders for longer is not determined
 _REFIT_AT_MOST = 150
 _REFIT_TOLERANCE = 1e-7  # the next step would be a thousandth of it, or less
@@ -199,7 +199,7 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
         lengthening, own = _noise(problem, theta, fit.jacobian)
         residuals = fit.residuals
         if problem.covariance is not None and problem.excess and not problem.robust:
-            excess, freedom = plausible_excess(residuals, own, _spare(problem, fit.jacobian, 1 / variance))
+            excess, freedom = plausible_excess(residuals, own, 1 - leverage(fit.jacobian, 1 / variance))
         variance = own + excess[:, None]
         if problem.robust:
             standard = residuals / np.sqrt(variance * np.maximum(1 - leverage(fit.jacobian, down / variance), 0.05))
@@ -229,35 +229,10 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
     )
 
 
-def _least_squares(
-    problem: Problem,
-    theta: Array,
-    weights: Array,
-    lengthening: Array,
-    tolerance: float = 1e-9,
-    max_iterations: int = 40,
-) -> Fit:
-    prior = problem.prior
-    if prior is None:
-        return fit_lengths(
-            theta, problem.reading, weights, lengthening, problem.order, tolerance=tolerance, most=max_iterations
-        )
-
-    def model(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
-        reading = problem.reading if len(index) == len(problem.reading) else problem.reading[index]
-        norm, jacobian, _, _ = norm_and_jacobian(parameters, reading, problem.order)
-        return norm - 1 - lengthening[index], jacobian
-
-    def informed(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
-        residuals, jacobian = model(parameters, index)
-        rows = np.broadcast_to(prior.rows, (len(index), *prior.rows.shape))
-        known = (parameters - prior.mean) @ prior.rows.T
-        return np.hstack([residuals, known]), np.concatenate([jacobian, rows], axis=1)
-
-    n = weights.shape[1]
-    all_weights = np.hstack([weights, np.ones((len(weights), len(prior.rows)))])
-    fit = levenberg_marquardt(informed, theta, all_weights, tolerance=tolerance, max_iterations=max_iterations)
-    return replace(fit, residuals=fit.residuals[:, :n], jacobian=fit.jacobian[:, :n], weights=weights)
+def _least_squares(problem: Problem, theta: Array, weights: Array, lengthening: Array, tolerance: float = 1e-9) -> Fit:
+    return fit_lengths(
+        theta, problem.reading, weights, lengthening, problem.order, tolerance=tolerance, most=_FIT_STEPS
+    )
 
 
 def informed_rows(problem: Problem, jacobian: Array, weights: Array) -> tuple[Array, Array]:
@@ -265,14 +240,6 @@ def informed_rows(problem: Problem, jacobian: Array, weights: Array) -> tuple[Ar
     if problem.prior is None:
         return jacobian, weights
     return np.vstack([jacobian, problem.prior.rows]), np.concatenate([weights, np.ones(len(problem.prior.rows))])
-
-
-def _spare(problem: Problem, jacobian: Array, weights: Array) -> Array:
-    """Return ``1 - leverage`` of the attitudes, shape (b, n), whose sum is the number of degrees of freedom."""
-    if problem.prior is None:
-        return 1 - leverage(jacobian, weights)
-    rows, all_weights = informed_rows(problem, jacobian[0], weights[0])
-    return 1 - leverage(rows[None], all_weights[None])[:, : weights.shape[1]]
 
 
 def data_freedom(problem: Problem, jacobian: Array, weights: Array) -> float:
@@ -339,7 +306,7 @@ def solve_linearised(problem: Problem, name: str) -> Solution:
         return solution
     for _ in range(_REWEIGHTING_PASSES[False]):
         before = solution.excess
-        spare = _spare(problem, solution.jacobian, solution.weights)
+        spare = 1 - leverage(solution.jacobian, solution.weights)
         excess, freedom = plausible_excess(solution.residuals, solution.own_variance, spare)
         theta, passes = _linearised_iteration(problem, solution.lengthening[0], solution.own_variance[0] + excess, name)
         solution = _evaluated(problem, theta, passes, name)

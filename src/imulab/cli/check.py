@@ -1,0 +1,59 @@
+"""``imulab tumble check``: what a test of a record by fresh attitudes found, for people and for scripts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from imulab.jsontext import json_text
+from imulab.tumble.figures import small_g
+
+if TYPE_CHECKING:
+    from imulab.attitudes import Attitudes
+    from imulab.tumble.compare import Check
+
+
+def as_text(check: Check, attitudes: Attitudes, record: str, file: str) -> str:
+    """Return the verdict with its p, what to do next, and the residual of every attitude."""
+    n = len(attitudes)
+    test = "not tested, the record states no uncertainties"
+    if check.probability is not None:
+        test = f"p = {check.probability:.2g} (chi-square {check.chi_square:.3g} of {n})"
+    limit = "" if check.limit is None else f", limit {small_g(check.limit)}"
+    lines = [
+        f"{'pass' if check.passed else 'fail'}: {test}, {n} attitudes, largest |f| - g "
+        f"{small_g(check.residuals[check.worst])} ({attitudes.label(check.worst)}){limit}"
+    ]
+    if not check.passed:
+        lines.append(
+            "the unit has changed since the record was made, or attitudes were disturbed: measure again, or "
+            f"'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the change"
+        )
+    for index, value in enumerate(check.residuals.tolist()):
+        beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
+        expected = ""
+        if check.standard_uncertainty is not None:
+            expected = f" ± {small_g(check.standard_uncertainty[index])}"
+        lines.append(f"{attitudes.label(index)}: {small_g(value)}{expected}{beyond}")
+    return "\n".join(lines)
+
+
+def as_json(check: Check, attitudes: Attitudes) -> str:
+    """Return the same as JSON, in SI."""
+    uncertainty = [None] * len(attitudes) if check.standard_uncertainty is None else check.standard_uncertainty.tolist()
+    return json_text(
+        {
+            "verdict": "pass" if check.passed else "fail",
+            "p": check.probability,
+            "chi_square": check.chi_square,
+            "degrees_of_freedom": len(attitudes),
+            "limit": None if check.limit is None else {"value": check.limit, "unit": "m/s^2"},
+            "gravity": check.gravity.entry(),
+            "attitudes": [
+                {"label": attitudes.label(i), "residual": value, "standard_uncertainty": u}
+                for i, (value, u) in enumerate(zip(np.asarray(check.residuals).tolist(), uncertainty, strict=True))
+            ],
+            "notes": [str(note) for note in check.notes],
+        }
+    ).rstrip()
