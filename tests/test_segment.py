@@ -230,13 +230,24 @@ def with_std(table: Recording, units, values) -> Recording:
 
 
 def test_a_table_is_taken_row_by_row():
-    rows = np.vstack([DIRECTIONS, DIRECTIONS[:2]])  # equal rows stay apart
+    rows = np.vstack([DIRECTIONS, DIRECTIONS[:2] + 1e-12])  # nearly equal rows stay apart
     attitudes = find_attitudes(recording(rows, unit="g"))
     np.testing.assert_array_equal(attitudes.mean, rows)
     assert attitudes.covariance is None
     assert attitudes.samples.tolist() == [1] * 22
+    assert attitudes.notes == ()
     assert (attitudes.unit, attitudes.trace, attitudes.temperature) == ("g", None, None)
     assert attitudes.label(2) == "row 3 (line 4)"
+
+
+def test_rows_that_repeat_earlier_ones_count_once():
+    rows = np.vstack([DIRECTIONS[:3], DIRECTIONS])
+    attitudes = find_attitudes(with_std(recording(rows, unit="g"), ["g"] * 3, [1e-3] * 3))
+    np.testing.assert_array_equal(attitudes.mean, DIRECTIONS)
+    assert len(attitudes.covariance) == 20
+    assert attitudes.label(3) == "row 7 (line 8)"
+    (note,) = attitudes.notes
+    assert note.startswith("3 of 23 rows are duplicates of earlier ones, such as row 4 (line 5) of row 1 (line 2)")
 
 
 def test_stated_deviations_become_covariances_in_the_unit_of_the_means():
@@ -412,7 +423,7 @@ def test_clipped_rows_of_a_table_are_called_so():
 
 @pytest.mark.parametrize("rows", [np.repeat(CUBE, 4, axis=0), np.round(500 * FIXTURE), np.repeat(FIXTURE, 3, axis=0)])
 def test_the_equal_values_of_a_fixture_are_not_called_clipped(rows):
-    assert len(find_attitudes(recording(rows, unit="count"))) == len(rows)
+    assert len(find_attitudes(recording(rows, unit="count"))) == len(np.unique(rows, axis=0))
 
 
 def test_deviations_may_be_named_by_their_axis_alone():

@@ -14,6 +14,7 @@ from imulab.errors import DataError
 from imulab.lines import Lines, spectral_lines
 from imulab.noise import AllanCurve, allan_deviation
 from imulab.recording import Array, Recording
+from imulab.rows import leave_out
 from imulab.sampling import bridged, sampling_rate, steady_part
 from imulab.units import from_si, parse_unit
 from imulab.verdict import Note
@@ -57,6 +58,11 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         )
     notes = [f"{recording.name}: {note}" for note in recording.notes]
     recording, more = bridged(recording, names)
+    for sensor in dict.fromkeys(name.split("_")[0] for name in names):
+        left_out = leave_out(recording, [name for name in names if name.split("_")[0] == sensor])
+        left_out.check(0, len(recording), "the recording")
+        more += [type(note)(f"{recording.name}: {note}") for note in left_out.notes()]
+        recording = left_out.recording
     recording, trimmed = steady_part(recording)
     rate, timing = sampling_rate(recording)
     notes += [*more, *trimmed, *timing]

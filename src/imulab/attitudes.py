@@ -130,7 +130,7 @@ class Attitudes:
     def label(self, index: int) -> str:
         """Return how messages name an attitude: by its row, or by its time."""
         if self.trace is None:
-            return self.recording.place(index)
+            return self.recording.place(int(self.start[index]) - self.recording.first_row)
         return f"attitude {index + 1} ({self.start[index]:.1f} to {self.stop[index]:.1f} s)"
 
     def times(self) -> str:

@@ -22,6 +22,7 @@ from imulab.attitudes import POOL_DEGREES, Attitudes, Motion, Trace
 from imulab.clipping import check_clipped_rows, check_clipping
 from imulab.errors import SegmentError, UnitError
 from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.rows import leave_out
 from imulab.units import conversion_factor
 
 _BLOCK_SECONDS = 0.1
@@ -116,18 +117,10 @@ def find_attitudes(
     temperature = recording.mean_temperature()
     if "time" not in recording:
         check_clipped_rows(recording, names)
-        return Attitudes(
-            mean=recording.triad(sensor),
-            covariance=_stated_covariance(recording, names, unit),
-            samples=np.ones(len(recording), dtype=np.int64),
-            start=np.arange(recording.first_row, recording.first_row + len(recording), dtype=np.float64),
-            stop=np.arange(recording.first_row, recording.first_row + len(recording), dtype=np.float64),
-            unit=unit,
-            recording=recording,
-            temperature=temperature,
-            notes=(_NO_TIME.format(len(recording)),) if len(recording) > _LONG_TABLE else (),
-        )
+        return _table(recording, sensor, names, unit, temperature)
     time = check_time(recording)
+    left_out = leave_out(recording, names)
+    given, recording = recording, left_out.recording
     blocks = _form_blocks(recording, names, time, window)
     width = max(3, round(window / blocks.duration))
     if len(blocks.mean) < 2 * width:
@@ -153,6 +146,8 @@ def find_attitudes(
     if not pieces.start.size:
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
     stretches = np.column_stack([pieces.start * blocks.length, pieces.stop * blocks.length, pieces.attitude])
+    for a, b, _ in stretches.tolist():
+        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
     check_clipping(recording, names, stretches)
     held = _Held.of(recording, names, pieces, blocks)
     moments, freedom, share = _statistics(held)
@@ -173,14 +168,48 @@ def find_attitudes(
         start=time[pieces.start[first] * blocks.length],
         stop=time[pieces.stop[last] * blocks.length - 1],
         unit=unit,
-        recording=recording,
+        recording=given,
         temperature=temperature,
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
         motion=_motion(held, moments, freedom, share),
-        notes=_notes(blocks, variance),
+        notes=(*left_out.notes(_at_rest(stretches, len(time))), *_notes(blocks, variance)),
     )
+
+
+def _table(recording: Recording, sensor: str, names: list[str], unit: str, temperature: float | None) -> Attitudes:
+    """Return the rows of a table as attitudes; a row that repeats an earlier one exactly is not measured again."""
+    mean, covariance = recording.triad(sensor), _stated_covariance(recording, names, unit)
+    kept = np.sort(np.unique(mean, axis=0, return_index=True)[1])
+    row = (kept + recording.first_row).astype(np.float64)
+    notes = [_NO_TIME.format(len(recording))] if len(recording) > _LONG_TABLE else []
+    if len(kept) < len(mean):
+        again = int(np.setdiff1d(np.arange(len(mean)), kept)[0])
+        first = int(np.argmax((mean == mean[again]).all(axis=1)))
+        notes.append(
+            f"{len(mean) - len(kept)} of {len(mean)} rows are duplicates of earlier ones, such as "
+            f"{recording.place(again)} of {recording.place(first)}: they were left out, being no measurements"
+        )
+    return Attitudes(
+        mean=mean[kept],
+        covariance=None if covariance is None else covariance[kept],
+        samples=np.ones(len(kept), dtype=np.int64),
+        start=row,
+        stop=row.copy(),
+        unit=unit,
+        recording=recording,
+        temperature=temperature,
+        notes=tuple(notes),
+    )
+
+
+def _at_rest(stretches: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Return which samples belong to an attitude, shape (count,)."""
+    rest = np.zeros(count, dtype=np.bool_)
+    for start, stop, _ in stretches.tolist():
+        rest[start:stop] = True
+    return rest
 
 
 def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:

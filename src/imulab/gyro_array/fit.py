@@ -18,6 +18,7 @@ from imulab.gyro_array.latency import align_in_time, latency_notes
 from imulab.gyro_array.model import Elements, find_elements, fixed_weights
 from imulab.noise import AllanCurve
 from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.rows import LeftOut, leave_out
 from imulab.sampling import sampling_rate
 from imulab.units import parse_unit, to_si
 
@@ -84,8 +85,12 @@ def calibrate_array(
         raise DataError(f"{still.name}: {elements.count} element on each axis; expected 2 or more")
     if not averaging_time > 0:
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
+    left_out = _leave_out(still, elements)
+    left_out.check(0, len(still), "the recording at rest")
+    still = left_out.recording
     rest = _at_rest(still, elements)
     warnings = [f"{still.name}: {note}" for note in still.notes]
+    warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
     _, notes = sampling_rate(still)
     warnings += notes
     aligned = None
@@ -110,6 +115,12 @@ def calibrate_array(
     return ArrayFit(record, rest.curves)
 
 
+def _leave_out(recording: Recording, elements: Elements) -> LeftOut:
+    names = [name for row in elements.names for name in row]
+    check_finite(recording, names)
+    return leave_out(recording, names)
+
+
 def _si(recording: Recording, elements: Elements) -> Array:
     readings = elements.readings(recording)
     for axis, unit in enumerate(elements.units):
@@ -121,9 +132,7 @@ def _at_rest(still: Recording, elements: Elements) -> _AtRest:
     rate, _ = sampling_rate(still)
     if len(still) < _FEWEST_SAMPLES:
         raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
-    names = [name for row in elements.names for name in row]
-    check_finite(still, names)
-    for name in names:
+    for name in (name for row in elements.names for name in row):
         if np.ptp(still.columns[name]) == 0:
             raise DataError(f"{still.name}: column {name}: all samples are {still.columns[name][0]:g}: a dead gyro")
     readings = _si(still, elements)
@@ -143,10 +152,12 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
             f"{moving.name}: {its.count} elements on {len(its.axes)} axes; expected {elements.count} on "
             f"{len(elements.axes)} as at rest"
         )
-    check_finite(moving, [name for row in its.names for name in row])
+    left_out = _leave_out(moving, its)
+    moving = left_out.recording
     readings = _si(moving, its)
     clipped = _clipped(readings)
     notes = [f"{moving.name}: {note}" for note in moving.notes]
+    notes += [type(note)(f"{moving.name}: {note}") for note in left_out.notes()]
     if clipped.any():
         notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
     truth = its.truth(moving)

@@ -24,6 +24,7 @@ from imulab.gyro_array.model import (
     find_elements,
 )
 from imulab.recording import Array, Recording
+from imulab.rows import HISTORY, zero_rows
 from imulab.units import conversion_factor, from_si, parse_unit
 
 _NEED_THREE = ("robust", "support", "least-squares")
@@ -186,6 +187,8 @@ class Fuser:
     tell: Callable[[str], None] = lambda _: None
     name: str = "recording"
     turned: Turned | None = None
+    before: Array | None = None
+    lost: int = 0
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
         """Fuse consecutive blocks; the result does not depend on where they are cut.
@@ -215,6 +218,7 @@ class Fuser:
             before = self.clock.rate
             self.clock.watch(block)
             readings, time = elements.readings(block), block.si("time")
+            self._drop_zeros(readings)
             if self.turned is not None:
                 self.turned.watch(readings)
             seen = 0
@@ -238,7 +242,19 @@ class Fuser:
     def notes(self) -> list[str]:
         """Return what there is to say at the end: gaps in time, gyros that turn against the others."""
         turned = self.turned.lines() if self.turned is not None else []
+        if self.lost:
+            rows = f"{self.lost} row{'s' * (self.lost > 1)}"
+            turned = [*turned, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
         return [*self.clock.lines(self.name), *(f"{self.name}: {line}" for line in turned)]
+
+    def _drop_zeros(self, readings: Array) -> None:
+        """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""
+        flat = readings.reshape(len(readings), -1)
+        joined = flat if self.before is None else np.vstack([self.before, flat])
+        zero = zero_rows(list(joined.T))[len(joined) - len(flat) :]
+        self.before = joined[(joined != 0).any(axis=1)][-HISTORY:]
+        self.lost += int(np.count_nonzero(zero))
+        readings[zero] = np.nan
 
     def _aligns(self) -> bool:
         record = self.options.calibration

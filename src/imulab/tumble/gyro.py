@@ -22,6 +22,7 @@ from imulab.calibration import Calibration
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
 from imulab.estimate import Observability, covariance, observability
 from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.rows import leave_out
 from imulab.tumble.apply import output_factor, specific_force
 from imulab.tumble.directions import direction_covariance
 from imulab.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks
@@ -152,12 +153,15 @@ def fit_gyro(
         raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
     unit = recording.triad_unit("gyro")
     check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
-    time, output = check_time(recording), recording.triad("gyro")
+    left_out = leave_out(recording, [f"gyro_{axis}" for axis in "xyz"])
+    time, output = check_time(recording), left_out.recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
     means = attitudes.mean * factor
     own, own_force = (
         attitudes.recording.si("time"),
-        specific_force(record, attitudes.recording.triad("accel") * factor),
+        specific_force(
+            record, leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording.triad("accel") * factor
+        ),
     )
     case = Case(recording.name, attitudes, specific_force(record, means), own, own_force, output, unit, fit_bias)
     found = solve_turns(case, time, sensitivity)
@@ -169,7 +173,16 @@ def fit_gyro(
         time = comparison.on_other(time)
         found = solve_turns(case, time, sensitivity)
     known = clock_of_scale(comparison, clock, clock_of)
-    notes = [*found.notes, *_record_notes(record, attitudes, case.force), *known.notes(apart=apart)]
+    rest = np.zeros(len(time), dtype=np.bool_)
+    for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
+        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
+        rest[a:b] = True
+    notes = [
+        *(f"gyro: {note}" for note in left_out.notes(rest)),
+        *found.notes,
+        *_record_notes(record, attitudes, case.force),
+        *known.notes(apart=apart),
+    ]
     if apart and clock_of == "gyro":
         notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
     segments, residual, jacobian = found.segments, found.residual, found.jacobian

@@ -1,0 +1,220 @@
+"""Rows that are not readings: exact zeros, repeats of the row before, single samples far from both neighbours.
+
+Loggers fill what they lost with zeros or with the last row, and shift or tear frames. Such rows are found before
+anything else looks at the samples, and bridged by straight lines, so that rows and times stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import DataError
+from imulab.recording import Array, Recording
+from imulab.verdict import Note
+
+FAR = "far from the rows on both sides"
+MOST = 0.05
+"""Share of a stretch at rest that may be left out: more, and what is left is hardly to be trusted either."""
+_FAR = 10.0
+"""Standard deviations of the noise around it, or steps of its output, beyond which a sample is none."""
+_A_FEW = 1e-3
+_FAR_ZERO = 5.0  # usual steps around it
+_BESIDE = 4  # samples on both sides
+_QUIET = 4.0  # times the steps of the quietest fifth
+_AROUND = 64  # samples whose differences tell the noise
+HISTORY, _FEW_ZEROS = 50, 0.02
+"""A row of zeros is none of a gyro at rest whose last 50 rows hold hardly a zero."""
+_LONGEST_ZERO = 20  # rows; gyros without noise rest at zero for longer
+_BY_CHANCE = 3.0
+_UPPER, _TO_SIGMA = 24, 0.615
+"""Three quarters of 32 steps, not half: a log may hold each sample twice. To the standard deviation of white noise."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Rows that were left out of a group of columns.
+
+    Attributes
+    ----------
+    recording
+        With straight lines in their place.
+    names
+        The columns.
+    kinds
+        What the rows are, and which they are, of shape (n,).
+    """
+
+    recording: Recording
+    names: tuple[str, ...]
+    kinds: Mapping[str, NDArray[np.bool_]]
+
+    def notes(self, rest: NDArray[np.bool_] | None = None) -> list[str]:
+        """Say what was left out and why, a sentence for each kind; of knocks and the like only what is `rest`, (n,)."""
+        found = []
+        for kind, rows in self.kinds.items():
+            seen = rows & rest if rest is not None and kind == FAR else rows
+            count = int(np.count_nonzero(seen))
+            if count:
+                # A few knocks are in every recording; zeros and repeats are a fault of the logger.
+                kind_of = Note if kind == FAR and count < _A_FEW * len(seen) else str
+                found.append(
+                    kind_of(
+                        f"{count} row{'s' * (count > 1)} of {_shown(self.names)} left out: {kind}, first at "
+                        f"{self.recording.place(int(np.argmax(seen)))}"
+                    )
+                )
+        return found
+
+    def check(self, start: int, stop: int, where: str) -> None:
+        """Check that not too much is left out between two samples of a stretch at rest, called `where` in messages.
+
+        Raises
+        ------
+        DataError
+            More than 5 %.
+        """
+        if not self.kinds or stop <= start:
+            return
+        bad = np.logical_or.reduce([rows[start:stop] for rows in self.kinds.values()])
+        share = float(bad.mean())
+        if share > MOST:
+            kind = max(self.kinds, key=lambda kind: int(np.count_nonzero(self.kinds[kind][start:stop])))
+            raise DataError(
+                f"{self.recording.name}: {self.recording.place(start + int(np.argmax(bad)))}, columns "
+                f"{_shown(self.names)}: {100 * share:.0f} % of the rows of {where} are no readings ({kind}); expected "
+                f"at most {100 * MOST:.0f} %, which are left out"
+            )
+
+
+def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
+    """Find the rows of one sensor that are not readings, and bridge them.
+
+    - Zeros: all columns are exactly zero; of gyroscopes, where zeros are rare in the rows before.
+    - Repeats: all columns are exactly as in the row before, more often than their steps make it by chance, in no more
+      than 5 % of the rows (beyond that the sensor is slower than its log).
+    - Far: at rest, a sample or two farther than ten standard deviations of the noise around them, and ten steps of the
+      output, from the samples on both sides, which rest; and a single zero between values of one sign far from it.
+
+    Parameters
+    ----------
+    recording
+        Finite in these columns.
+    names
+        Columns of one sensor: a triad, the gyros of an array, or a single one.
+    """
+    values = [np.asarray(recording.column(name), dtype=np.float64) for name in names]
+    if len(recording) < 2 * _AROUND:
+        return LeftOut(recording, tuple(names), {})
+    never_zero = all(name.startswith("accel_") for name in names)
+    zero = zero_rows(values, never_zero)
+    if not never_zero:
+        zero &= ~_long_runs(zero)
+    found = {"exact zeros": zero, "exact repeats of the row before": repeated_rows(values) & ~zero}
+    found[FAR], found["an exact zero of one column"] = far_rows(values, zero)
+    kinds = {kind: rows for kind, rows in found.items() if rows.any()}
+    bad = np.logical_or.reduce(list(found.values()))
+    index, good = np.flatnonzero(bad), np.flatnonzero(~bad)
+    if not index.size or not good.size:
+        return LeftOut(recording, tuple(names), kinds)
+    columns = {}
+    for name, column in zip(names, values, strict=True):
+        columns[name] = np.array(column)
+        columns[name][index] = np.interp(index, good, column[good])
+    return LeftOut(recording.with_columns(columns, {}), tuple(names), kinds)
+
+
+def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.bool_]:
+    """Return the rows in which all columns are exactly zero, and that are not the zeros of a quantised sensor at rest.
+
+    Parameters
+    ----------
+    values
+        Columns, each of shape (n,).
+    never_zero
+        Whether no row of zeros can be a reading, as of accelerometers.
+    """
+    zero = np.array([column == 0 for column in values])
+    every = np.asarray(zero.all(axis=0))
+    if never_zero or len(values) < 2 or not every.any():
+        return every if len(values) > 1 else np.zeros_like(every)
+    count = np.concatenate([[0], np.cumsum(zero.sum(axis=0)[~every])])
+    before = np.clip(np.cumsum(~every)[every], min(HISTORY, len(count) - 1), None)  # at the start: the rows after it
+    rare = count[before] - count[np.maximum(before - HISTORY, 0)] <= _FEW_ZEROS * len(values) * HISTORY
+    found = np.zeros_like(every)
+    found[np.flatnonzero(every)[rare & (before >= HISTORY)]] = True
+    return found
+
+
+def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
+    """Return the rows that repeat the row before in all columns, where the sensor does not do that by itself."""
+    same = [np.diff(column, prepend=np.nan) == 0 for column in values]
+    every = np.logical_and.reduce(same)
+    count, n = int(np.count_nonzero(every)), len(every)
+    by_chance = n * float(np.prod([np.count_nonzero(each) / n for each in same]))
+    rare = (
+        len(values) > 1 and count > _BY_CHANCE * by_chance + 2 * _BY_CHANCE * np.sqrt(by_chance) and count <= MOST * n
+    )
+    return every if rare else np.zeros_like(every)
+
+
+def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the rows with a sample far from the rows on both sides, and those with a zero that is; not the `known`."""
+    found = np.zeros((2, len(known)), dtype=np.bool_)
+    good = np.flatnonzero(~known)
+    if len(good) >= 2 * _AROUND:
+        for column in values:
+            found[:, good] |= _far(column if len(good) == len(column) else column[good])
+    return found[0] & ~found[1], found[1]
+
+
+def _far(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which samples, one or two in a row, are far from the others, and which zeros are, shape (n,).
+
+    At rest only, since in motion there are knocks; but single zeros between values of one sign everywhere.
+    """
+    steps = np.abs(np.diff(x))
+    far, alone = np.zeros((2, len(x)), dtype=np.bool_)
+    count = len(steps) // _AROUND
+    local = np.sort(steps[: count * _AROUND].reshape(count, _AROUND)[:, : _AROUND // 2], axis=1)[:, _UPPER]
+    # Rest next to motion is no rest: the largest of a part's steps and its neighbours' counts.
+    wide = np.maximum(local, np.maximum(np.append(local[1:], 0.0), np.concatenate([[0.0], local[:-1]])))
+    around = np.repeat(np.append(wide, wide[-1]), _AROUND)[: len(x)]
+    around = np.append(around, np.full(len(x) - len(around), wide[-1]))
+    if not (steps > 0).any():
+        return far, alone
+    resolution = float(steps[steps > 0].min())
+    moving = wide > _QUIET * max(float(np.quantile(local, 0.2)), resolution)
+    least = _FAR * resolution
+    limit = np.maximum(_FAR * _TO_SIGMA * around, least)
+    # A sample that is far from what is around it is a large step away from it, or from the one before.
+    suspect = np.flatnonzero(np.append(steps, 0.0) > limit)
+    suspect = suspect[~moving[np.minimum(suspect // _AROUND, len(wide) - 1)]]
+    index = np.unique(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
+    middle = np.clip(index, _BESIDE, len(x) - 1 - _BESIDE)
+    window = x[middle[:, None] + np.arange(-_BESIDE, _BESIDE + 1)]
+    level = np.sort(window, axis=1)[:, _BESIDE]
+    # A knock, or a turn that begins, moves more than two samples.
+    still = np.sort(np.abs(window - level[:, None]), axis=1)[:, -3] < limit[index] / 2
+    far[index] = still & (np.abs(x[index] - level) > limit[index])
+    zero = np.flatnonzero(x[1:-1] == 0) + 1
+    before, after = x[zero - 1], x[zero + 1]
+    away = np.minimum(np.abs(before), np.abs(after)) > np.maximum(_FAR_ZERO * around[zero], least)
+    alone[zero[away & (before * after > 0)]] = True
+    return far, alone
+
+
+def _long_runs(rows: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the rows of runs that are longer than any dropout."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8))).reshape(-1, 2)
+    long = np.zeros_like(rows)
+    for start, stop in edges[np.diff(edges, axis=1)[:, 0] > _LONGEST_ZERO].tolist():
+        long[start:stop] = True
+    return long
+
+
+def _shown(names: Sequence[str]) -> str:
+    return " ".join(names) if len(names) <= 3 else f"{names[0]} .. {names[-1]}"
