@@ -142,10 +142,11 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
     if never_zero or len(values) < 2 or not every.any():
         return every if len(values) > 1 else np.zeros_like(every)
     count = np.concatenate([[0], np.cumsum(zero.sum(axis=0)[~every])])
-    before = np.clip(np.cumsum(~every)[every], min(HISTORY, len(count) - 1), None)  # at the start: the rows after it
+    first = np.cumsum(~every)[every]
+    before = np.maximum(first, min(HISTORY, len(count) - 1))  # near the start: of the rows after it, too
     rare = count[before] - count[np.maximum(before - HISTORY, 0)] <= _FEW_ZEROS * len(values) * HISTORY
     found = np.zeros_like(every)
-    found[np.flatnonzero(every)[rare & (before >= HISTORY)]] = True
+    found[np.flatnonzero(every)[rare & (first > 0) & (before >= HISTORY)]] = True
     return found
 
 
