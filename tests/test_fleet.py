@@ -244,7 +244,7 @@ def test_a_parquet_manifest_is_as_good_as_csv(tmp_path):
     assert run(tmp_path / "in" / "manifest.parquet", tmp_path / "out").count("done") == 3
 
 
-def test_manifest_and_files_may_be_urls(tmp_path):
+def test_manifest_and_files_may_be_urls(tmp_path, monkeypatch):
     manifest = make_fleet(tmp_path / "in", 2, order=1)
     state = run(manifest.as_uri(), tmp_path / "url")
     assert state.count("done") == 2
@@ -252,6 +252,9 @@ def test_manifest_and_files_may_be_urls(tmp_path):
     assert plain(tmp_path / "url" / "SN001.json") == plain(tmp_path / "path" / "SN001.json")
     import fsspec
 
+    from imulab.fleet import sources
+
+    monkeypatch.setattr(sources, "SCHEMES", (*sources.SCHEMES, "memory"))
     memory = fsspec.filesystem("memory")
     for name in ("u0.csv", "u1.csv", "manifest.csv"):
         memory.pipe(f"/line/{name}", (tmp_path / "in" / name).read_bytes())
@@ -260,16 +263,10 @@ def test_manifest_and_files_may_be_urls(tmp_path):
     assert run("memory://line/manifest.csv", tmp_path / "memory").kept == 2
 
 
-@pytest.mark.parametrize(
-    ("address", "reason"),
-    [
-        ("memory://line/none.csv", "memory://line/none.csv: no such file"),
-        ("nowhere://line/none.csv", "nowhere://line/none.csv: cannot be read: Protocol not known: nowhere"),
-    ],
-)
-def test_a_url_that_cannot_be_opened_fails_its_unit(tmp_path, address, reason):
+def test_a_url_of_no_file_fails_its_unit(tmp_path):
+    address = (tmp_path / "none.csv").as_uri()
     manifest = write_manifest(tmp_path / "m.csv", [{"serial": "A", "procedure": "tumble", "file": address}])
-    assert run(manifest, tmp_path / "out").failures[0].reason.startswith(reason)
+    assert run(manifest, tmp_path / "out").failures[0].reason == f"{address}: no such file"
 
 
 ROW = "A1,tumble,a.csv,9.81"

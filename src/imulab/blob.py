@@ -69,6 +69,8 @@ def tables_of_all(records: Sequence[Calibration]) -> list[Table]:
 def is_blob(path: str | Path) -> bool:
     """Return whether a file begins like a blob; False where it cannot be read."""
     try:
+        if not Path(path).is_file():
+            return False  # a pipe can be read only once
         with Path(path).open("rb") as stream:
             return stream.read(len(BLOB_MAGIC)) == BLOB_MAGIC
     except OSError:

@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
 from imulab.printable import printable
 
-_INTERRUPTED_PIPE = 141  # 128 + SIGPIPE, as a shell reports it
+_INTERRUPTED, _INTERRUPTED_PIPE, _TERMINATED = 130, 141, 143  # 128 + the signal, as a shell reports it
+
+
+class _TerminatedError(BaseException):
+    """The process was asked to end."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``imulab`` with the given arguments (those of the process by default) and return the exit status."""
     # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    try:
+        return _main(arguments)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except _TerminatedError:
+        return _TERMINATED
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     from typer.exceptions import TyperException
 
     from imulab.cli.app import command
@@ -40,8 +54,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         where = error.filename or "standard output"
         return _refuse(f"{where}: cannot be written: {error.strerror}")
-    except KeyboardInterrupt:
-        return 130
     except Exception as error:
         if os.environ.get("IMULAB_DEBUG"):
             raise
@@ -55,8 +67,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run() -> None:
-    """Entry point of the installed command."""
+    """Entry point of the installed command; a termination unwinds it, so that no part of a file stays behind."""
+    signal.signal(signal.SIGTERM, _terminate)
     sys.exit(main())
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise _TerminatedError
 
 
 def _refuse(message: str) -> int:

@@ -127,8 +127,8 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
 
 def is_json(file: str) -> bool:
     """Return whether a file is a record rather than a recording, by its first character."""
-    if file == "-" or Path(file).is_dir():
-        return False
+    if file == "-" or (Path(file).exists() and not Path(file).is_file()):
+        return False  # a pipe can be read only once, as a recording
     try:
         with Path(file).open("rb") as stream:
             return stream.read(64).lstrip().startswith(b"{")

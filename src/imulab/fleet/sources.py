@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -21,11 +20,21 @@ if TYPE_CHECKING:
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[A-Za-z][A-Za-z0-9+.-]*)*://")
 _BLOCK = 1 << 22
+SCHEMES = ("file", "https", "s3", "gs", "az")
+"""Where files may be fetched from; a manifest is somebody else's text, and fsspec knows dozens of others."""
+_LARGEST = 1 << 33
+_LOGIN = re.compile(r"(?<=://)[^/@\s]*@")
+_SECRET = re.compile(r"([?&][\w-]*(?:pass|pwd|token|secret|key|sig|auth)[\w-]*=)[^&\s]+", re.IGNORECASE)
 
 
 def is_url(name: str) -> bool:
     """Return whether a name is a URL rather than a path."""
     return _URL.match(name) is not None
+
+
+def masked(text: str) -> str:
+    """Return a text in which the credentials of URLs are replaced by asterisks."""
+    return _SECRET.sub(r"\1***", _LOGIN.sub("***@", text))
 
 
 def parent_of(path: str) -> str:
@@ -40,11 +49,25 @@ def local_file(address: str, name: str) -> Iterator[Path]:
     Raises
     ------
     ReadError
-        There is no such file, the URL cannot be opened, or fsspec is not there to open it.
+        There is no such file, it is no regular file or too large, the URL cannot be opened or is of a scheme that is
+        not read, or fsspec is not there to open it.
     """
+    name = masked(name)
     if not is_url(address):
-        yield Path(address)
+        path = Path(address)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ReadError(f"{name}: expected a file, found a device or a pipe")
+        yield path
         return
+    scheme = address.partition("://")[0].lower()
+    if scheme not in SCHEMES:
+        raise ReadError(
+            f"{name}: addresses with {scheme!r} are not read; expected a path, or one of {' '.join(SCHEMES)}"
+        )
+    if _LOGIN.search(address):
+        raise ReadError(
+            f"{name}: a login in the address would end up in records and reports; expected it in the environment"
+        )
     with tempfile.TemporaryDirectory(prefix="imulab-", ignore_cleanup_errors=True) as folder:
         yield _fetched(address, name, Path(folder))
 
@@ -58,18 +81,33 @@ def _fetched(address: str, name: str, folder: Path) -> Path:
     try:
         system, path = fsspec.core.url_to_fs(address)
         if system.isdir(path):
+            if system.du(path) > _LARGEST:
+                raise _too_large(name)
             system.get(path.rstrip("/") + "/", str(target) + "/", recursive=True)
+        elif system.info(path)["type"] != "file":
+            raise ReadError(f"{name}: expected a file, found a device or a pipe")
         else:
             with system.open(path, "rb") as stream, target.open("wb") as copy:
-                shutil.copyfileobj(stream, copy, _BLOCK)
+                while data := stream.read(_BLOCK):
+                    copy.write(data)
+                    if copy.tell() > _LARGEST:
+                        raise _too_large(name)
+    except ReadError:
+        raise
     except FileNotFoundError:
         raise ReadError(f"{name}: no such file") from None
     except ImportError as error:
-        raise ReadError(f"{name}: cannot be opened: {error}") from None
+        raise ReadError(f"{name}: cannot be opened: {masked(str(error))}") from None
     except Exception as error:  # fsspec passes on whatever its back ends raise
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = masked(" ".join(str(error).split())) or type(error).__name__
         raise ReadError(f"{name}: cannot be read: {reason}") from None
     return target
+
+
+def _too_large(name: str) -> ReadError:
+    return ReadError(
+        f"{name}: larger than {_LARGEST >> 30} GiB, the most that is fetched; expected a path of this machine"
+    )
 
 
 def sha256_of(path: Path, name: str) -> str:

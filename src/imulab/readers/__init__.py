@@ -143,7 +143,8 @@ def _blocks(
         kind = next(kind for kind in FORMATS if kind.module == "rosbag")
     else:
         kind = TEXT
-        if str(file) != "-" and not (layout is not None and layout.text):
+        # A pipe can be read once: it is text, or is refused as none.
+        if not is_pipe(file) and not (layout is not None and layout.text):
             with _open(file, name) as stream:
                 kind = recognised(stream.read(1024))
     if kind.layout == "none" and layout is not None:
@@ -179,6 +180,11 @@ def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording
 
 
 _FAMILIES = {kind.module: _family(kind.module, by_layout=kind.layout != "none") for kind in FORMATS}
+
+
+def is_pipe(file: str | Path) -> bool:
+    """Return whether a name stands for what can be read only once: standard input, a pipe, a device."""
+    return str(file) == "-" or (Path(file).exists() and not Path(file).is_file() and not Path(file).is_dir())
 
 
 def _name(file: str | Path) -> str:

@@ -14,6 +14,7 @@ from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import BinaryIO
 
@@ -24,6 +25,7 @@ from imulab.readers import _text
 from imulab.readers.layout import Layout
 from imulab.recording import CORRECTED_BY, Recording, parse_column_title
 from imulab.tens import powers_of_five
+from imulab.verdict import Note
 
 _BLOCK_BYTES = 1 << 21
 _WORTH_SHARING = 1 << 19
@@ -56,6 +58,9 @@ class _Crew:
     def __exit__(self, *_: object) -> None:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+
+
+_UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 
 
 class _Hash:
@@ -92,7 +97,7 @@ class TextFile:
         self._layout = layout
         self._hash = _Hash() if hashed else None
         self._rest = b""
-        self._ended = False
+        self._ended = self._unended = False
         self._taken = 0
         self._size = os.fstat(stream.fileno()).st_size if whole and not self._live and _is_file(stream) else 0
         self._room: np.ndarray | None = None
@@ -140,6 +145,8 @@ class TextFile:
                 # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
                 while waiting and (block is None or self._live or len(waiting) > crew.size):
                     recording = self._finish(*waiting.popleft(), row)
+                    if self._unended and not waiting:
+                        recording = replace(recording, notes=(*recording.notes, _UNENDED))
                     row += len(recording)
                     yield recording
                 if block is None:
@@ -185,6 +192,7 @@ class TextFile:
                 self._rest = data[end + 1 :]
                 return lines
             self._rest += data
+        self._unended |= bool(self._rest) and not self._rest.endswith(b"\n")
         lines, self._rest = self._rest.rstrip(self._blanks), b""
         return lines or None
 
