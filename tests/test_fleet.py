@@ -296,7 +296,7 @@ BAD_MANIFESTS = {
         "serial,procedure,file,order\nA,tumble,a.csv,1\nB,array,b.csv,1\n",
         ["row 2 (line 3), column order: not an option of array; its options: interval"],
     ),
-    "bad option": ("serial,procedure,file,order\nA,tumble,a.csv,9\n", ["row 1 (line 2): order 9", "auto 1 2"]),
+    "bad option": ("serial,procedure,file,order\nA,tumble,a.csv,9\n", ["row 1 (line 2): order 9", "auto 0 1 2"]),
     "bad gravity": (
         "serial,procedure,file,gravity\nA,tumble,a.csv,much\n",
         ["column gravity 'much': expected a number"],
