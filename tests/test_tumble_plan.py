@@ -96,21 +96,43 @@ def test_a_head_with_steps_of_90_degrees_is_blind():
         )
 
 
-def test_no_plan_repeats_an_attitude_for_want_of_others():
-    """24 candidates of which two are a degree apart, and candidates that have all been measured."""
-    candidates = reference.random_attitudes(np.random.default_rng(3), 200)
-    apart = [candidates[0]]
-    for up in candidates:
-        if (np.array(apart) @ up).max() < np.cos(np.radians(10)):
+def separated(count):
+    """Directions 10 deg apart or more."""
+    apart = []
+    for up in reference.random_attitudes(np.random.default_rng(3), 200):
+        if not apart or (np.array(apart) @ up).max() < np.cos(np.radians(10)):
             apart.append(up)
-    apart = np.array(apart[:24])
+    return np.array(apart[:count])
+
+
+def test_attitudes_are_put_down_twice_for_want_of_others():
+    """24 candidates of which two are a degree apart, and candidates that have all been measured."""
+    apart = separated(24)
     twin = apart[0] + np.radians(1) * np.cross(apart[0], [1.0, 0, 0])
     listed = np.vstack([apart[:23], twin / np.linalg.norm(twin)])
-    assert len(plan_tumble(order=2, attitudes=23, candidates=listed).directions) == 23
-    with pytest.raises(OptionError, match=r"list\.csv: no 24 of the 24 candidate attitudes are 3 deg apart from each"):
-        plan_tumble(order=2, attitudes=24, candidates=listed, source="list.csv")
-    with pytest.raises(OptionError, match="and from the 24 already there"):
-        plan_tumble(order=2, attitudes=6, candidates=apart, already=apart)
+    alone = plan_tumble(order=2, attitudes=23, candidates=listed)
+    assert alone.again == []
+    plan = plan_tumble(order=2, attitudes=24, candidates=listed, source="list.csv")
+    ((one, other),) = plan.again
+    assert other == 24  # after all others
+    np.testing.assert_allclose(plan.directions[one - 1], plan.directions[23], atol=np.radians(3))
+    assert np.trace(plan.covariance) < np.trace(alone.covariance)
+    best = min(
+        np.trace(np.linalg.inv(i.T @ i))
+        for i in (information_rows(np.vstack([apart[:23], up]), 2) for up in apart[:23])
+    )
+    assert np.trace(plan.covariance) == pytest.approx(best, rel=1e-3)
+    more = plan_tumble(order=2, attitudes=6, candidates=apart, already=apart)
+    assert more.again == []
+    assert (more.directions @ apart.T).max(axis=1) == pytest.approx(np.ones(6))
+
+
+def test_a_fixture_of_eighteen_positions_serves_forty_holds_evenly():
+    ups = separated(18)
+    plan = plan_tumble(order=2, attitudes=40, candidates=ups)
+    times = np.bincount(np.argmax(plan.directions @ ups.T, axis=1), minlength=18)
+    assert set(times) == {2, 3}
+    assert sorted(np.argmax(plan.directions[:18] @ ups.T, axis=1)) == list(range(18))
 
 
 def test_attitudes_already_there_are_taken_into_account():
@@ -193,7 +215,8 @@ def test_pictures_show_the_face_that_is_up():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"order": 6, "attitudes": 30}, "order 6: expected 1 to 5"),
+        ({"order": 6, "attitudes": 30}, "order 6: expected 0 to 5"),
+        ({"attitudes": 14}, "order 3 has 15 parameters"),
         ({"order": 2, "attitudes": 11}, "order 2 has 12 parameters"),
         ({"order": 1, "attitudes": 12, "criterion": "G"}, "expected one of A D"),
     ],
@@ -212,7 +235,9 @@ def test_the_command_writes_a_plan_and_a_sheet(imulab, tmp_path):
     assert "for a noise of 5 µg" in done.stdout
     sheet = (tmp_path / "p.html").read_text()
     assert sheet.count("<svg ") == 14
-    more = imulab("tumble", "plan", "--order", "2", "--attitudes", "4", "--add", "p.csv", "--from", "fixture:15")
+    more = imulab(
+        "tumble", "plan", "--order", "2", "--attitudes", "4", "--add", "p.csv", "--from", "fixture:15", "--noise", "1ug"
+    )
     assert "4 attitudes with the 14 already there" in more.stdout
     for arguments, fragment in (
         (["--from", "fixture:7"], "expected a whole part of 360 deg"),
@@ -221,7 +246,7 @@ def test_the_command_writes_a_plan_and_a_sheet(imulab, tmp_path):
         (["-o", "p.txt"], "ends in .csv"),
         (["--criterion", "G"], "expected one of A D"),
     ):
-        refused = imulab("tumble", "plan", "--order", "2", "--attitudes", "14", *arguments)
+        refused = imulab("tumble", "plan", "--order", "2", "--attitudes", "14", "--noise", "1ug", *arguments)
         assert refused.returncode == 2
         assert fragment in refused.stderr
         assert refused.stderr.count("\n") == 1
@@ -231,11 +256,37 @@ def test_add_takes_a_recording_and_a_record(imulab):
     imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
     imulab("tumble", "fit", "t.csv", "--gravity", str(G), "--order", "1", "-o", "t.json")
     found = [
-        imulab("tumble", "plan", "--order", "2", "--attitudes", "3", "--add", file) for file in ("t.csv", "t.json")
+        imulab("tumble", "plan", "--order", "2", "--attitudes", "3", "--add", file, "--noise", file)
+        for file in ("t.csv", "t.json")
     ]
     for done in found:
         assert done.returncode == 0, done.stderr
         assert "3 attitudes with the 16 already there" in done.stdout
+    noise = [float(re.search(r"noise of ([\d.]+) µg in", done.stdout)[1]) for done in found]
+    # 0.7 mg samples at 100 Hz, holds of 2 s less their edges
+    assert noise == pytest.approx([700 / np.sqrt(140)] * 2, rel=0.2)
+
+
+def test_noise_is_asked_for_and_order_3_is_the_default(imulab, tmp_path):
+    silent = imulab("tumble", "plan", "--attitudes", "24")
+    assert silent.returncode == 2
+    assert silent.stderr.startswith(
+        "imulab: --noise: expected the noise of |f| in one attitude, such as 20ug, or a rec"
+    )
+    assert silent.stderr.count("\n") == 1
+    done = imulab("tumble", "plan", "--attitudes", "18", "--noise", "20ug")
+    assert done.returncode == 0, done.stderr
+    assert "18 attitudes for order 3" in done.stdout
+    assert "Order 3 because attitudes for a lower one cannot show" in done.stdout
+    imulab("tumble", "simulate", "-o", "few.csv", "--attitudes", "6", "--hold", "3", "--order", "1")
+    few = imulab("tumble", "plan", "--attitudes", "18", "--noise", "few.csv", "--order", "1")
+    assert float(re.search(r"noise of ([\d.]+) µg", few.stdout)[1]) == pytest.approx(700 / np.sqrt(240), rel=0.25)
+    (tmp_path / "bare.csv").write_text("accel_x [g],accel_y [g],accel_z [g]\n1,0,0\n0,1,0\n0,0,1\n")
+    bare = imulab("tumble", "plan", "--attitudes", "18", "--noise", "bare.csv")
+    assert bare.stderr.startswith("imulab: bare.csv: a table without std_* columns does not say what noise")
+    twice = imulab("tumble", "plan", "--attitudes", "8", "--noise", "1ug", "--order", "0", "--from", "head:90")
+    assert twice.returncode == 0, twice.stderr
+    assert re.search(r"Put down twice: \d and 7, \d and 8\.", twice.stdout)
 
 
 def test_lists_and_records_that_are_none_are_refused_by_name(imulab, tmp_path):
@@ -258,13 +309,13 @@ def test_lists_and_records_that_are_none_are_refused_by_name(imulab, tmp_path):
         (["--from", "inf.csv"], "inf.csv: row 7 (line 8), column up_y: expected a finite number, found inf"),
         (["--from", "bare.csv"], "bare.csv: column roll: expected an angle, as in roll [deg]; found the unit 1"),
         (["--from", "metre.csv"], "metre.csv: column pitch: expected an angle, as in pitch [deg]; found the unit m"),
-        (["--from", "few.csv"], "few.csv: 5 different candidate attitudes; expected at least 14"),
+        (["--from", "few.csv"], "few.csv: 5 different candidate attitudes; expected at least 12"),
         (["--from", "good.csv", "-o", "good.csv"], "good.csv: would overwrite good.csv"),
         (["--add", "other.json"], "other.json: a warmup record holds no attitudes; expected a tumble record"),
         (["--attitudes", "301"], "301 attitudes: expected 1 to 300"),
         (["--attitudes", "0", "--add", "good.csv"], "0 attitudes: expected 1 to 300"),
     ):
-        refused = imulab("tumble", "plan", "--order", "2", "--attitudes", "14", *arguments)
+        refused = imulab("tumble", "plan", "--order", "2", "--noise", "1ug", "--attitudes", "14", *arguments)
         assert refused.returncode == 2, (arguments, refused.stderr)
         assert refused.stderr == f"imulab: {fragment}\n" or refused.stderr.startswith(f"imulab: {fragment}; "), (
             refused.stderr

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.calibration import load
+from imulab.calibration import Calibration, load
 from imulab.cli.options import check_outputs, is_json, quantity, whole_number
 from imulab.cli.show import aligned
 from imulab.errors import ImulabError, OptionError, RecordError
@@ -29,7 +29,7 @@ def run(
     order: str,
     attitudes: str,
     output: str | None,
-    noise: str,
+    noise: str | None,
     criterion: str,
     source: str,
     add: str | None,
@@ -39,9 +39,7 @@ def run(
     check_outputs([output, report], [name for name in (add, source) if name])
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
-    sigma = from_si(quantity(noise, "--noise", "acceleration", "ug"), "g")
-    if not sigma > 0:
-        raise OptionError(f"--noise {noise!r}: expected more than 0")
+    sigma, source_of_noise = _noise(noise)
     plan = plan_tumble(
         order=whole_number(order, "--order"),
         attitudes=whole_number(attitudes, "--attitudes"),
@@ -56,8 +54,16 @@ def run(
     lead = (
         f"{len(plan.directions)} attitudes{there} for order {plan.order}, criterion {criterion}: condition number "
         f"{plan.condition_number:.1f}, {np.degrees(turning(plan.directions)):.0f} deg of turning. Predicted for a "
-        f"noise of {noise_text} in |f| per attitude and a nominal sensor."
+        f"noise of {noise_text} in |f| per attitude{source_of_noise} and a nominal sensor."
     )
+    if plan.order == 3:
+        lead += " Order 3 because attitudes for a lower one cannot show what that would leave in the scale factors."
+    if plan.again:
+        pairs = ", ".join(f"{one} and {other}" for one, other in plan.again)
+        lead += (
+            f" Put down twice: {pairs}. No more candidates lie 3 deg apart; the second time, after the others, lowers "
+            "the noise and shows what drifts, but no new direction."
+        )
     with ExitStack() as stack:
         to_csv = stack.enter_context(replacing(output)) if output else None
         to_sheet = stack.enter_context(replacing(report)) if report else None
@@ -70,6 +76,44 @@ def run(
     for name, what in ((output, "plan"), (report, "sheet")):
         if name:
             print(f"{what}: {name}")
+
+
+def _noise(text: str | None) -> tuple[float, str]:
+    """Noise of |f| in one attitude, g: a quantity, or what the attitudes of a recording or record have; and whose."""
+    if text is None:
+        raise OptionError(
+            "--noise: expected the noise of |f| in one attitude, such as 20ug, or a recording or record that has it"
+        )
+    if not Path(text).is_file():
+        sigma = from_si(quantity(text, "--noise", "acceleration", "ug"), "g")
+        if not sigma > 0:
+            raise OptionError(f"--noise {text!r}: expected more than 0")
+        return sigma, ""
+    if is_json(text):
+        record = load(text)
+        if record.procedure != "tumble":
+            raise RecordError(f"{text}: a {record.procedure} record holds no attitudes; expected a tumble record")
+        return _noise_of(record), f" (that of {text})"
+    found = find_attitudes(read(text))
+    if found.covariance is None:
+        raise OptionError(f"{text}: a table without std_* columns does not say what noise its attitudes have")
+    try:
+        return _noise_of(fit_tumble(found, order=1).calibration), f" (that of {text})"
+    except ImulabError:  # too few for a fit: any direction and length are good enough for a noise
+        up = found.mean / np.linalg.norm(found.mean, axis=1, keepdims=True)
+        variance = np.einsum("ni,nij,nj->n", up, found.covariance, up) / (found.mean**2).sum(axis=1)
+        return float(np.sqrt(np.median(variance))), f" (that of {text})"
+
+
+def _noise_of(record: Calibration) -> float:
+    """Noise of |f| in the usual attitude of a record, with what they scatter beyond their own, g."""
+    stated, g = record.data["attitudes"]["standard_uncertainty"], float(record.model["gravity"]["value"])
+    if stated:
+        return float(np.hypot(np.median(stated), record.fit["excess"]["value"])) / g
+    reduced = record.fit["reduced_chi_square"]
+    if not reduced:
+        raise RecordError("--noise: the record's attitudes do not say what noise they have; expected a value, as 20ug")
+    return float(np.sqrt(reduced)) / g
 
 
 def _candidates(source: str) -> Array | None:

@@ -42,10 +42,13 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
 
 
 def plan(
-    order: Annotated[str, typer.Option(help="Order of the model, 1 to 5.")],
     attitudes: Annotated[str, typer.Option(help="Number of attitudes to choose.")],
+    noise: Annotated[
+        str | None,
+        typer.Option(metavar="20ug|FILE", help="Noise of |f| in one attitude, or a recording or record that has it."),
+    ] = None,
+    order: Annotated[str, typer.Option(help="Order of the model, 0 to 5; 3 shows what 2 would leave out.")] = "3",
     output: Annotated[str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Plan to write.")] = None,
-    noise: Annotated[str, typer.Option(help="Noise of |f| in one attitude.")] = "1 ug",
     criterion: Annotated[str, typer.Option(help="A: least sum of variances; D: smallest confidence region.")] = "A",
     source: Annotated[
         str,

@@ -47,6 +47,12 @@ class Plan:
     condition_number: float
     already: int
 
+    @property
+    def again(self) -> list[tuple[int, int]]:
+        """Numbers, from 1, of attitudes that are one attitude put down twice."""
+        near = self.directions @ self.directions.T > np.cos(CLOSEST)
+        return [(int(i) + 1, int(j) + 1) for i, j in np.argwhere(np.triu(near, 1)).tolist()]
+
     def uncertainties(self, noise: float) -> dict[str, float]:
         """Return the standard uncertainty of every parameter in units of g, for a noise of |f| in g."""
         sigma = noise * np.sqrt(np.diag(self.covariance))
@@ -55,8 +61,8 @@ class Plan:
 
 def plan_tumble(
     *,
-    order: int,
     attitudes: int,
+    order: int = 3,
     criterion: str = "A",
     candidates: Array | None = None,
     already: Array | None = None,
@@ -66,14 +72,15 @@ def plan_tumble(
     """Choose attitudes for a tumble test.
 
     Criterion A minimises the sum of the parameters' variances (in units of g), D the volume of their confidence region.
-    Of sets whose sums are within 1 % of the least, A takes that whose worst axes have the least sum.
+    Of sets whose sums are within 1 % of the least, A takes that whose worst axes have the least sum. Where fewer
+    candidates lie 3 deg apart than attitudes are asked for, some are put down again, those first that gain most.
 
     Parameters
     ----------
-    order
-        Order of the model, 1 to 5.
     attitudes
         Number of attitudes to choose.
+    order
+        Order of the model, 0 to 5. Attitudes for order 3 show what an order 2 would silently leave in scale factors.
     criterion
         ``"A"`` or ``"D"``.
     candidates
@@ -92,9 +99,9 @@ def plan_tumble(
     ObservabilityError
         No choice among the candidates determines the model.
     """
-    size = parameter_count(order) if 1 <= order <= HIGHEST_ORDER else 0
+    size = parameter_count(order) if 0 <= order <= HIGHEST_ORDER else 0
     if not size:
-        raise OptionError(f"order {order}: expected 1 to {HIGHEST_ORDER}")
+        raise OptionError(f"order {order}: expected 0 to {HIGHEST_ORDER}")
     if criterion not in CRITERIA:
         raise OptionError(f"criterion {criterion!r}: expected one of {' '.join(CRITERIA)}")
     before = np.empty((0, 3)) if already is None else already
@@ -107,26 +114,52 @@ def plan_tumble(
         )
     free = candidates is None
     points = _sphere_candidates() if candidates is None else _distinct(candidates)
-    if len(points) < attitudes:
-        raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {attitudes}")
-    best = optimal_set(Search(order, criterion, before), points, attitudes, seed, free=free)
+    if len(points) + len(before) < size:
+        raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {size}")
+    search = Search(order, criterion, before)
+    best = optimal_set(search, points, attitudes, seed, free=free) if len(points) >= attitudes else None
+    if not free and (best is None or len(_apart(best, before)) < attitudes):
+        apart = _apart(points, before)
+        best = apart if len(apart) <= attitudes else optimal_set(search, apart, attitudes, seed, free=free)
     if best is None:
         raise ObservabilityError(
             f"{source}: no {attitudes} of the {len(points)} candidate attitudes determine order {order}"
         )
+    rounds = [best, *_put_down_again(search, points, best, attitudes)]
+    best = np.vstack(rounds)
     everything = np.vstack([before, best])
     jacobian = information_rows(everything, order)
     seen = observability(jacobian, np.full(len(everything), 1e16))
     if seen.rank < size:
         confused = " ".join(seen.confused(parameter_names(order)))
         raise ObservabilityError(f"{source}: the candidate attitudes cannot separate {confused} of order {order}")
-    near = np.vstack([best, before])
-    if (best @ near.T - 2 * np.eye(len(best), len(near)) > np.cos(CLOSEST)).any():
-        there = f" and from the {len(before)} already there" if len(before) else ""
-        raise OptionError(
-            f"{source}: no {attitudes} of the {len(points)} candidate attitudes are 3 deg apart from each other{there}"
-        )
-    return Plan(_shortest_path(best), order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
+    paths = np.vstack([_shortest_path(each) for each in rounds if len(each)])
+    return Plan(paths, order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
+
+
+def _apart(points: Array, before: Array) -> Array:
+    """Candidates that are no two the same attitude, nor one already there, in their order, shape (k, 3)."""
+    found = list(before)
+    for point in points:
+        if not found or (np.array(found) @ point).max() <= np.cos(CLOSEST):
+            found.append(point)
+    return np.array(found[len(before) :]).reshape(-1, 3)
+
+
+def _put_down_again(search: Search, points: Array, best: Array, attitudes: int) -> list[Array]:
+    """Attitudes that make up the number, in rounds: no attitude is put down a third time before all were twice."""
+    everywhere = best if len(best) else _apart(points, np.empty((0, 3)))
+    rows, rounds = information_rows(everywhere, search.order), list[Array]()
+    kept, left = information_rows(best, search.order), attitudes - len(best)
+    while left > 0:
+        chosen: list[int] = []
+        while len(chosen) < min(left, len(everywhere)):
+            gain = search.gain(rows, np.vstack([kept, rows[chosen]]))
+            gain[chosen] = -np.inf
+            chosen.append(int(np.argmax(gain)))
+        rounds.append(everywhere[chosen])
+        kept, left = np.vstack([kept, rows[chosen]]), left - len(chosen)
+    return rounds
 
 
 def fixture_candidates(step: float) -> Array:
