@@ -93,13 +93,12 @@ def test_apply_subtracts_the_curve_and_nothing_else(chamber, model, capsys):
     "line",
     [None, "# power_on_temperature: nan", "# power_on_temperature: 20.01", "# power_on_temperature: -20.01 degC"],
 )
-def test_outside_the_table_nothing_changes_and_one_line_says_so(chamber, tmp_path, line, capsys):
+def test_outside_the_table_nothing_is_written_and_one_line_says_why(chamber, tmp_path, line, capsys):
     file = with_head(chamber / "cycle_+0_1.csv", tmp_path / "r.csv", line)
-    assert main(["apply", str(chamber / "auto.json"), str(file), "-o", str(tmp_path / "out.csv")]) == 0
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "temperature" in error
-    before, after = il.read(file), il.read(tmp_path / "out.csv")
+    assert "temperature" in refused(capsys, "apply", chamber / "auto.json", file, "-o", tmp_path / "out.csv")
+    assert not (tmp_path / "out.csv").exists()
+    before = il.read(file)
+    after = il.apply(il.load(chamber / "auto.json"), before)
     for name in before.columns:
         np.testing.assert_array_equal(after.column(name), before.column(name))
 

@@ -19,7 +19,7 @@ from imulab.runtime import Unit
 from imulab.tables import tables_of
 from imulab.tumble.apply import apply_gyro, apply_tumble, beyond_test
 from imulab.units import from_si
-from imulab.warmup.apply import apply_warmup, record_table, temperature_warning
+from imulab.warmup.apply import apply_warmup, record_table, unchanged
 
 _FAR_IN_TEMPERATURE = 20.0
 
@@ -58,7 +58,9 @@ class Loaded:
     again: bool = False
 
 
-def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool = False) -> Loaded:
+def loaded(
+    record: Calibration | Blob, name: str | None = None, *, again: bool = False, latest_start: float = 5.0
+) -> Loaded:
     """Return a record (in double) or a blob (with its floats) ready to run.
 
     Parameters
@@ -69,16 +71,22 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         What the corrected recording calls it; procedure and serial number, or the blob's file, if not given.
     again
         Whether to correct a recording a second time.
+    latest_start
+        A recording that starts later after power-on is refused by a warm-up table, s.
 
     Raises
     ------
     RecordError
         There is nothing to apply in it, or it lacks a parameter.
     """
+
+    def started(kind: str, columns: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
+        return kind, {**columns, "latest_start": latest_start} if kind == "warmup" else columns
+
     if isinstance(record, Blob):
         # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
         sections = [
-            (str(section["kind"]), section) for section in record.text["sections"] if section["kind"] != "array"
+            started(str(section["kind"]), section) for section in record.text["sections"] if section["kind"] != "array"
         ]
         unknown = [kind for kind, _ in sections if kind not in _APPLY]
         if unknown:
@@ -93,7 +101,7 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         record_table(record)  # says in words what the core would refuse by a number
     tables = tables_of(record)
     known = name or f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
-    corrections = tuple((table.kind, table.columns) for table in tables)
+    corrections = tuple(started(table.kind, table.columns) for table in tables)
     return Loaded(Unit.of(*tables), corrections, known, (record.sealed()[0],), again)
 
 
@@ -128,12 +136,28 @@ def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: b
 
 
 def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:
-    """Correct consecutive blocks of a recording by several records in the order given."""
+    """Correct consecutive blocks of a recording by several records in the order given.
+
+    Raises
+    ------
+    DataError
+        None of the records corrects anything in it; and what `apply` raises.
+    """
     chain = [record if isinstance(record, Loaded) else loaded(record) for record in records]
-    for block in blocks:
+    for number, given in enumerate(blocks):
+        block = given
         for ready in chain:
             block = apply(ready, block)
+        if number == 0 and block is given:
+            raise DataError(next(iter(_why_unchanged(chain, given)), f"{given.name}: nothing to correct in it"))
         yield block
+
+
+def _why_unchanged(chain: Iterable[Loaded], recording: Recording) -> Iterator[str]:
+    for ready in chain:
+        for kind, columns in ready.sections:
+            if kind == "warmup" and (message := unchanged(columns, recording)):
+                yield message
 
 
 def sections_for(
@@ -170,8 +194,7 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     if mine and its and mine != its:
         found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
     found += _missing_triad(record, recording)
-    tables = _warmup_ranges(record)
-    messages = [message for low, high in tables if (message := temperature_warning(low, high, recording))]
+    messages = [message for columns in _warmup_columns(record) if (message := unchanged(columns, recording))]
     if isinstance(record, Blob) or record.procedure == "warmup":
         return [*found, *messages]
     made = record.model.get("temperature")
@@ -185,13 +208,11 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     ]
 
 
-def _warmup_ranges(record: Calibration | Blob) -> list[tuple[float, float]]:
-    """Power-on temperatures that the record's or blob's warm-up table covers, degC."""
+def _warmup_columns(record: Calibration | Blob) -> list[Mapping[str, Any]]:
+    """What the sections of the record's or blob's warm-up tables say of themselves."""
     if isinstance(record, Blob):
-        ranges = [section["range"] for section in record.text["sections"] if section["kind"] == "warmup"]
-    else:
-        ranges = [record_table(record).temperatures[[0, -1]]] if record.procedure == "warmup" else []
-    return [(float(low), float(high)) for low, high in ranges]
+        return [section for section in record.text["sections"] if section["kind"] == "warmup"]
+    return [table.columns for table in tables_of(record)] if record.procedure == "warmup" else []
 
 
 def beyond_test_of(record: Calibration | Blob, recording: Recording) -> tuple[int, float]:

@@ -94,6 +94,8 @@ def monotone_range(nonlinearity: Array) -> tuple[float, float]:
 # ---- centrifuge ----------------------------------------------------------------------------------------------------
 
 
+_COLDEST, _HOTTEST, _HAIR = -273.15, 1000.0, 1e-3
+"""How far a table is held beyond its edges, degC, and how soon its slope ends there, K."""
 _CURVE_UNITS = {"K0": "rad/s/(m/s^2)", "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2", "direction": "rad"}
 
 
@@ -156,6 +158,8 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
     constants = np.zeros(3)
     if table["model"] == "exponential":
         constants[: len(table["time_constants"])] = table["time_constants"]
+    if table.get("beyond", "zero") == "hold":
+        temperatures, coefficients, slopes = _held(table["model"], temperatures, coefficients, slopes)
     axes = list(table["axes"])
     rows = len(temperatures) - (table["model"] == "interval-cubic")
     terms = len(table["time_constants"]) if table["model"] == "exponential" else 4
@@ -177,7 +181,32 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
         Field("slope", slopes, pointed=True),
     )
     ends = [float(temperatures[0]), float(temperatures[-1])]
-    return Table("warmup", fields, {"axes": axes, "units": list(table["units"]), "range": ends, "end": _end(table)})
+    return Table(
+        "warmup",
+        fields,
+        {"axes": axes, "units": list(table["units"]), "range": ends, "end": _end(table), "exit": table["exit"]},
+    )
+
+
+def _held(
+    model: str, temperatures: Array, coefficients: Array, slopes: Array | None
+) -> tuple[Array, Array, Array | None]:
+    """Return a table that goes on as at its edges: outer intervals that reach further, or knots of the same value.
+
+    A unit needs no rule of its own for that. Slopes of exponential amplitudes end a hair beyond the outer knots.
+    """
+    low, high = float(temperatures[0]), float(temperatures[-1])
+    if model == "interval-cubic":
+        return np.array([_COLDEST, *temperatures[1:-1], _HOTTEST]), coefficients, None
+    outside = ([_COLDEST], [_HOTTEST]) if slopes is None else ([_COLDEST, low - _HAIR], [high + _HAIR, _HOTTEST])
+    count = len(outside[0])
+    ends = [np.repeat(coefficients[[k]], count, axis=0) for k in (0, -1)]
+    level = None if slopes is None else np.zeros_like(ends[0])
+    return (
+        np.array([*outside[0], *temperatures, *outside[1]]),
+        np.concatenate([ends[0], coefficients, ends[1]]),
+        None if slopes is None or level is None else np.concatenate([level, slopes, level]),
+    )
 
 
 def _end(table: Mapping[str, Any]) -> float:

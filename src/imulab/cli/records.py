@@ -23,6 +23,7 @@ from imulab.cli.options import (
     heard,
     is_json,
     naming,
+    quantity,
     warn,
 )
 from imulab.errors import ImulabError, OptionError, RecordError
@@ -46,6 +47,10 @@ def apply(
     instance: Instance = None,
     window: Window = None,
     again: Annotated[bool, typer.Option("--again", help="Correct a recording that a record corrected before.")] = False,
+    latest_start: Annotated[
+        str,
+        typer.Option("--latest-start", help="Refuse a recording that starts later after power-on (warm-up)."),
+    ] = "5 s",
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
@@ -66,10 +71,17 @@ def apply(
                 f"{file}: expected a recording as the last file, found a record: records go first"
             ) from None
         raise
-    chain = []
+    chain, start = [], quantity(latest_start, "--latest-start", "time", "s")
     for name, record in zip(names, records, strict=True):
         with naming(name):
-            chain.append(loaded(record, Path(name).name, again=again))
+            chain.append(
+                loaded(
+                    record,
+                    Path(name).name,
+                    again=again,
+                    latest_start=start,
+                )
+            )
     blocks = heard(read_blocks(file, layout, **part), notes=False)
     write_out(apply_blocks(chain, _warned(records, blocks)), output)
 

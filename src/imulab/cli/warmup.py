@@ -154,6 +154,9 @@ def fit(
     exit_rule: Annotated[str, typer.Option("--exit", help="From T_M on: zero, hold or taper.")] = "zero",
     taper_time: Annotated[str, typer.Option("--taper-time", help="How long a taper takes.")] = "60 s",
     pool: Annotated[str, typer.Option(help="unit, or type: several units share one table.")] = "unit",
+    beyond: Annotated[
+        str, typer.Option(help="Beyond the outer temperatures: zero (no correction) or hold (as there).")
+    ] = "zero",
     axes: Annotated[str | None, typer.Option(metavar="A,A,...", help="Columns to fit; all if not given.")] = None,
     latest_start: Annotated[
         str, typer.Option("--latest-start", help="A first sample later after power-on is refused.")
@@ -184,6 +187,7 @@ def fit(
         "taper_time": taper_time,
         "pool": pool,
         "axes": axes,
+        "beyond": beyond,
         "latest_start": latest_start,
         "temperature_column": "yes" if temperature_column else "no",
         "layout": layout,

@@ -39,11 +39,21 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "taper_time": quantity(texts.get("taper_time", "60 s"), name("taper-time"), "time", "s"),
         "pool": texts.get("pool", "unit"),
         "axes": None if axes is None else _names(axes, name("axes")),
+        "beyond": texts.get("beyond", "zero"),
     }
     check_options(
         *(
             fit[key]
-            for key in ("model", "temperatures", "tolerance", "settling_time", "exit_rule", "taper_time", "pool")
+            for key in (
+                "model",
+                "temperatures",
+                "tolerance",
+                "settling_time",
+                "exit_rule",
+                "taper_time",
+                "pool",
+                "beyond",
+            )
         )
     )
     return {
@@ -124,6 +134,7 @@ TASK = Task(
         "taper_time",
         "pool",
         "axes",
+        "beyond",
         "latest_start",
         "temperature_column",
         "layout",

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from imulab.calibration import Calibration
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Recording, check_time
 from imulab.runtime import Unit
 from imulab.units import conversion_factor
 from imulab.warmup.model import Table, table_from
-from imulab.warmup.poweron import power_on_temperature
+from imulab.warmup.poweron import LATEST_START, check_clock, check_start, power_on_temperature
 
 _TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
 _LAST_TICK = 2**32 - 1
@@ -25,14 +25,15 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     """Return the recording with ``output - Z(t; T)`` in the axes of the record, their units kept.
 
     `t` is the column time, counted from power-on; `T` is ``power_on_temperature`` of the head of the file. Without it,
-    or outside the table, the recording passes unchanged (`temperature_warning` says so).
+    or outside the table, the recording passes unchanged (`unchanged` says why).
 
     Raises
     ------
     UnitError
         A column's unit cannot be converted to the record's.
     DataError
-        The recording lacks time or an axis of the record.
+        The recording lacks time or an axis of the record; its time does not count from power-on, does not rise or is
+        of another unit.
     """
     factors = []
     for axis, made_in in zip(columns["axes"], columns["units"], strict=True):
@@ -46,8 +47,9 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     time = recording.time
     if time is None:
         raise DataError(f"{recording.name}: no column time; a warm-up record needs the time since power-on")
+    time = _checked(recording, columns.get("latest_start", LATEST_START))
     temperature = power_on_temperature(recording)
-    if temperature is None:
+    if temperature is None or unchanged(columns, recording) is not None:
         return recording
     tick = _TICK if columns["end"] < _LONG else _LONG_TICK
     axes = list(columns["axes"])
@@ -56,44 +58,58 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     buffer = np.empty(min(_PIECE, len(recording)))
     for start in range(0, len(recording), _PIECE):
         piece = slice(start, start + _PIECE)
-        ticks, unknown = _ticks(time[piece], tick, buffer)
+        ticks = _ticks(time[piece], tick, buffer)
         into = [column[piece] for column in corrected]
         _, active = unit.warmup(
             temperature, tick, ticks, [column[piece] for column in given], factors=factors, into=into
         )
         if not active:
             return recording
-        if unknown is not None:
-            for values in into:
-                values[unknown] = np.nan
     return recording.with_columns(dict(zip(axes, corrected, strict=True)), {})
 
 
-def _ticks(time: Array, tick: float, buffer: Array) -> tuple[NDArray[np.uint32], NDArray[np.bool_] | None]:
-    """Return times in whole ticks, and which of them are no numbers, if any; `buffer` has room for them."""
+def _checked(recording: Recording, latest: float) -> Array:
+    """Return the column time, s, once it is sure that it counts from power-on; a later block has no start."""
+    time = check_time(recording)
+    if time.size and recording.first_row == 1:
+        check_start(recording, float(time[0]), latest)
+        check_clock(recording, time)
+    return time
+
+
+def _ticks(time: Array, tick: float, buffer: Array) -> NDArray[np.uint32]:
+    """Return times in whole ticks; `buffer` has room for them."""
     count = np.divide(time, tick, out=buffer[: len(time)])
     np.rint(count, out=count)
-    if count.min() >= 0 and count.max() <= _LAST_TICK:  # also False where a time is NaN
-        return count.astype(np.uint32), None
-    unknown = ~np.isfinite(time)
-    count[unknown] = 0
-    return np.clip(count, 0, _LAST_TICK).astype(np.uint32), unknown if unknown.any() else None
+    return np.clip(count, 0, _LAST_TICK, out=count).astype(np.uint32)
 
 
-def temperature_warning(low: float, high: float, recording: Recording) -> str | None:
-    """Return why a table from `low` to `high`, degC, leaves a recording unchanged, in one line, or None."""
+def unchanged(columns: Mapping[str, Any], recording: Recording) -> str | None:
+    """Return why the table of a record or blob leaves a recording unchanged, in one line, or None.
+
+    `columns` are those of its section in the C core: range of temperatures, degC, and when the correction ends, s.
+    """
+    low, high = columns["range"]
     temperature = power_on_temperature(recording)
     if temperature is None:
         return (
             f"{recording.name}: no power_on_temperature in the head of the file: nothing corrected; "
             "expected a line such as '# power_on_temperature: 21.5'"
         )
-    if low <= temperature <= high:
-        return None
-    return (
-        f"{recording.name}: power-on temperature {temperature:g} degC is not within the table, "
-        f"{low:g} to {high:g} degC: nothing corrected"
-    )
+    if not low <= temperature <= high:
+        return (
+            f"{recording.name}: power-on temperature {temperature:g} degC is not within the table, "
+            f"{low:g} to {high:g} degC: nothing corrected"
+            + ("" if np.isnan(temperature) else " (warmup fit --beyond hold: a table that goes on as at its edges)")
+        )
+    time = recording.time
+    ends = columns["end"] if columns.get("exit", "hold") != "hold" else np.inf
+    if recording.first_row == 1 and time is not None and time.size and time[0] >= ends:
+        return (
+            f"{recording.name}: starts {time[0]:.6g} s after power-on, where the correction has ended "
+            f"({ends:g} s): nothing corrected"
+        )
+    return None
 
 
 def record_table(record: Calibration) -> Table:

@@ -12,16 +12,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
 from imulab.recording import Array, Recording, Source, check_finite, check_time
 from imulab.units import conversion_factor, parse_unit, to_si
-from imulab.warmup.poweron import head_temperature, power_on_temperature
+from imulab.warmup.poweron import LATEST_START, check_clock, check_start, head_temperature, power_on_temperature
 
 BIN = 1.0
 """Width of a bin, s."""
-LATEST_START = 5.0
-"""A first sample later than this after power-on is refused, s."""
+_DAY = 86400.0
 _AXIS = re.compile(r"(gyro|accel)_.+")
 _SI = {"rate": "rad/s", "acceleration": "m/s^2"}
 
@@ -88,6 +88,8 @@ class Cycle:
         ``model`` of the head of the file.
     file_units
         Units of the axes as the file has them.
+    zeros
+        Rows left out because every axis is exactly zero in them, as where a logger writes what it has not got.
     """
 
     bins: Bins
@@ -103,6 +105,7 @@ class Cycle:
     source: Source | None = None
     sensor_model: str | None = None
     file_units: tuple[str, ...] = ()
+    zeros: int = 0
 
 
 def find_power_cycle(
@@ -128,7 +131,8 @@ def find_power_cycle(
     Raises
     ------
     DataError
-        No power-on temperature, time that does not start at power-on or does not rise, NaN, or no axes.
+        No power-on temperature, time that does not start at power-on, does not rise or is of another unit, NaN, or no
+        axes.
     UnitError
         The axes of one kind have different units.
     """
@@ -136,7 +140,7 @@ def find_power_cycle(
     pieces: list[tuple[np.ndarray, Array, Array]] = []
     head: Recording | None = None
     axes: tuple[str, ...] = ()
-    temperature, first, last, first_reading = np.nan, 0.0, -np.inf, None
+    temperature, first, last, first_reading, zeros = np.nan, 0.0, -np.inf, None, 0
     for block in blocks:
         time = check_time(block)
         if not time.size:
@@ -146,16 +150,27 @@ def find_power_cycle(
             axes = _axes(block)
             first, first_reading = float(time[0]), _first_reading(block)
             temperature = _power_on(block, temperature_from_column, first_reading)
-            _check_start(block, first, latest_start)
+            check_start(block, first, latest_start)
+            check_clock(block, time)
         elif time[0] <= last:
             raise DataError(
                 f"{block.name}: {block.place(0)}, column time: time does not rise: "
                 f"expected more than {last:.9g} s, found {time[0]:.9g} s"
             )
         last = float(time[-1])
-        pieces.append(_accumulate(block, axes, time))
+        if last > _DAY:
+            raise DataError(
+                f"{block.name}: {block.place(len(time) - 1)}, column time: {last:.6g} s after power-on; expected a "
+                "power cycle of less than a day: are these milliseconds titled as seconds?"
+            )
+        here = _empty_rows(block, axes)
+        zeros += int(here.sum())
+        if not here.all():
+            pieces.append(_accumulate(block, axes, time, ~here if here.any() else None))
     if head is None:
         raise DataError("no samples")
+    if not pieces:
+        raise DataError(f"{head.name}: every row is zero in {' '.join(axes)}")
     return Cycle(
         bins=_bins(pieces, [conversion_factor(head.units[axis], _si_unit(head, axis)) for axis in axes]),
         axes=axes,
@@ -170,6 +185,7 @@ def find_power_cycle(
         source=source or head.source,
         sensor_model=head.metadata.get("model"),
         file_units=tuple(parse_unit(head.units[axis]).symbol for axis in axes),
+        zeros=zeros,
     )
 
 
@@ -209,19 +225,6 @@ def _power_on(recording: Recording, from_column: bool, first_reading: float | No
     raise DataError(f"{recording.name}: {found}; expected a line such as '# power_on_temperature: -20'")
 
 
-def _check_start(recording: Recording, first: float, latest: float) -> None:
-    if first < 0:
-        raise DataError(
-            f"{recording.name}: {recording.place(0)}, column time: starts {-first:.6g} s before power-on; "
-            "expected time 0 at power-on"
-        )
-    if first > latest:
-        raise DataError(
-            f"{recording.name}: {recording.place(0)}, column time: the first sample is {first:.6g} s after power-on; "
-            f"expected at most {latest:g} s (time 0 is power-on; --latest-start allows more)"
-        )
-
-
 def _chamber(recording: Recording) -> float | None:
     for key in ("chamber_temperature", "set_point"):
         value = head_temperature(recording, key)
@@ -230,11 +233,24 @@ def _chamber(recording: Recording) -> float | None:
     return None
 
 
-def _accumulate(block: Recording, axes: tuple[str, ...], time: Array) -> tuple[np.ndarray, Array, Array]:
+def _empty_rows(block: Recording, axes: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Return which rows are zero in all of two axes or more."""
+    empty: NDArray[np.bool_] = block.columns[axes[0]] == 0
+    if len(axes) < 2 or not empty.any():
+        return np.zeros(len(empty), dtype=np.bool_)
+    for axis in axes[1:]:
+        empty = empty & (block.columns[axis] == 0)
+    return empty
+
+
+def _accumulate(
+    block: Recording, axes: tuple[str, ...], time: Array, used: NDArray[np.bool_] | None = None
+) -> tuple[np.ndarray, Array, Array]:
     """Return bin numbers (k,), moments (k, 4), and per axis mean and sum of squared deviations (k, axes, 2).
 
     Moments are sums of 1, x, x^2, x^3 with x the time from the bin's middle; the rest is in the units of the file.
     """
+    time = time if used is None else time[used]
     number = np.floor(time / BIN).astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
     sizes = np.diff(first, append=len(time))
@@ -248,7 +264,7 @@ def _accumulate(block: Recording, axes: tuple[str, ...], time: Array) -> tuple[n
             power = power * x
     sums = np.empty((len(first), len(axes), 2))
     for a, axis in enumerate(axes):
-        values = block.columns[axis]
+        values = block.columns[axis] if used is None else block.columns[axis][used]
         total = np.add.reduceat(values, first)
         if not np.isfinite(total).all():
             check_finite(block, [axis])

@@ -37,6 +37,7 @@ def exhibits(record: Calibration) -> Exhibits:
     facts = [
         ("left at the tests", _text(chosen["training"], head, factor, f" {label}")),
         ("temperature left out", _text(chosen["left_temperature"], head, factor, f" {label}")),
+        *_worst(record, table, head, factor, label),
         ("repeatability", _text(floor, head, factor, f" {label}")),
         (jump[0], f"{_largest(chosen[jump[1]], head, factor)} {label}"),
         ("T_M", f"{table.settling_time:g} s"),
@@ -61,6 +62,18 @@ def exhibits(record: Calibration) -> Exhibits:
         facts=facts,
         items=items,
     )
+
+
+def _worst(
+    record: Calibration, table: WarmupTable, index: list[int], factor: float, label: str
+) -> list[tuple[str, str]]:
+    """What to expect at the worst power-on temperature; nothing where a record does not hold it."""
+    at = record.fit.get("worst_temperature")
+    names = [f"worst_temperature_error_{table.axes[i]}" for i in index]
+    if at is None or not all(name in record.parameters for name in names):
+        return []
+    error = _text([record.value(name) for name in names], list(range(len(names))), factor, f" {label}")
+    return [(f"at worst, near {at['value']:.3g} °C", error)]
 
 
 def _handmade(table: WarmupTable) -> Exhibits:

@@ -21,8 +21,9 @@ from imulab.warmup.judge import (
     judge,
     judge_none,
     repeatability,
+    worst_between,
 )
-from imulab.warmup.model import EXITS, MODELS, SOURCE_TEMPERATURES, Table
+from imulab.warmup.model import BEYOND, EXITS, MODELS, SOURCE_TEMPERATURES, Table
 from imulab.warmup.record import make_record
 from imulab.warmup.solve import coefficient_covariance, statistics
 
@@ -73,6 +74,7 @@ def fit_warmup(
     taper_time: float = 60.0,
     pool: str = "unit",
     axes: Sequence[str] | None = None,
+    beyond: str = "zero",
 ) -> WarmupFit:
     """Fit the curve of an output's zero after power-on, ``Z(t; T)``, to power cycles at several temperatures.
 
@@ -99,6 +101,8 @@ def fit_warmup(
         ``unit``: all cycles are of one unit. ``type``: several units share a table, with a random effect per unit.
     axes
         Columns to fit; all gyro_* and accel_* if not given.
+    beyond
+        What the unit does at power-on temperatures beyond the outer ones: ``zero``, nothing; ``hold``, as there.
 
     Raises
     ------
@@ -112,7 +116,7 @@ def fit_warmup(
     Source: start-up zero error compensation of MEMS inertial instruments (patent record 38161583), and
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
     """
-    at = check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool)
+    at = check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool, beyond)
     if not cycles:
         raise DataError("no power cycles: expected at least one file for each calibration temperature")
     found = [find_power_cycle(item) if isinstance(item, Recording) else item for item in cycles]
@@ -131,7 +135,7 @@ def fit_warmup(
     ]
     chosen = choose(curves, rows)
     covariance = _covariance(curves, chosen, by_unit)
-    table = chosen.table.with_exit(exit_rule, taper_time)
+    table = chosen.table.with_rules(exit_rule, taper_time, beyond)
     record = make_record(
         curves=curves,
         rows=rows,
@@ -141,6 +145,7 @@ def fit_warmup(
         covariance=covariance,
         settled=settled,
         by_unit=by_unit,
+        worst=worst_between(curves, chosen, spread),
         options={
             "model": model,
             "temperatures": at.tolist(),
@@ -148,6 +153,7 @@ def fit_warmup(
             "settling_time": settling_time,
             "exit": exit_rule,
             "pool": pool,
+            "beyond": beyond,
         },
     )
     return WarmupFit(record, table, tuple(rows), spread, curves)
@@ -171,6 +177,7 @@ def check_options(
     exit_rule: str,
     taper_time: float,
     pool: str,
+    beyond: str = "zero",
 ) -> Array:
     """Check what can be checked before there is data, and return the temperatures, degC, shape (k,).
 
@@ -183,6 +190,7 @@ def check_options(
         ("model", model, (*MODELS, "auto")),
         ("exit", exit_rule, EXITS),
         ("pool", pool, POOLS),
+        ("beyond", beyond, BEYOND),
     ):
         if value not in known:
             raise OptionError(f"{name} {value!r}: expected one of {' '.join(known)}")

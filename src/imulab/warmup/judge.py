@@ -160,6 +160,45 @@ def _leave_temperatures(
     return errors, found
 
 
+@dataclass(frozen=True)
+class Worst:
+    """What to expect at the power-on temperature between calibration temperatures where a table is worst.
+
+    Attributes
+    ----------
+    temperature
+        degC.
+    error
+        Root mean square over t < T_M of one start there, its repeatability included, shape (axes,).
+    """
+
+    temperature: float
+    error: Array
+
+
+def worst_between(curves: Curves, chosen: Judged, spread: Repeatability) -> Worst | None:
+    """Return the error to expect at the worst power-on temperature, from temperatures left out of the fit.
+
+    Interpolation over a gap h errs by up to ``f'' h^2 / 8``; a temperature between neighbours h1 and h2 away, left
+    out, by ``f'' h1 h2 / 2``. Each gap takes the larger f'' of its two ends. None with fewer than three temperatures,
+    and for ``interval-cubic``, whose errors at its end points show what its wide intervals do.
+    """
+    t = curves.temperatures
+    left = np.nan_to_num(chosen.left_by_temperature)
+    if len(t) < 3 or chosen.model == "interval-cubic":
+        return None
+    gap = np.diff(t)
+    repeated = np.nan_to_num(spread.cycle)
+    own = np.sqrt(np.maximum(left[1:-1] ** 2 - repeated**2, 0.0))
+    bend = np.zeros_like(left)
+    bend[1:-1] = own / (gap[:-1] * gap[1:])[:, None]
+    between = np.maximum(bend[:-1], bend[1:]) * (gap**2 / 4)[:, None]
+    total = np.sqrt(between**2 + np.nan_to_num(chosen.training) ** 2 + repeated**2)
+    size = np.sqrt(np.mean(curves.mean**2, axis=(0, 1)))
+    place = int(np.argmax((total / np.maximum(size, 1e-300)).max(axis=1)))
+    return Worst(float(t[place] + gap[place] / 2), total[place])
+
+
 def _jackknife(values: Array, count: int) -> Array | None:
     """Covariance of the time scales from those found with each temperature left out (Efron and Tibshirani 1993, 11)."""
     n = len(values)

@@ -9,7 +9,7 @@ interpolated between knots: linearly, or for exponentials by cubic Hermite polyn
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from imulab.units import conversion_factor, parse_unit
 
 MODELS = ("interval-cubic", "knot-cubic", "knot-log-cubic", "exponential")
 EXITS = ("zero", "hold", "taper")
+BEYOND = ("zero", "hold")
 MOST_CONSTANTS = 3
 """Time constants of an exponential that the unit has room for."""
 SOURCE_TEMPERATURES = (-40.0, -30.0, -20.0, -10.0, 0.0, 40.0, 50.0, 60.0)
@@ -52,6 +53,8 @@ class Table:
         Of ``exponential``, s.
     slopes
         Derivatives of the amplitudes by temperature at the knots, 1/K, shape of `coefficients` (``exponential``).
+    beyond
+        At power-on temperatures beyond the outer ones: ``zero``, no correction; ``hold``, that of the outer one.
     """
 
     model: str
@@ -65,6 +68,7 @@ class Table:
     time_scale: float | None = None
     time_constants: tuple[float, ...] = ()
     slopes: Array | None = None
+    beyond: str = "zero"
 
     @property
     def scales(self) -> tuple[float, ...]:
@@ -89,11 +93,15 @@ class Table:
             section["time_constants"] = list(self.time_constants)
         section["exit"] = self.exit
         section["taper_time"] = self.taper_time
+        if self.beyond != "zero":
+            section["beyond"] = self.beyond
         return section
 
     def coefficients_at(self, temperature: float) -> Array | None:
         """Return the coefficients at a power-on temperature, shape (axes, p); None outside the table or for NaN."""
         edges = self.temperatures
+        if self.beyond == "hold":
+            temperature = float(np.clip(temperature, edges[0], edges[-1]))
         if not edges[0] <= temperature <= edges[-1]:
             return None
         row = min(int(np.searchsorted(edges, temperature, side="right")) - 1, len(edges) - 2)
@@ -109,11 +117,9 @@ class Table:
         turns = s * (1 - s) ** 2 * self.slopes[row] - s * s * (1 - s) * self.slopes[row + 1]
         return np.asarray(ends + width * turns)
 
-    def with_exit(self, rule: str, taper_time: float) -> Table:
-        """Return the table with another exit rule."""
-        from dataclasses import replace
-
-        return replace(self, exit=rule, taper_time=taper_time)
+    def with_rules(self, rule: str, taper_time: float, beyond: str) -> Table:
+        """Return the table with another exit rule, and another rule beyond its temperatures."""
+        return replace(self, exit=rule, taper_time=taper_time, beyond=beyond)
 
 
 def evaluate(table: Table, time: Array, temperature: float) -> Array | None:
@@ -174,6 +180,7 @@ def table_from(section: Mapping[str, Any]) -> Table:
             settling_time=float(section["settling_time"]),
             exit=str(section["exit"]),
             taper_time=float(section.get("taper_time", 60.0)),
+            beyond=str(section.get("beyond", "zero")),
             time_scale=float(section["time_scale"]) if model == "knot-log-cubic" else None,
             time_constants=tuple(map(float, section["time_constants"])) if model == "exponential" else (),
             slopes=np.array(section["slopes"], dtype=np.float64) if model == "exponential" else None,
@@ -199,6 +206,7 @@ def check_table(table: Table) -> None:
     shape = (rows, len(table.axes), size)
     problems = [
         (table.model not in MODELS, f"model {table.model!r}; known models: {' '.join(MODELS)}"),
+        (table.beyond not in BEYOND, f"beyond {table.beyond!r}; known rules: {' '.join(BEYOND)}"),
         (table.exit not in EXITS, f"exit {table.exit!r}; known rules: {' '.join(EXITS)}"),
         (
             table.temperatures.ndim != 1 or len(table.temperatures) < 2 or not (np.diff(table.temperatures) > 0).all(),

@@ -1,12 +1,58 @@
-"""What the head of a file says about a power cycle."""
+"""What a file says about a power cycle: its temperature, and that its time counts from power-on."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from imulab.errors import DataError, UnitError
-from imulab.recording import Recording
+from imulab.recording import Array, Recording
 from imulab.units import parse_unit, to_si
+
+LATEST_START = 5.0
+"""A first sample later than this after power-on is refused, s."""
+_SLOWEST, _FASTEST = 4.0, 2e-5
+"""Sampling periods, s, that no recording of a warm-up has."""
+
+
+def check_start(recording: Recording, first: float, latest: float) -> None:
+    """Check that time counts from power-on.
+
+    Raises
+    ------
+    DataError
+        The first sample lies before power-on, or more than `latest`, s, after it.
+    """
+    if first < 0:
+        raise DataError(
+            f"{recording.name}: {recording.place(0)}, column time: starts {-first:.6g} s before power-on; "
+            "expected time 0 at power-on"
+        )
+    if first > latest:
+        raise DataError(
+            f"{recording.name}: {recording.place(0)}, column time: the first sample is {first:.6g} s after power-on; "
+            f"expected at most {latest:g} s (time 0 is power-on; --latest-start allows more)"
+        )
+
+
+def check_clock(recording: Recording, time: Array) -> None:
+    """Check that times, s, are not of another unit than their column's title says.
+
+    Raises
+    ------
+    DataError
+        They are so far apart, or so close, as those of no recording of a warm-up.
+    """
+    if len(time) < 3:
+        return
+    step = float(np.median(np.diff(time)))
+    if step > _SLOWEST or step < _FASTEST:
+        other = "milliseconds titled as seconds" if step > _SLOWEST else "seconds titled as a smaller unit"
+        raise DataError(
+            f"{recording.name}: column time [{recording.units['time']}]: a sample every {step:.4g} s; "
+            f"expected {_FASTEST:g} to {_SLOWEST:g} s: are these {other}?"
+        )
 
 
 def power_on_temperature(recording: Recording) -> float | None:

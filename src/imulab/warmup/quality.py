@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from imulab.verdict import Bad, Note
 from imulab.warmup.curves import SETTLED, Curves
 from imulab.warmup.engineering import in_engineering
-from imulab.warmup.judge import Judged
+from imulab.warmup.judge import Judged, Worst
 from imulab.warmup.solve import SCALE_LIMIT
 
 _COLD = 1.0
@@ -20,6 +22,9 @@ _WIDE = 20.0
 _AT_LIMIT = 1.02
 _COUNTS = 0.05
 _ROUNDING = 1e-12
+_PAUSE, _MOSTLY = 5, 0.5
+"""Seconds of exactly repeated samples that are no coarse output, in a column that changes most of the time."""
+_MORE = 1.2
 _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 """A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
 
@@ -27,6 +32,7 @@ _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]:
     """Return the warnings on a test and the table made from it."""
     return [
+        *_dead(curves),
         *_ends(curves, settled),
         *_starts(curves),
         *_sizes(curves),
@@ -37,6 +43,65 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
         *_intervals(curves, chosen),
         *_constants(curves, chosen),
     ]
+
+
+def expectations(curves: Curves, chosen: Judged, worst: Worst | None, beyond: str) -> list[str]:
+    """Return what a unit in use has to expect of a table, beyond what the tests show of it."""
+    found: list[str] = []
+    stated = chosen.left_temperature
+    if worst is not None and stated is not None and (worst.error > _MORE * stated + _ROUNDING).any():
+        said = [
+            f"{in_engineering(max(worst.error[i] for i in index), curves.units[index[0]])} ({kind})"
+            for kind, index in curves.kinds().items()
+        ]
+        found.append(
+            Note(
+                f"at the worst power-on temperature, near {worst.temperature:.3g} degC, expect {' and '.join(said)} "
+                "rms, more than the temperatures left out of the fit show: measure there"
+            )
+        )
+    low, high = curves.temperatures[[0, -1]]
+    outside = (curves.power_on < low) | (curves.power_on > high)
+    if beyond == "zero" and outside.any():
+        edge = np.isin(curves.group, (0, len(curves.temperatures) - 1))
+        share = 100 * outside.sum() / edge.sum()
+        found.append(
+            Note(
+                f"{int(outside.sum())} of {len(outside)} power cycles ({share:.0f} % of those at the outer "
+                f"temperatures) began outside {low:g} to {high:g} degC: such starts get no correction in use, unless "
+                "--beyond hold goes on as at the edges"
+            )
+        )
+    return found
+
+
+def _dead(curves: Curves) -> list[str]:
+    """Columns that never change while others do, for a cycle or for a while, and rows of zeros."""
+    found: list[str] = []
+    stuck: dict[str, list[str]] = {}
+    paused: dict[str, list[str]] = {}
+    for cycle in curves.cycles:
+        still = (cycle.bins.variance == 0) & (cycle.bins.count > 1)[:, None]
+        constant = still.all(axis=0) & (np.ptp(cycle.bins.mean, axis=0) == 0)
+        for i, axis in enumerate(cycle.axes):
+            if constant[i]:
+                stuck.setdefault(axis, []).append(cycle.name)
+            elif (longest := _longest(still[:, i])) >= _PAUSE and still[:, i].mean() < _MOSTLY:
+                paused.setdefault(axis, []).append(f"{cycle.name} ({longest} s)")
+    for axis, names in stuck.items():
+        found.append(Bad(f"{axis} never changes in {_named(names)}: is it connected? --axes leaves a column out"))
+    for axis, names in paused.items():
+        found.append(Bad(f"{axis} is stuck for a while in {_named(names)}: its samples repeat exactly"))
+    empty = [f"{cycle.name} ({cycle.zeros})" for cycle in curves.cycles if cycle.zeros]
+    if empty:
+        found.append(f"rows in which every axis is exactly zero were left out: {_named(empty)}")
+    return found
+
+
+def _longest(flags: NDArray[np.bool_]) -> int:
+    """Length of the longest run of true."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
 def _named(names: list[str]) -> str:

@@ -10,9 +10,9 @@ import numpy as np
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.recording import Array
 from imulab.warmup.curves import Curves
-from imulab.warmup.judge import Judged, Repeatability
-from imulab.warmup.model import Table, exit_jump
-from imulab.warmup.quality import quality_warnings
+from imulab.warmup.judge import Judged, Repeatability, Worst
+from imulab.warmup.model import Table, evaluate, exit_jump
+from imulab.warmup.quality import expectations, quality_warnings
 
 _DIGITS = 7
 
@@ -27,10 +27,11 @@ def make_record(
     covariance: Array | None,
     settled: bool,
     by_unit: bool,
+    worst: Worst | None,
     options: Mapping[str, Any],
 ) -> Calibration:
     """Turn a fitted table and what is known of its errors into a record."""
-    parameters, names, matrix = _parameters(curves, chosen, spread)
+    parameters, names, matrix = _parameters(curves, chosen, spread, worst)
     serials = sorted({cycle.serial for cycle in curves.cycles if cycle.serial})
     models = {cycle.sensor_model for cycle in curves.cycles if cycle.sensor_model}
     sensor = {"serial": serials[0]} if len(serials) == 1 else {}
@@ -65,21 +66,23 @@ def make_record(
                 "degrees_of_freedom": spread.freedom,
                 "unit": None if spread.unit is None else _numbers(spread.unit),
             },
+            "worst_temperature": None if worst is None else {"value": worst.temperature, "unit": "degC"},
             "exit_rms": _numbers(np.sqrt(np.mean(exit_jump(table) ** 2, axis=0))),
             "noise": _numbers(np.sqrt(curves.noise)),
+            "curve_misfit": misfit(curves, table),
             "coefficient_covariance": None if covariance is None else covariance.tolist(),
         },
         options={key: value for key, value in options.items() if value is not None},
         data=_data(curves),
         sensor=sensor,
         sources=tuple(cycle.source for cycle in curves.cycles if cycle.source is not None),
-        warnings=tuple(quality_warnings(curves, chosen, settled)),
+        warnings=(*quality_warnings(curves, chosen, settled), *expectations(curves, chosen, worst, table.beyond)),
         sections={"table": table.to_section()},
     )
 
 
 def _parameters(
-    curves: Curves, chosen: Judged, spread: Repeatability
+    curves: Curves, chosen: Judged, spread: Repeatability, worst: Worst | None
 ) -> tuple[dict[str, Parameter], tuple[str, ...], Array]:
     """Return T_M, time scales, and per axis what cycles repeat to and the model leaves; names and covariance."""
     found = {"settling_time": Parameter(curves.settling_time, None, "s")}
@@ -105,6 +108,7 @@ def _parameters(
             ("training_error", chosen.training),
             ("left_cycle_error", chosen.left_cycle),
             ("left_temperature_error", chosen.left_temperature),
+            ("worst_temperature_error", None if worst is None else worst.error),
             ("edge_jump", chosen.edge_jump),
             ("exit_jump", chosen.exit_jump),
         ):
@@ -159,6 +163,26 @@ def _data(curves: Curves) -> dict[str, Any]:
             }
         )
     return {"cycles": cycles}
+
+
+def misfit(curves: Curves, table: Table) -> dict[str, Any]:
+    """Return what the model cannot follow of the mean curves: rms over the temperatures in each bin of time.
+
+    White noise is taken off. To be added to the variance of a curve from ``coefficient_covariance``, which holds what
+    does not repeat.
+    """
+    mean, seconds = curves.group_means()
+    middle = 0.5 * (curves.edges[1:] + curves.edges[:-1])
+    inside = middle < table.settling_time
+    total = np.zeros((int(inside.sum()), len(curves.axes)))
+    for k, at in enumerate(curves.temperatures):
+        own = np.clip(curves.power_on[curves.group == k].mean(), *curves.temperatures[[0, -1]])
+        z = evaluate(table, middle[inside], float(own))
+        assert z is not None, at
+        white = curves.noise / np.maximum(seconds[k, inside], 1.0)[:, None]
+        total += ((mean[k, inside] - z.T) ** 2 - white) * (seconds[k, inside] > 0)[:, None]
+    rms = np.sqrt(np.maximum(total / len(curves.temperatures), 0.0))
+    return {"time": _numbers(middle[inside]), "rms": _numbers(rms.T), "unit": "s"}
 
 
 def _numbers(values: Array) -> Any:

@@ -17,7 +17,7 @@ from imulab.warmup.apply import record_table
 from imulab.warmup.model import MODELS, Table, check_table
 from imulab.warmup.solve import amplitude_slopes
 
-_KEYS = ("model", "settling_time", "exit", "taper_time", "time_scale", "time_constants", "serial")
+_KEYS = ("model", "settling_time", "exit", "taper_time", "time_scale", "time_constants", "beyond", "serial")
 _SI = {"rate": "rad/s", "acceleration": "m/s^2"}
 
 
@@ -39,6 +39,8 @@ def write_table(record: Calibration) -> str:
         "exit": table.exit,
         "taper_time": f"{table.taper_time!r} s",
     }
+    if table.beyond != "zero":
+        settings["beyond"] = table.beyond
     if table.time_scale is not None:
         settings["time_scale"] = f"{table.time_scale!r} s"
     if table.time_constants:
@@ -154,6 +156,7 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
         coefficients=values,
         settling_time=_seconds(path, settings, "settling_time")[0],
         exit=settings.get("exit", "zero"),
+        beyond=settings.get("beyond", "zero"),
         taper_time=_seconds(path, settings, "taper_time")[0] if "taper_time" in settings else 60.0,
         time_scale=_seconds(path, settings, "time_scale")[0] if model == "knot-log-cubic" else None,
         time_constants=constants,

@@ -1,0 +1,200 @@
+"""What a warm-up record must refuse, hold and say: clocks, starts, edges, dead columns, the worst temperature."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.blob import load_any
+from imulab.cli import main
+from imulab.exporters import export
+from imulab.present import exhibits_of
+from imulab.verdict import Bad
+from imulab.warmup.apply import record_table
+from imulab.warmup.fit import fit_warmup
+from imulab.warmup.model import evaluate
+
+AT = (-20.0, 0.0, 20.0)
+AXES = ("gyro_x", "gyro_y")
+HOUR = np.pi / 180 / 3600
+
+
+def curve(time: Any, power_on: float) -> Any:
+    """Deg/h: two stages whose size is linear in the power-on temperature."""
+    return (60 - power_on) * np.exp(-time / 15.0) + (40 + 0.5 * power_on) * np.exp(-time / 70.0)
+
+
+def cycle(power_on: float, seed: int, seconds: float = 400.0) -> il.Recording:
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 0.2)
+    columns = {
+        axis: (1 + k) * curve(time, power_on) * (1 + 0.02 * rng.standard_normal()) + rng.normal(5, 2, len(time))
+        for k, axis in enumerate(AXES)
+    }
+    head = {"power_on_temperature": f"{power_on:g}", "serial": "U1"}
+    return il.Recording({"time": time, **columns}, {"time": "s", **dict.fromkeys(AXES, "deg/h")}, head, name="cycle")
+
+
+def cycles(shift: float = 0.0) -> list[il.Recording]:
+    return [cycle(t + shift * (-1) ** k, 10 * i + k) for i, t in enumerate(AT) for k in range(2)]
+
+
+def fit(recordings: list[il.Recording] | None = None, **options: Any) -> Any:
+    return fit_warmup(recordings or cycles(), **{"temperatures": AT, "settling_time": 300.0, **options})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: Any) -> Path:
+    path: Path = tmp_path_factory.mktemp("warm")
+    fit(model="exponential").calibration.save(path / "zero.json")
+    fit(model="exponential", beyond="hold").calibration.save(path / "hold.json")
+    return path
+
+
+def changed(recording: il.Recording, **columns: Any) -> il.Recording:
+    return replace(recording, columns={**recording.columns, **columns})
+
+
+def refused(capsys: Any, folder: Path, recording: il.Recording, *options: str) -> str:
+    il.write_csv(recording, folder / "in.csv")
+    out = folder / "out.csv"
+    assert main(["apply", str(folder / "zero.json"), str(folder / "in.csv"), "-o", str(out), *options]) == 2
+    error: str = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert not out.exists()
+    return error
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: t - 3.0, "before power-on"),
+        (lambda t: t + 20.0, "the first sample is 20 s after power-on; expected at most 5 s"),
+        (lambda t: np.where(np.arange(len(t)) == 100, np.nan, t), "row 101"),
+        (lambda t: np.where(np.arange(len(t)) == 100, t - 1.0, t), "runs backwards"),
+        (lambda t: 1e3 * t, "milliseconds titled as seconds"),
+        (lambda t: 1e-5 * t, "are these seconds"),
+    ],
+    ids=["negative", "late", "nan", "backwards", "milliseconds", "too fast"],
+)
+def test_apply_asks_of_time_what_fit_asks(folder: Path, capsys: Any, change: Any, words: str) -> None:
+    recording = cycle(3.0, 1)
+    wrong = changed(recording, time=change(recording.columns["time"]))
+    assert words in refused(capsys, folder, wrong)
+    with pytest.raises(il.ImulabError, match=words.replace("(", ".")):
+        fit([*cycles()[1:], wrong])
+
+
+def test_a_late_start_is_allowed_when_it_is_asked_for(folder: Path, capsys: Any) -> None:
+    recording = cycle(3.0, 1)
+    time = recording.columns["time"] + 20.0
+    late = changed(recording, time=time)
+    il.write_csv(late, folder / "late.csv")
+    out = folder / "late_out.csv"
+    options = ["--latest-start", "30 s", "-o", str(out)]
+    assert main(["apply", str(folder / "zero.json"), str(folder / "late.csv"), *options]) == 0
+    z = evaluate(record_table(il.load(folder / "zero.json")), time, 3.0)
+    want = late.columns["gyro_x"] - z[0] / HOUR  # type: ignore[index]
+    np.testing.assert_allclose(il.read(out).column("gyro_x"), want, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("temperature", [None, "nan", "20.3", "-20.3"])
+def test_nothing_corrected_is_refused_and_says_why(folder: Path, capsys: Any, temperature: str | None) -> None:
+    recording = cycle(0.0, 1)
+    head = {} if temperature is None else {"power_on_temperature": temperature}
+    assert "temperature" in refused(capsys, folder, replace(recording, metadata=head))
+
+
+def test_a_recording_from_after_the_warm_up_has_nothing_to_correct(folder: Path, capsys: Any) -> None:
+    recording = cycle(0.0, 1)
+    late = changed(recording, time=recording.columns["time"] + 500.0)
+    assert "the correction has ended (300 s)" in refused(capsys, folder, late, "--latest-start", "1000 s")
+
+
+@pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"])
+@pytest.mark.parametrize(("temperature", "edge"), [(-45.0, -20.0), (21.0, 20.0), (80.0, 20.0), (5.0, 5.0)])
+def test_beyond_hold_goes_on_as_at_the_edges_on_the_desk_and_in_the_unit(
+    tmp_path: Path, model: str, temperature: float, edge: float
+) -> None:
+    record = fit(model=model, beyond="hold").calibration
+    start = cycle(temperature, 5)
+    z = evaluate(record_table(fit(model=model).calibration), start.columns["time"], edge)
+    assert z is not None
+    want = start.columns["gyro_y"] - z[1] / HOUR
+    np.testing.assert_allclose(il.apply(record, start).column("gyro_y"), want, atol=1e-9)
+    (blob,) = export("blob", [record], tmp_path)
+    found = il.apply(load_any(blob), start).column("gyro_y")
+    np.testing.assert_allclose(found, want, atol=0.02)
+    held = evaluate(record_table(record), start.columns["time"], temperature)
+    np.testing.assert_allclose(held, z)
+
+
+def test_hold_survives_record_and_spreadsheet(folder: Path, capsys: Any) -> None:
+    assert il.load(folder / "hold.json").sections["table"]["beyond"] == "hold"
+    assert "beyond" not in il.load(folder / "zero.json").sections["table"]
+    table, again = str(folder / "t.csv"), str(folder / "again.json")
+    assert main(["warmup", "table", str(folder / "hold.json"), "-o", table]) == 0
+    assert main(["warmup", "table", table, "-o", again]) == 0
+    assert il.load(again).sections["table"] == il.load(folder / "hold.json").sections["table"]
+    with pytest.raises(il.ImulabError, match="beyond 'later': expected one of zero hold"):
+        fit(beyond="later")
+
+
+def test_the_share_of_starts_beyond_the_edges_is_said_unless_they_are_held() -> None:
+    scattered = cycles(shift=0.3)
+    said = [w for w in fit(scattered).calibration.warnings if "began outside" in w]
+    assert said[0].startswith("2 of 6 power cycles (50 % of those at the outer temperatures) began outside -20 to 20")
+    assert not [w for w in fit(scattered, beyond="hold").calibration.warnings if "began outside" in w]
+    assert not [w for w in fit().calibration.warnings if "began outside" in w]
+
+
+def test_a_stuck_gyro_a_pause_and_rows_of_zeros_are_said() -> None:
+    good = cycles()
+    stuck = [changed(r, gyro_x=np.full(len(r), 7.0)) for r in good]
+    (said,) = (w for w in fit(stuck).calibration.warnings if "never changes" in w)
+    assert isinstance(said, Bad)
+    assert said.startswith("gyro_x never changes in cycle")
+    paused = good[1].columns["gyro_y"].copy()
+    paused[500:560] = paused[500]
+    (said,) = (
+        w for w in fit([good[0], changed(good[1], gyro_y=paused), *good[2:]]).calibration.warnings if "stuck" in w
+    )
+    assert isinstance(said, Bad)
+    every = np.arange(len(good[0])) % 50 == 3
+    zeroed = [changed(r, **{axis: np.where(every, 0.0, r.columns[axis]) for axis in AXES}) for r in good]
+    found = fit(zeroed, model="exponential")
+    assert [w for w in found.calibration.warnings if "exactly zero were left out" in w]
+    clean = fit(model="exponential")
+    time = np.linspace(0, 290, 30)
+    off = evaluate(found.table, time, 3.0) - evaluate(clean.table, time, 3.0)  # type: ignore[operator]
+    assert np.abs(off).max() < 1.5 * HOUR  # with the zeros in: 3 deg/h
+    assert not [w for w in clean.calibration.warnings if "stuck" in w or "never" in w or "zero" in w]
+
+
+def test_the_worst_temperature_is_what_the_gap_makes_of_a_bent_law() -> None:
+    """Z = c(T) exp(-t / 40 s), c quadratic in T: linear knots err by c'' h^2 / 8 in the middle of the wide gap."""
+    at, size = (-20.0, -10.0, 0.0, 30.0, 40.0), 0.05
+    time = np.arange(0.0, 400.0, 0.2)
+    rng = np.random.default_rng(3)
+    recordings = [
+        il.Recording(
+            {"time": time, "gyro_x": size * t**2 * np.exp(-time / 40.0) + 1e-3 * rng.standard_normal(len(time))},
+            {"time": "s", "gyro_x": "deg/h"}, {"power_on_temperature": f"{t:g}"}, name=f"{t:g} {k}",
+        )
+        for t in at for k in range(2)
+    ]  # fmt: skip
+    record = fit(recordings, temperatures=at, model="knot-cubic").calibration
+    assert record.fit["worst_temperature"]["value"] == 15.0
+    shape = np.exp(-np.arange(0.0, 300.0, 0.2) / 40.0)
+    reference = np.exp(-np.arange(300.0, 400.0, 0.2) / 40.0).mean()
+    want = size * 30.0**2 / 4 * np.sqrt(np.mean((shape - reference) ** 2))
+    assert record.value("worst_temperature_error_gyro_x") / HOUR == pytest.approx(
+        np.hypot(want, record.value("training_error_gyro_x") / HOUR), rel=0.1
+    )
+    assert record.fit["curve_misfit"]["rms"][0][0] / HOUR > 0.01  # a cubic is no exponential, most of all at first
+    assert exhibits_of(record).facts[2][0] == "at worst, near 15 °C"
