@@ -8,6 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.errors import OptionError
+from imulab.present import exhibits_of
 from imulab.tumble.gyro import fit_gyro
 from imulab.tumble.gyrorecord import with_gyro
 from imulab.verdict import Bad, Note
@@ -154,6 +155,9 @@ def test_turns_with_a_knock_or_with_lost_samples_are_named_and_do_not_count(chan
         assert np.abs(fit.scale_factor / unit.scale - 1).max() < 3e-4
         both = with_gyro(record, fit, recording, recording)
         assert len(both.fit["gyro"]["set_aside"]) == len(fit.aside)
+        figure = next(f for f in exhibits_of(both).items if f.title.startswith("What the gyroscopes miss"))
+        assert len(figure.traces[0]["y"]) == len(fit.residuals) + len(fit.aside)
+        assert ("Red: set aside." in figure.caption) == (len(fit.aside) > 0)
 
 
 def test_nothing_is_set_aside_without_reason():
@@ -244,3 +248,48 @@ def test_the_command_takes_the_clock(imulab, tmp_path):
         refused = imulab(*command, *wrong)
         assert refused.returncode == 2
         assert refused.stderr.count("\n") == 1
+
+
+def jittered(size):
+    """Time stamps of a host that gets to a sample late: the sensor itself runs evenly."""
+
+    def change(columns, accel, path):
+        rng = np.random.default_rng(len(columns["time"]))
+        late = columns["time"] + rng.uniform(0, size, len(columns["time"]))
+        return columns | {"time": np.maximum.accumulate(late) + 1e-9 * np.arange(len(late))}, accel
+
+    return change
+
+
+def polled(columns, accel, path):
+    """Samples taken when a host gets to them, and stamped rightly."""
+    rng = np.random.default_rng(len(columns["time"]))
+    number = np.sort(rng.choice(len(columns["time"]), 2 * len(columns["time"]) // 3, replace=False))
+    return {n: v[number] for n, v in columns.items()}, {n: v[number] for n, v in accel.items()}
+
+
+def test_stamps_that_jitter_are_evened_where_the_turns_say_that_the_samples_do_not():
+    plain, wrong = [], []
+    for seed in range(8):
+        for size in (0.004, 0.04):
+            unit, record, attitudes, recording = campaign(seed, change=jittered(size))
+            fit = fit_gyro(record, attitudes, recording)
+            assert any("jitter by" in w for w in fit.notes)
+            assert np.abs(scores(unit, fit)).max() < 5
+            plain += (fit.scale_factor / unit.scale - 1).tolist()
+        unit, record, attitudes, recording = campaign(seed, change=polled)
+        fit = fit_gyro(record, attitudes, recording)
+        assert not any("jitter by" in w for w in fit.notes)
+        wrong += (fit.scale_factor / unit.scale - 1).tolist()
+    assert np.sqrt(np.mean(np.square(plain))) < 6e-5  # 790 ppm at 0.04 s as they come
+    assert np.sqrt(np.mean(np.square(wrong))) < 1.2e-4
+
+
+def test_counted_time_stamps_are_noted_unless_the_clock_is_stated():
+    _, record, attitudes, recording = campaign(1)
+    assert any(
+        "--clock 10000ppm" in w and isinstance(w, Note)
+        for w in said(record, fit_gyro(record, attitudes, recording), recording)
+    )
+    stated = fit_gyro(record, attitudes, recording, clock=0.01)
+    assert not any("--clock" in w for w in said(record, stated, recording))

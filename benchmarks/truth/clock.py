@@ -38,11 +38,12 @@ def gyro(
     lost: tuple[int, bool] | None = None,
     knock: float = 0.0,
     scale: float = 1.0,
+    jitter: float = 0.0,
 ) -> Trial:
     """Calibrate a unit; warned means that a finding other than a note holds the words, where there are some.
 
     `clock`: standard deviation of the clocks' rates; `fast`: what the gyroscopes' clock is off by beyond that; `lost`:
-    samples lost in a turn, and whether the time stamps show it.
+    samples lost in a turn, and whether the time stamps show it; `jitter`: a host stamps samples so late at most, s.
     """
     rng = np.random.default_rng(seed)
     unit = turns.random_unit(rng, sensitivity)
@@ -61,6 +62,8 @@ def gyro(
         keep = np.abs(true - middle) > count / RATE / 2
         columns, accel = ({n: v[keep] for n, v in values.items()} for values in (columns, accel))
         time = time[keep] if stamped else time[: keep.sum()]
+    if jitter:
+        time = np.maximum.accumulate(time + rng.uniform(0, jitter, len(time))) + 1e-9 * np.arange(len(time))
     units = {"time": "s"} | {f"gyro_{a}": "rad/s" for a in "xyz"} | {f"accel_{a}": "m/s^2" for a in "xyz"}
     accelerometers = recording = il.Recording(columns={"time": time, **columns, **accel}, units=units, name="both.csv")
     if apart:
@@ -123,6 +126,7 @@ SCENARIOS = [
         warned=95.0),
     row("clock 2000 ppm fast, `--clock-of accel`", apart=True, fast=2e-3, clock_of="accel"),
     row("samples 10 ms late", late=0.01, false_alarms=5.0),
+    row("stamps late by up to 40 ms, each by its own", jitter=0.04),
     row("scale factor 0.1 % larger at 100 deg/s", cubic=1e-3, words="depends on the rate", coverage=None, warned=95.0),
     row("g-sensitivity of 0.001 deg/s/g", sensitivity=np.radians(0.001) / turns.GRAVITY),
     row("g-sensitivity of 0.002 deg/s/g", sensitivity=np.radians(0.002) / turns.GRAVITY),

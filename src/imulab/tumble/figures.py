@@ -319,20 +319,25 @@ def _trace(record: Calibration) -> Figure:
 
 def _turns(record: Calibration) -> Figure:
     data = record.data["gyro"]
-    angle = [float(from_si(value, "deg")) for value in data["residual"]]
+    aside = record.fit["gyro"].get("set_aside", [])
+    turns = [(a, b, miss, GOOD) for a, b, miss in zip(data["start"], data["stop"], data["residual"], strict=True)]
+    turns += [(turn["start"], turn["stop"], turn["miss"]["value"], BAD) for turn in aside]
+    turns.sort(key=lambda turn: turn[0])
+    angle = [float(from_si(turn[2], "deg")) for turn in turns]
     number = list(range(1, len(angle) + 1))
-    text = [f"{a:.1f} to {b:.1f} s" for a, b in zip(data["start"], data["stop"], strict=True)]
+    text = [f"{a:.1f} to {b:.1f} s" for a, b, *_ in turns]
     rms = float(from_si(_rms(data["residual"]), "deg"))
     return Figure(
         title="What the gyroscopes miss in each turn",
         caption="Angle between the direction of gravity as the gyroscopes carry it and the one found after the turn, "
-        f"rms {rms:.3g} deg. A few high bars: very fast turns, or a unit that moved while it was taken to be at rest.",
+        f"rms {rms:.3g} deg. A few high bars: very fast turns, or a unit that moved while it was taken to be at rest."
+        + (" Red: set aside." if aside else ""),
         traces=[
             {
                 "type": "bar",
                 "x": number,
                 "y": angle,
-                "marker": {"color": GOOD},
+                "marker": {"color": [turn[3] for turn in turns] if aside else GOOD},
                 "text": text,
                 "textposition": "none",
                 "hovertemplate": "turn %{x}, %{text}<br>%{y:.3f} deg<extra></extra>",

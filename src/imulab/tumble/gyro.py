@@ -25,14 +25,16 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rows import leave_out
 from imulab.tumble.apply import output_factor, specific_force
 from imulab.tumble.directions import direction_covariance
-from imulab.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks
+from imulab.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks, counted, evened
 from imulab.tumble.gyrolinear import Nonlinearity, test_linearity
 from imulab.tumble.gyrorest import SENSITIVITIES, clock_notes, find_holds
 from imulab.tumble.gyrosolve import Case, Solved, solve_turns
 from imulab.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
 from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.verdict import Note
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
+_EVENER = 0.9
 _FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
 
 
@@ -157,14 +159,24 @@ def fit_gyro(
     time, output = check_time(recording), left_out.recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
     means = attitudes.mean * factor
-    own, own_force = (
-        attitudes.recording.si("time"),
-        specific_force(
-            record, leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording.triad("accel") * factor
-        ),
-    )
+    own = attitudes.recording.si("time")
+    moving = leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording
+    own_force = specific_force(record, moving.triad("accel") * factor)
     case = Case(recording.name, attitudes, specific_force(record, means), own, own_force, output, unit, fit_bias)
     found = solve_turns(case, time, sensitivity)
+    even, said = evened(time), []
+    if even is not None:
+        # Only the turns can tell stamps that jitter from samples that do.
+        other = solve_turns(case, even[0], sensitivity)
+        if other.typical_miss < _EVENER * found.typical_miss:
+            said = [
+                Note(
+                    f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
+                    f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
+                    f"{np.degrees(found.typical_miss):.2g} deg (median)"
+                )
+            ]
+            time, found = even[0], other
     apart = attitudes.recording is not recording
     comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
     if clock_of == "accel":
@@ -172,13 +184,14 @@ def fit_gyro(
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
         time = comparison.on_other(time)
         found = solve_turns(case, time, sensitivity)
-    known = clock_of_scale(comparison, clock, clock_of)
+    known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
     rest = np.zeros(len(time), dtype=np.bool_)
     for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
         left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
         rest[a:b] = True
     notes = [
         *(f"gyro: {note}" for note in left_out.notes(rest)),
+        *said,
         *found.notes,
         *_record_notes(record, attitudes, case.force),
         *known.notes(apart=apart),

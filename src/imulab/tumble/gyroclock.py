@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -30,6 +31,8 @@ _CLEAR_DELAY = 4.0
 _OUTLIER = 4.0 * 1.4826
 _FEWEST = 6
 _LATENCY = 5e-3  # s
+_JITTER, _COUNTED = 0.02, 1e-6  # of a step
+_FEWEST_STAMPS = 100
 
 
 @dataclass(frozen=True)
@@ -58,12 +61,25 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Clock:
-    """Relative standard uncertainty of the rate of the clock in use, and as assumed of any, whose it is, comparison."""
+    """What the time is known by that the scale factors are referred to.
+
+    Attributes
+    ----------
+    uncertainty, assumed
+        Relative standard uncertainty of the rate of the clock in use, and as assumed of any.
+    of
+        Whose it is.
+    comparison
+        Of the two clocks, or None.
+    counted
+        Whether the gyroscopes' time stamps are a count times a nominal step, which no clock measured.
+    """
 
     uncertainty: float
     assumed: float
     of: str
     comparison: Comparison | None
+    counted: bool = False
 
     def notes(self, *, apart: bool) -> list[str]:
         """Say what a user should know; `apart`: the two triads come from two recordings."""
@@ -89,7 +105,7 @@ class Clock:
         return []
 
 
-def clock_of_scale(comparison: Comparison | None, clock: float, of: str) -> Clock:
+def clock_of_scale(comparison: Comparison | None, clock: float, of: str, *, counted: bool) -> Clock:
     """Return what is known of the clock that the scale factors are referred to.
 
     Parameters
@@ -107,7 +123,33 @@ def clock_of_scale(comparison: Comparison | None, clock: float, of: str) -> Cloc
         more = comparison.rate_uncertainty**2
     elif comparison is not None:
         more = max(comparison.rate**2 - comparison.variance(clock), 0.0)
-    return Clock((clock**2 + more) ** 0.5, clock, of, comparison)
+    return Clock((clock**2 + more) ** 0.5, clock, of, comparison, counted)
+
+
+def counted(time: Array) -> bool:
+    """Whether time stamps are a count times a step, to rounding."""
+    step = np.diff(time)
+    return bool(np.ptp(step) < _COUNTED * float(step.mean()) + 8 * np.spacing(np.abs(time).max()))
+
+
+def evened(time: Array) -> tuple[Array, float] | None:
+    """Return even time stamps in place of some that jitter, and by how much they do, rms, s; None where they do not.
+
+    Samples of a sensor that runs by itself come evenly, while a host stamps them when it gets to it. Stamps are
+    replaced by a line through them, between gaps.
+    """
+    step = np.diff(time)
+    middle = float(np.median(step))
+    gap = step > 1.5 * float(step.mean()) + 8 * 1.4826 * float(np.median(np.abs(step - middle)))
+    even = time.copy()
+    edges = np.concatenate([[0], np.flatnonzero(gap) + 1, [len(time)]])
+    for start, stop in pairwise(edges.tolist()):
+        if stop - start >= _FEWEST_STAMPS:
+            number = np.arange(stop - start) - (stop - start - 1) / 2
+            stamps = time[start:stop] - time[start:stop].mean()
+            even[start:stop] -= stamps - number * float(number @ stamps) / float(number @ number)
+    jitter = float(np.sqrt(np.mean((time - even) ** 2)))
+    return (even, jitter) if jitter > _JITTER * float(step.mean()) and (np.diff(even) > 0).all() else None
 
 
 def compare_clocks(

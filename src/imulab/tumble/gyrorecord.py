@@ -11,10 +11,10 @@ from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.estimate import coverage_factor
 from imulab.recording import Array, Recording
 from imulab.tumble.gyro import PAIRS, GyroFit, gyro_names
-from imulab.tumble.gyroclock import Clock
+from imulab.tumble.gyroclock import CRYSTAL, Clock
 from imulab.tumble.gyrolinear import Nonlinearity
 from imulab.units import parse_unit
-from imulab.verdict import UNJUDGED, Bad
+from imulab.verdict import UNJUDGED, Bad, Note
 
 _AXES = ("x", "y", "z")
 _WORST_SCALE = 0.1
@@ -179,6 +179,14 @@ def _off_nominal(fit: GyroFit) -> list[str]:
 def _warnings(fit: GyroFit) -> list[str]:
     found = list(fit.notes)
     found += _off_nominal(fit)
+    if fit.clock.counted and fit.clock.of == "gyro" and fit.clock.assumed == CRYSTAL:
+        found.append(
+            Note(
+                "gyro: the time stamps are counted in even steps: the scale factors are true to the "
+                f"{1e6 * CRYSTAL:.0f} ppm of a crystal only if a crystal sets the sample rate; a sensor's own "
+                "oscillator is off by up to some percent: state it, such as --clock 10000ppm for 1 %"
+            )
+        )
     rms = float(np.degrees(np.sqrt(np.mean(fit.residuals**2))))
     if rms > _LARGE_MISS:
         found.append(f"gyro: the turns miss the change of gravity's direction by {rms:.2g} deg rms")

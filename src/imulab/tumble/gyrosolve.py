@@ -67,6 +67,11 @@ class Solved:
         scaled = (output - self.rest.zero - moved) / (self.scale * (1 + self.theta[:3]))
         return np.asarray(np.linalg.solve(t, scaled.T).T, dtype=np.float64)
 
+    @property
+    def typical_miss(self) -> float:
+        """Median angle by which the turns miss, rad."""
+        return float(np.median(np.linalg.norm(self.residual.reshape(-1, 3), axis=1)))
+
     def cost(self, attitudes: NDArray[np.intp]) -> float:
         """Sum of squares, rad^2, over the turns that begin at some of the attitudes."""
         chosen = np.isin(self.segments.attitude, attitudes)

@@ -18,7 +18,7 @@ from imulab.tumble.gyrorest import Holds, Rest, beyond_range
 ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
 _FEWEST_TURNS = 8
 _LONGEST_TURN = 60.0  # s
-_GAP_SECONDS, _GAP_STEPS = 0.05, 4.5
+_GAP_SECONDS, _GAP_STEPS, _GAP_BURSTS = 0.05, 4.5, 2.0
 _COARSE = 4  # steps taken as one where a scale factor is only to be found roughly
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
@@ -69,7 +69,8 @@ def find_turns(
     clipped = _during(beyond_range(output), begin, end) & turns[:, None]
     step = np.diff(time)
     # What lies in a gap is taken as a straight line: no turn is known to a milliradian across a longer one.
-    wide = step > max(_GAP_SECONDS, _GAP_STEPS * float(np.median(step)))
+    usual = float(np.median(step)), float(np.quantile(step, 0.99))  # the second where stamps come in bursts
+    wide = step > max(_GAP_SECONDS, _GAP_STEPS * usual[0], _GAP_BURSTS * usual[1])
     broken = _during(np.append(wide, False)[:, None], begin, end - 1)[:, 0] & turns
     chosen = np.flatnonzero(turns & ~clipped.any(axis=1) & ~broken)
     notes = []
