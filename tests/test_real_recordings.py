@@ -61,7 +61,8 @@ def test_xsens_reaches_the_reference_figures(xsens):
         assert record.value(f"misalignment_{pair}") == pytest.approx(value, abs=sigma)
     for axis, ppm in (("x", 65), ("y", 34), ("z", 39)):
         p = record.parameters[f"scale_factor_{axis}"]
-        assert p.standard_uncertainty / p.value == pytest.approx(ppm * 1e-6, rel=0.15)
+        assert p.standard_uncertainty_given_order / p.value == pytest.approx(ppm * 1e-6, rel=0.15)
+        assert p.standard_uncertainty_given_order < p.standard_uncertainty < 3 * p.standard_uncertainty_given_order
 
 
 def test_xsens_table_of_orders_tells_why(xsens):

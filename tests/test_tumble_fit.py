@@ -145,7 +145,7 @@ def test_huber_keeps_one_knocked_attitude_from_spoiling_the_rest():
     data = outputs(truth, 2, directions) + 2e-4 * rng.standard_normal((30, 3))
     clean = fit(data, 2, sigma=2e-4).calibration
     data[11] += 0.05 * directions[11]  # 5 mg
-    square, huber = fit(data, 2, sigma=2e-4).calibration, fit(data, 2, sigma=2e-4, loss="huber").calibration
+    square, huber = (fit(data, 2, sigma=2e-4, loss=loss).calibration for loss in ("square", "huber"))
     shift = {
         loss: max(abs(c.value(n) - clean.value(n)) / clean.parameters[n].standard_uncertainty for n in truth)
         for loss, c in (("square", square), ("huber", huber))

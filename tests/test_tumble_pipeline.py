@@ -124,15 +124,19 @@ def test_linearised_states_the_excess_that_norm_states():
 
 
 @pytest.mark.parametrize("sigma", [None, 1e-3])
-def test_one_bad_attitude_is_named_without_huber(sigma):
+def test_one_bad_attitude_is_set_aside_and_named(sigma):
     rng = np.random.default_rng(6)
     truth = reference.random_truth(rng, 1)
     data = np.array([reference.forward(G * u, truth, 1) for u in reference.random_attitudes(rng, 24)])
     data += 1e-3 * rng.standard_normal(data.shape)
     data[5] *= 1.3
-    record = il.fit_tumble(il.find_attitudes(table(data, sigma=sigma)), order=1, gravity=G).calibration
-    named = [w for w in record.warnings if "stands out" in w]
-    assert any(w.startswith("row 6 (line 7) stands out") and "--loss huber" in w for w in named)
+    attitudes = il.find_attitudes(table(data, sigma=sigma))
+    record = il.fit_tumble(attitudes, order=1, gravity=G).calibration
+    assert record.fit["set_aside"] == [6]
+    assert any(w.startswith("row 6 (line 7) set aside") for w in record.warnings)
+    kept = il.fit_tumble(attitudes, order=1, gravity=G, loss="square").calibration
+    named = [w for w in kept.warnings if "stands out" in w]
+    assert any(w.startswith("row 6 (line 7) stands out") and "--loss auto sets it aside" in w for w in named)
 
 
 def test_few_attitudes_are_warned_of_though_their_noise_is_known():

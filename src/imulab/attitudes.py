@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -105,6 +105,8 @@ class Attitudes:
         How they moved while they were held; None for a table.
     notes
         What a user should know of how they were found.
+    numbers
+        Where some were set aside: the place of each among all that were found, shape (n,).
     """
 
     mean: Array
@@ -120,6 +122,7 @@ class Attitudes:
     swing: Array | None = None
     motion: Motion | None = None
     notes: tuple[str, ...] = ()
+    numbers: NDArray[np.intp] | None = None
 
     def __repr__(self) -> str:
         return f"Attitudes({len(self)} of {self.recording.name}, in {self.unit})"
@@ -129,11 +132,26 @@ class Attitudes:
 
     def label(self, index: int) -> str:
         """Return how messages name an attitude: by its row, or by its time."""
+        number = index if self.numbers is None else int(self.numbers[index])
         if self.trace is None:
             return self.recording.place(int(self.start[index]) - self.recording.first_row)
-        return f"attitude {index + 1} ({self.start[index]:.1f} to {self.stop[index]:.1f} s)"
+        return f"attitude {number + 1} ({self.start[index]:.1f} to {self.stop[index]:.1f} s)"
 
     def times(self) -> str:
         """Return when the attitudes were found, for a message."""
         shown = [f"{a:.0f}-{b:.0f} s" for a, b in zip(self.start[:12], self.stop[:12], strict=True)]
         return ", ".join(shown) + (", ..." if len(self) > 12 else "")
+
+    def only(self, kept: NDArray[np.intp]) -> Attitudes:
+        """Return some of the attitudes under the labels that they had; the stretches at rest are left out."""
+        return replace(
+            self,
+            mean=self.mean[kept],
+            covariance=None if self.covariance is None else self.covariance[kept],
+            samples=self.samples[kept],
+            start=self.start[kept],
+            stop=self.stop[kept],
+            pieces=None,
+            motion=None if self.motion is None else self.motion[kept],
+            numbers=kept if self.numbers is None else self.numbers[kept],
+        )

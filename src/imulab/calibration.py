@@ -37,11 +37,16 @@ PROCEDURES = ("tumble", "gyro_array", "warmup", "centrifuge")
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A value with its standard uncertainty (None where none can be stated) and its SI or output unit."""
+    """A value with its standard uncertainty (None where none can be stated) and its SI or output unit.
+
+    Where the order of a model was chosen from the data, `standard_uncertainty_given_order` is what it would be if that
+    order were known to be right.
+    """
 
     value: float
     standard_uncertainty: float | None
     unit: str
+    standard_uncertainty_given_order: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +150,11 @@ class Calibration:
             "model": self.model,
             "parameters": {
                 name: {"value": p.value, "standard_uncertainty": p.standard_uncertainty, "unit": p.unit}
+                | (
+                    {}
+                    if p.standard_uncertainty_given_order is None
+                    else {"standard_uncertainty_given_order": p.standard_uncertainty_given_order}
+                )
                 for name, p in self.parameters.items()
             },
             "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},

@@ -42,7 +42,7 @@ SCENARIOS = (
         "What are the errors of this accelerometer triad, with gravity as the only reference?",
         """
 imulab tumble simulate --order 2 --gravity 9.81362 --knock 7 --seed 4 -o tumble.csv
-imulab tumble fit tumble.csv --gravity 9.81362 --loss huber -o tumble.json --report tumble.html
+imulab tumble fit tumble.csv --gravity 9.81362 -o tumble.json --report tumble.html
 imulab apply tumble.json tumble.csv -o tumble_corrected.csv
 """,
         "tumble.json",

@@ -139,7 +139,8 @@ def _already(file: str) -> Array:
         record = load(file)
         if record.procedure != "tumble":
             raise RecordError(f"{file}: a {record.procedure} record holds no attitudes; expected a tumble record")
-        force = np.array(record.data["attitudes"]["force"])
+        listed_ones = record.data["attitudes"]
+        force = np.array(listed_ones["force"])[np.array(listed_ones["down_weight"]) > 0]
     else:
         recording = read(file)
         listed = directions_of(recording)

@@ -118,9 +118,20 @@ def fit(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
-    order: Annotated[str, typer.Option(help="auto, or 0 to 5; 0 is bias and scale factor only.")] = "auto",
+    order: Annotated[
+        str,
+        typer.Option(
+            help="auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them."
+        ),
+    ] = "auto",
     method: Annotated[str, typer.Option(help="norm or linearised.")] = "norm",
-    loss: Annotated[str, typer.Option(help="square, or huber against single disturbed attitudes.")] = "square",
+    loss: Annotated[
+        str, typer.Option(help="auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.")
+    ] = "auto",
+    nonlinearity: Annotated[
+        str | None,
+        typer.Option(metavar="20ug,20ug", help="Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known."),
+    ] = None,
     gravity: Annotated[
         str | None,
         typer.Option(help="Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head."),
@@ -153,6 +164,7 @@ def fit(
         "order": order,
         "method": method,
         "loss": loss,
+        "nonlinearity": nonlinearity,
         "gravity": gravity,
         "latitude": latitude,
         "height": height,

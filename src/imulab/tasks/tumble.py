@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.tasks.task import Files, Task
 from imulab.texts import chosen, quantity, whole_number
+from imulab.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
@@ -23,7 +24,8 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     values: dict[str, Any] = {
         "order": int(order) if order.isascii() and order.isdecimal() and len(order) < 3 else order,
         "method": texts.get("method", "norm"),
-        "loss": texts.get("loss", "square"),
+        "loss": texts.get("loss", "auto"),
+        "nonlinearity": _spread(texts.get("nonlinearity"), label.format("nonlinearity")),
         "gravity": gravity_option(texts.get("gravity"), texts.get("latitude"), texts.get("height"), label),
         "monte_carlo": None if trials is None else whole_number(trials, label.format("monte-carlo")),
         "prior": texts.get("prior"),
@@ -34,6 +36,7 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     check_options(
         values["order"], values["method"], values["loss"],
         monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
+        nonlinearity=values["nonlinearity"],
     )  # fmt: skip
     return values
 
@@ -53,6 +56,7 @@ def _tumble_fit(
         gravity=values["gravity"],
         method=values["method"],
         loss=values["loss"],
+        nonlinearity=values["nonlinearity"],
         prior=prior,
         ageing=values["ageing"],
         monte_carlo=values["monte_carlo"],
@@ -69,6 +73,17 @@ def _ageing(text: str | None, name: str) -> tuple[float, ...]:
     if len(parts) > len(kinds):
         raise OptionError(f"{name} {text!r}: expected up to three, as in 100ug,100ppm,50urad")
     return tuple(quantity(part, name, *kind) for part, kind in zip(parts, kinds, strict=False))
+
+
+def _spread(text: str | None, option: str) -> tuple[float, float] | None:
+    """Return the standard deviations of k2 and k3 in units of 1/g and 1/g^2: ``20ug,20ug`` is 20 ug/g^2, 20 ug/g^3."""
+    if text is None:
+        return None
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise OptionError(f"{option} {text!r}: expected two standard deviations, of k2 and k3, such as 20ug,20ug")
+    first, second = (quantity(part.strip(), option, "acceleration", "ug") / STANDARD_GRAVITY for part in parts)
+    return first, second
 
 
 def _prior(file: str, recording: Recording, access: Files) -> Calibration:
@@ -100,6 +115,7 @@ TASK = Task(
         "latitude",
         "height",
         "loss",
+        "nonlinearity",
         "monte_carlo",
         "prior",
         "ageing",

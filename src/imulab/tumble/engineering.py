@@ -16,12 +16,16 @@ _OFF_NOMINAL = "ppm off nominal"
 
 @dataclass(frozen=True)
 class EngineeringRow:
-    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ..."""
+    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ...
+
+    `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
+    """
 
     name: str
     value: float
     standard_uncertainty: float | None
     unit: str
+    given_order: float | None = None
 
     def text(self) -> tuple[str, str]:
         """Return value and uncertainty as text."""
@@ -39,12 +43,12 @@ def propagated_rows(record: Calibration) -> list[list[str]]:
     """Return the Monte Carlo intervals beside the linear ones: name, both, ratio of their widths, unit."""
     output = str(record.model["output_unit"])
     physical = parse_unit(output).quantity == "acceleration"
-    coverage = record.fit["coverage_factor_95"]
+    coverage = record.fit.get("coverage_factor_95_given_order") or record.fit["coverage_factor_95"]
     rows = []
     for name, found in record.fit["monte_carlo"]["parameters"].items():
         parameter = record.parameters[name]
         factor, offset, unit = _converted(name, parameter.unit, output, physical)
-        u = parameter.standard_uncertainty or 0.0
+        u = parameter.standard_uncertainty_given_order or parameter.standard_uncertainty or 0.0
         linear = [parameter.value - coverage * u, parameter.value + coverage * u]
         texts = [
             " to ".join(format_uncertain(end * factor + offset, u * abs(factor))[0] for end in ends)
@@ -80,8 +84,9 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
             EngineeringRow(
                 name,
                 parameter.value * factor + offset,
-                None if parameter.standard_uncertainty is None else parameter.standard_uncertainty * abs(factor),
+                _scaled(parameter.standard_uncertainty, factor),
                 unit,
+                _scaled(parameter.standard_uncertainty_given_order, factor),
             )
         )
         if stem == "bias" and axis == "z":
@@ -89,6 +94,10 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
                 EngineeringRow(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zeros.items()
             ]
     return rows
+
+
+def _scaled(uncertainty: float | None, factor: float) -> float | None:
+    return None if uncertainty is None else uncertainty * abs(factor)
 
 
 def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float, float, str]:

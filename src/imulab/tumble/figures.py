@@ -23,7 +23,7 @@ def exhibits(record: Calibration) -> Exhibits:
     left_out = fit.get("leave_one_out")
     worst = _worst_scale_uncertainty(record)
     facts = [
-        ("attitudes", str(fit["attitudes"])),
+        ("attitudes", str(len(good))),
         ("order", str(model["order"])),
         (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", small_g(_rms(used))),
         ("leave-one-out", small_g(left_out["value"]) if left_out else "not computed"),
@@ -44,7 +44,7 @@ def exhibits(record: Calibration) -> Exhibits:
         items.append(_turns(record))
     if record.covariance.names:
         items.append(_correlation(record))
-    aside = f"; {bad} more {'was' if bad == 1 else 'were'} down-weighted" if bad else ""
+    aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_held_back(record)}" if bad else ""
     if "gyro" in fit:
         missed = from_si(fit["gyro"]["rms"]["value"], "deg")
         aside += (
@@ -56,6 +56,10 @@ def exhibits(record: Calibration) -> Exhibits:
         facts=facts,
         items=items,
     )
+
+
+def _held_back(record: Calibration) -> str:
+    return "set aside" if record.fit.get("set_aside") else "down-weighted"
 
 
 def small_g(value: float) -> str:
@@ -118,7 +122,7 @@ def _residuals(record: Calibration) -> Figure:
         title="Residual |f| − g of each attitude",
         caption="Above: with the nominal sensor (for counts and volts: the span of each axis). Below: calibrated"
         + ("; bars are one standard uncertainty of |f|" if bars else "")
-        + (f"; {bad} down-weighted attitude{'s' if bad > 1 else ''} in red" if bad else "")
+        + (f"; {bad} attitude{'s' if bad > 1 else ''} {_held_back(record)} in red" if bad else "")
         + ". A pattern in the lower plot is an error that the model does not know.",
         traces=[
             {
@@ -181,6 +185,7 @@ def _basis(record: Calibration) -> str:
 
 
 def _parameters(record: Calibration) -> Table:
+    blend = record.fit.get("blend")
     factors = {False: record.fit["coverage_factor_95"], True: record.fit.get("gyro", {}).get("coverage_factor_95")}
     rows = []
     for row in engineering_rows(record):
@@ -190,8 +195,14 @@ def _parameters(record: Calibration) -> Table:
         if row.standard_uncertainty is not None and factor is not None:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
-        rows.append([row.name, value, uncertainty, interval, row.unit])
+        given = [] if blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]
+        rows.append([row.name, value, uncertainty, *given, interval, row.unit])
     basis = _basis(record)
+    if blend is not None:
+        basis += (
+            f" The standard uncertainty holds whatever the order is, up to {blend['highest_order']}; beside it what it "
+            f"would be if order {record.model['order']} were known to be right."
+        )
     turned = ""
     if "gyro" in record.fit:
         degrees = record.fit["gyro"]["degrees_of_freedom"]
@@ -199,7 +210,14 @@ def _parameters(record: Calibration) -> Table:
     return Table(
         title="Parameters",
         caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.{turned}",
-        columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit"],
+        columns=[
+            "parameter",
+            "value",
+            "standard uncertainty",
+            *([] if blend is None else [f"if order {record.model['order']} is right"]),
+            "95 % interval",
+            "unit",
+        ],
         rows=rows,
     )
 
@@ -242,6 +260,9 @@ def _orders(record: Calibration) -> Table:
                 plain_number(_micro_g(row["leave_one_out"]), 4) if row["leave_one_out"] is not None else "–",
                 f"{probability:.2g}" if probability is not None else "–",
                 f"{row['bic']:.1f}" if row["bic"] is not None else "–",
+                plain_number(_micro_g(predicted), 3)
+                if (predicted := row.get("largest_uncertainty")) is not None
+                else "–",
                 plain_number(row["condition_number"], 3),
                 "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
             ]
@@ -250,8 +271,9 @@ def _orders(record: Calibration) -> Table:
     return Table(
         title="Choice of the order",
         caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
-        "attitudes it has not seen (leave-one-out), if the F-test finds the gain significant, and if the attitudes can "
-        f"observe it.{huber}",
+        "attitudes it has not seen better (leave-one-out), by more than the error of that comparison, if the F-test "
+        "finds the gain significant, and if the attitudes can observe it: nowhere on the sphere may the predicted "
+        f"uncertainty of |f| exceed 4 times the scatter at order 1.{huber}",
         columns=[
             "order",
             "parameters",
@@ -259,6 +281,7 @@ def _orders(record: Calibration) -> Table:
             "leave-one-out, µg",
             "F-test p",
             "BIC",
+            "largest u(|f|), µg",
             "condition",
             "observable",
         ],

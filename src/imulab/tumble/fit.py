@@ -21,18 +21,22 @@ from imulab.gravity import Gravity, local_gravity
 from imulab.recording import Array
 from imulab.tumble.advice import helpful_attitudes
 from imulab.tumble.axes import check_axes
+from imulab.tumble.blend import Blended, blend_orders, with_known_spread
 from imulab.tumble.checks import check_attitudes, check_residuals
+from imulab.tumble.findings import Found, Stated
 from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
 from imulab.tumble.montecarlo import check_trials, propagate
 from imulab.tumble.order_zero import with_assumed_alignment
-from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order
+from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order, solve_orders
+from imulab.tumble.outliers import NONE_ASIDE, Aside, set_aside
 from imulab.tumble.prior import GROUPS, Aged, Known, entries, findings, known_of, put_together
 from imulab.tumble.record import Scaling, make_record
-from imulab.tumble.solve import Problem, Solution, forces, informed_rows, solve_linearised, solve_norm
+from imulab.tumble.solve import Problem, Solution, evaluate, forces, informed_rows, solve_linearised, solve_norm
 from imulab.units import parse_unit, to_si
 
 METHODS = ("norm", "linearised")
-LOSSES = ("square", "huber")
+LOSSES = ("square", "huber", "auto")
+FROM_DATA = ("auto", "blend")
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class TumbleFit:
     residuals
         ``|f| - g`` of each attitude, m/s^2, shape (n,).
     down_weights
-        Factors of Huber's loss, shape (n,); ones without it.
+        Factors of Huber's loss, shape (n,); without it ones, and zeros for attitudes set aside.
     """
 
     calibration: Calibration
@@ -69,7 +73,8 @@ def fit_tumble(
     order: int | str = "auto",
     gravity: float | str | Gravity | None = None,
     method: str = "norm",
-    loss: str = "square",
+    loss: str = "auto",
+    nonlinearity: tuple[float, float] | None = None,
     prior: Calibration | None = None,
     ageing: Sequence[float] = (),
     monte_carlo: int | None = None,
@@ -85,14 +90,18 @@ def fit_tumble(
     attitudes
         From `find_attitudes`.
     order
-        1 to 5, or ``"auto"``: the order that predicts best among those that the attitudes can see.
+        1 to 5; ``"auto"``: the order that predicts best among those that the attitudes can see, with an uncertainty
+        that holds whatever the order; ``"blend"``: all of them, each as far as the data support it.
     gravity
         Local gravity, m/s^2, or a text such as ``"9.81362+-0.00002"``, whose standard uncertainty enters that of the
         scale factors. Without it that of the recording's head is used, or standard gravity, with a warning.
     method
         ``"norm"`` or ``"linearised"``.
     loss
-        ``"square"``, or ``"huber"`` against single disturbed attitudes (method norm only).
+        ``"auto"``: attitudes that no order explains are set aside and named (``"square"`` with method linearised);
+        ``"square"``: all count; ``"huber"``: the pull of single disturbed ones is limited (method norm only).
+    nonlinearity
+        Standard deviations of k2 and k3 about zero, in units of 1/g and 1/g^2, if known; order auto or blend.
     prior
         Earlier tumble record of the same unit, taken as a normal distribution of the parameters, which is widened by
         what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square and stated
@@ -116,7 +125,10 @@ def fit_tumble(
     RecordError
         The prior lacks a parameter, or has outputs in another unit.
     """
-    check_options(order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing)
+    check_options(
+        order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
+        nonlinearity=nonlinearity,
+    )  # fmt: skip
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
@@ -124,56 +136,68 @@ def fit_tumble(
     spread = scaling.scale[:, None] * scaling.scale
     noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
     motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
-    problem = Problem(reading, noise, 1, robust=loss == "huber", motion=motion)
-    choice: OrderChoice | None = None
+    every = Problem(reading, noise, 1, robust=loss == "huber", motion=motion)
     known = None
     if prior is not None:
         order = _prior_order(prior, order, attitudes)
         known = known_of(prior, scaling, local, attitudes.unit)
-    if order == "auto":
-        if len(attitudes) >= parameter_count(1):
-            choice = choose_order(problem, local.value)
-        chosen = choice.order if choice else 1
-    else:
-        chosen = int(order)
-    problem = replace(problem, order=chosen)
+    aside, fitted = NONE_ASIDE, dict[int, Solution]()
+    if loss == "auto" and method == "norm":
+        aside, fitted = set_aside(every, lambda of: _fits(of, order))
+    used, kept = every, attitudes
+    if aside.index:
+        used, kept = every.only(aside.others(len(attitudes))), attitudes.only(aside.others(len(attitudes)))
+    choice: OrderChoice | None = None
+    if order in FROM_DATA and len(kept) >= parameter_count(1):
+        choice = choose_order(used, local.value, fitted or solve_orders(used))
+    problem = replace(used, order=choice.order if choice else 1 if order in FROM_DATA else int(order))
     aged = None
     if known is not None:
         aged = put_together(problem, known, local, _scaled_ageing(ageing, local.value))
         problem = aged.problem
-    solution, seen = _solve(problem, attitudes, method, choice, aged)
-    check_residuals(attitudes, solution, local.value)
-    check_axes(attitudes, forces(problem, solution)[0])
+    solution, seen = _solve(problem, kept, method, choice, aged.solution if aged else fitted.get(problem.order))
     matrix, freedom = (aged.covariance, aged.freedom) if aged else _covariance(problem, solution)
+    stated = None if matrix is None else Stated(matrix, freedom)
+    if choice is not None and stated is not None:
+        blended = with_known_spread(used, choice, nonlinearity) if nonlinearity else blend_orders(used, choice)
+        if order == "blend":
+            problem, solution = _at_blend(used, solution, blended)
+            stated = Stated(blended.covariance, blended.freedom, blended=blended)
+        else:
+            stated = Stated(blended.about(solution.theta[0]), blended.freedom, matrix, freedom, blended)
+    found = _found(attitudes, replace(every, order=problem.order), solution, aside)
+    check_residuals(kept, solution, local.value)
+    check_axes(attitudes, forces(found.problem, found.solution)[0])
     trials = None
     if monte_carlo is not None:
         if matrix is None:
             raise OptionError(
                 f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
-                f"columns); found {len(attitudes)} attitudes for {parameter_count(chosen)} parameters"
+                f"columns); found {len(kept)} attitudes for {parameter_count(problem.order)} parameters"
             )
         trials = propagate(problem, solution, trials=monte_carlo, freedom=freedom, progress=progress)
     record = make_record(
-        attitudes=attitudes,
+        attitudes=kept,
         gravity=local,
         scaling=scaling,
         problem=problem,
         solution=solution,
-        covariance=matrix,
-        effective=freedom,
+        stated=stated,
+        found=found,
         observability=seen,
         orders=choice.rows if choice else (),
         options={"order": order, "method": method, "loss": loss, "gravity": local.value}
+        | ({} if nonlinearity is None else {"nonlinearity": list(nonlinearity)})
         | ({} if monte_carlo is None else {"monte_carlo": monte_carlo}),
         monte_carlo=trials,
-        **_prior_found(prior, known, aged, scaling, local, attitudes),
+        **_prior_found(prior, known, aged, scaling, local, kept),
     )
     return TumbleFit(
         calibration=with_assumed_alignment(record) if problem.order == 0 else record,
         observability=seen,
         orders=choice.rows if choice else (),
-        residuals=local.value * solution.deviations[0],
-        down_weights=solution.down_weights[0],
+        residuals=local.value * found.solution.deviations[0],
+        down_weights=found.solution.down_weights[0],
     )
 
 
@@ -185,6 +209,7 @@ def check_options(
     monte_carlo: int | None = None,
     with_prior: bool = False,
     ageing: Sequence[float] = (),
+    nonlinearity: tuple[float, float] | None = None,
 ) -> None:
     """Check what can be checked before there is data.
 
@@ -193,7 +218,7 @@ def check_options(
     OptionError
         An option has an unknown value, or does not go with another.
     """
-    known = ("auto", *range(HIGHEST_ORDER + 1))
+    known = ("auto", *range(HIGHEST_ORDER + 1), "blend")
     if order not in known or isinstance(order, bool):
         raise OptionError(f"order {order!r}: expected one of {' '.join(map(str, known))}")
     if method not in METHODS:
@@ -204,8 +229,8 @@ def check_options(
         raise OptionError("loss huber needs method norm, found method linearised")
     if order == 0 and method == "linearised":
         raise OptionError("order 0 needs method norm, found method linearised")
-    if with_prior and (method != "norm" or loss != "square"):
-        raise OptionError(f"a prior needs method norm and loss square, found method {method} and loss {loss}")
+    if with_prior and (method != "norm" or loss == "huber"):
+        raise OptionError(f"a prior needs method norm and loss square or auto, found method {method} and loss {loss}")
     if ageing and not with_prior:
         raise OptionError("ageing without a prior: expected both, it is that of the prior's unit")
     if len(ageing) > len(GROUPS) or not all(0 <= value < np.inf for value in ageing):
@@ -213,6 +238,13 @@ def check_options(
             f"ageing {' '.join(f'{value:g}' for value in ageing)}: expected up to three standard deviations of 0 or "
             "more, of biases (m/s^2), scale factors (1) and misalignments (rad)"
         )
+    if order == "blend" and (method != "norm" or with_prior or monte_carlo is not None):
+        raise OptionError("order blend needs method norm, and goes neither with a prior nor with monte-carlo")
+    if nonlinearity is not None:
+        if order not in FROM_DATA or with_prior:
+            raise OptionError(f"nonlinearity needs order auto or blend without a prior, found order {order}")
+        if not all(0 < value < np.inf for value in nonlinearity):
+            raise OptionError(f"nonlinearity {nonlinearity}: expected two standard deviations above 0, of k2 and k3")
     if monte_carlo is None:
         return
     check_trials(monte_carlo)
@@ -238,6 +270,27 @@ def _prior_found(
         "entries": {"prior": entries(prior, known, aged, scaling, gravity)},
         "findings": findings(prior, aged, attitudes.recording, len(attitudes)),
     }
+
+
+def _fits(problem: Problem, order: int | str) -> dict[int, Solution]:
+    """Fit the orders that are asked for."""
+    return solve_orders(problem) if order in FROM_DATA else {int(order): solve_norm(replace(problem, order=int(order)))}
+
+
+def _found(attitudes: Attitudes, problem: Problem, solution: Solution, aside: Aside) -> Found:
+    """Return all attitudes under the solution, those set aside with the down-weight 0."""
+    if not aside.index:
+        return Found(attitudes, problem, solution, aside)
+    every = evaluate(problem, solution)
+    every.down_weights[0, list(aside.index)] = 0.0
+    return Found(attitudes, problem, every, aside)
+
+
+def _at_blend(problem: Problem, solution: Solution, blended: Blended) -> tuple[Problem, Solution]:
+    """Return problem and solution at the blend's own values."""
+    problem = replace(problem, order=blended.order)
+    at_blend = evaluate(problem, replace(solution, theta=blended.theta[None]))
+    return problem, replace(at_blend, down_weights=solution.down_weights)
 
 
 def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:
@@ -271,14 +324,14 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 
 
 def _solve(
-    problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None, aged: Aged | None
+    problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None, solved: Solution | None
 ) -> tuple[Solution, Observability]:
-    """Solve the problem, unless the `choice` of the order has done so by norm, and see what it determines."""
+    """Solve the problem, unless that has been done by norm, and see what it determines."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     if method == "norm" and choice is not None:
         solution, seen = choice.solution, choice.observability
     else:
-        solution = aged.solution if aged else _solved(problem, attitudes, method)
+        solution = solved or _solved(problem, attitudes, method)
         seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
     if seen.rank < size:
         names = parameter_names(problem.order)
@@ -308,7 +361,7 @@ def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
 
 
 def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
-    """Covariance of theta, shape (p, p), and the degrees of freedom of its scale (None: noise known)."""
+    """Covariance of theta given the order, (p, p), and the degrees of freedom of its scale (None: noise known)."""
     n, size = problem.reading.shape[1], parameter_count(problem.order)
     freedom = n - size
     base = covariance(solution.jacobian, 1 / solution.variance)[0]

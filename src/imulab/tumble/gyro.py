@@ -25,6 +25,7 @@ from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rows import leave_out
 from imulab.tumble.apply import output_factor, specific_force
 from imulab.tumble.directions import direction_covariance
+from imulab.tumble.findings import aside_of
 from imulab.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks, counted, evened
 from imulab.tumble.gyrolinear import Nonlinearity, test_linearity
 from imulab.tumble.gyrorest import SENSITIVITIES, clock_notes, find_holds
@@ -162,7 +163,8 @@ def fit_gyro(
     own = attitudes.recording.si("time")
     moving = leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording
     own_force = specific_force(record, moving.triad("accel") * factor)
-    case = Case(recording.name, attitudes, specific_force(record, means), own, own_force, output, unit, fit_bias)
+    force, knocked = specific_force(record, means), aside_of(record, attitudes)
+    case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)
     found = solve_turns(case, time, sensitivity)
     even, said = evened(time), []
     if even is not None:

@@ -14,7 +14,7 @@ from imulab.recording import Array
 from imulab.tumble.gyrorest import Rest, at_rest, find_holds
 from imulab.tumble.gyroturns import COLUMNS, ROWS, Segments, find_turns, model, start_scale
 from imulab.units import parse_unit, to_si
-from imulab.verdict import Bad
+from imulab.verdict import Bad, Note
 
 _WORST_TURN = np.radians(20.0)
 _FAR = np.radians(8.0)
@@ -37,6 +37,8 @@ class Case:
     output: Array
     unit: str
     fit_bias: bool
+    knocked: NDArray[np.bool_]
+    """Attitudes that the accelerometers' record set aside, shape (n,)."""
 
     def force_at(self, time: Array) -> Array:
         """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
@@ -86,6 +88,13 @@ def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
         rest = at_rest(holds, case.output, case.force, wanted)
         moving = None if rest.slope is None else case.force_at(time)
         segments, notes = find_turns(holds, time, case.output, case.force, rest, moving, case.name)
+        beside = case.knocked[segments.attitude] | case.knocked[segments.attitude + 1]
+        if beside.any():
+            numbers = " ".join(map(str, (np.flatnonzero(case.knocked) + 1).tolist()))
+            left_out = (
+                f"gyro: {int(beside.sum())} turns left out, beside attitudes that the record set aside ({numbers})"
+            )
+            segments, notes = segments.part(~beside), [*notes, Note(left_out)]
         return _solve(case, segments, rest, notes)
 
     found = solved(sensitivity)

@@ -14,6 +14,7 @@ from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.estimate import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.recording import Array
+from imulab.tumble.findings import Found, Stated, aside_warnings, assumption_notes, uncertainty_entries
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, gravity_slope, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
@@ -34,6 +35,14 @@ _FEW_DEGREES = 5
 _TO_MICRO = 1e6
 
 
+_REMEDIES = {
+    ("norm", "square"): "--loss auto sets it aside",
+    ("norm", "auto"): "it was not set aside: --loss huber limits its pull",
+    ("linearised", "square"): "--method norm --loss auto sets it aside",
+    ("linearised", "auto"): "--method norm sets it aside",
+}
+
+
 @dataclass(frozen=True)
 class Scaling:
     """Nominal zero and scale (output per g) of each axis, shape (3,), that the fit works relative to."""
@@ -49,8 +58,8 @@ def make_record(
     scaling: Scaling,
     problem: Problem,
     solution: Solution,
-    covariance: Array | None,
-    effective: float | None,
+    stated: Stated | None,
+    found: Found,
     observability: Observability,
     orders: tuple[OrderRow, ...],
     options: Mapping[str, Any],
@@ -61,16 +70,18 @@ def make_record(
 ) -> Calibration:
     """Turn a solution in units of g into the record.
 
-    ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; `covariance` is carried along by
-    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `effective`
-    degrees of freedom are those of its scale: None where the noise is known. `with_gravity` says that the covariance
-    holds gravity's uncertainty already; `entries` and `findings` are added to the fit's and to the warnings.
+    ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; covariances are carried along by
+    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `with_gravity`
+    says that the covariance holds it already; `entries` and `findings` are added to the fit's and to the warnings.
     """
     g, order = gravity.value, problem.order
     names = parameter_names(order)
     values, derivative = _to_si(solution.theta[0], scaling, g, order)
     shared = (not with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values)
-    matrix = None if covariance is None else derivative @ covariance @ derivative.T + np.outer(shared, shared)
+    matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
+    given = np.full(len(names), np.nan)
+    if stated is not None and stated.given_order is not None:
+        given = np.sqrt(np.diag(derivative @ stated.given_order @ derivative.T) + shared**2)
     recording = attitudes.recording
     n, size = len(attitudes), len(names)
     chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
@@ -89,7 +100,12 @@ def make_record(
     return Calibration(
         procedure="tumble",
         parameters={
-            name: Parameter(float(values[i]), None if matrix is None else float(np.sqrt(matrix[i, i])), unit)
+            name: Parameter(
+                float(values[i]),
+                None if matrix is None else float(np.sqrt(matrix[i, i])),
+                unit,
+                standard_uncertainty_given_order=None if np.isnan(given[i]) else float(given[i]),
+            )
             for i, (name, unit) in enumerate(zip(names, parameter_units(order, attitudes.unit), strict=True))
         },
         covariance=Covariance((), ())
@@ -100,14 +116,14 @@ def make_record(
             "method": options["method"],
             "loss": options["loss"],
             "attitudes": n,
+            "set_aside": [number + 1 for number in found.aside.index],
             "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
             "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
             "degrees_of_freedom": n - size if problem.prior is None else freedom,
             "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
             "noise": "known" if known else "estimated from the residuals",
             "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
-            "effective_degrees_of_freedom": effective,
-            "coverage_factor_95": None if covariance is None else coverage_factor(effective),
+            **uncertainty_entries(stated),
             "rank": observability.rank,
             "condition_number": observability.condition,
             "iterations": int(solution.iterations[0]),
@@ -117,13 +133,15 @@ def make_record(
             **entries,
         },
         options=dict(options),
-        data=_data(attitudes, scaling, problem, solution, g),
+        data=_data(found.attitudes, scaling, found.problem, found.solution, g),
         sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
-            *_warnings(attitudes, gravity, problem, solution, observability),
+            *_warnings(attitudes, gravity, problem, solution, observability, options),
             *_scatter_warnings(problem, solution, chi_square, freedom),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
+            *aside_warnings(found, options),
+            *assumption_notes(stated),
             *findings,
         ),
     )
@@ -255,12 +273,13 @@ def _warnings(
     problem: Problem,
     solution: Solution,
     observability: Observability,
+    options: Mapping[str, Any],
 ) -> list[str]:
     return [
         *attitudes.recording.notes,
         *attitudes.notes,
         *gravity_findings(gravity, attitudes.recording),
-        *_attitude_warnings(attitudes, problem, solution),
+        *_attitude_warnings(attitudes, problem, solution, options),
         *_freedom_warnings(problem, solution, observability),
         *_size_warnings(attitudes, solution),
     ]
@@ -303,7 +322,9 @@ def _pattern_warnings(attitudes: Attitudes, problem: Problem, solution: Solution
     ]
 
 
-def _attitude_warnings(attitudes: Attitudes, problem: Problem, solution: Solution) -> list[str]:
+def _attitude_warnings(
+    attitudes: Attitudes, problem: Problem, solution: Solution, options: Mapping[str, Any]
+) -> list[str]:
     deviation = 1e3 * solution.deviations[0]
     if problem.robust:
         down = solution.down_weights[0]
@@ -314,7 +335,7 @@ def _attitude_warnings(attitudes: Attitudes, problem: Problem, solution: Solutio
     else:
         single = [
             f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
-            f"(residual {deviation[i]:+.3f} mg); --loss huber keeps it from spoiling the rest"
+            f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}"
             for i, standard in _outliers(problem, solution).items()
         ]
     more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []

@@ -268,6 +268,28 @@ def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tup
     return length_noise(theta, jacobian, problem.covariance, problem.motion)
 
 
+def evaluate(problem: Problem, solution: Solution) -> Solution:
+    """Return residuals, Jacobian and variances of all attitudes under a solution for some of them, a batch of one.
+
+    The excess variance is the solution's; down-weights are ones.
+    """
+    norm, jacobian, _, _ = norm_and_jacobian(solution.theta, problem.reading, problem.order)
+    lengthening, own = _noise(problem, solution.theta, jacobian)
+    if problem.covariance is None:
+        lengthening = lengthening + solution.lengthening[:, :1]
+    residuals = norm - 1 - lengthening
+    return replace(
+        solution,
+        residuals=residuals,
+        deviations=residuals if problem.motion is not None else norm - 1,
+        lengthening=lengthening,
+        jacobian=jacobian,
+        variance=own + solution.excess[:, None] ** 2,
+        own_variance=own,
+        down_weights=np.ones(norm.shape),
+    )
+
+
 def forces(problem: Problem, solution: Solution) -> Array:
     """Return the specific force in each attitude, units of g, shape (b, n, 3)."""
     return norm_and_jacobian(solution.theta, problem.reading, problem.order)[2]

@@ -1,0 +1,117 @@
+"""What a fit found besides its values: attitudes set aside, and what its uncertainties hold for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.attitudes import Attitudes
+from imulab.calibration import Calibration
+from imulab.estimate import coverage_factor
+from imulab.recording import Array
+from imulab.tumble.blend import Blended
+from imulab.tumble.model import parameter_count
+from imulab.tumble.outliers import FREEDOM, HIGHEST_TESTED, Aside
+from imulab.tumble.solve import Problem, Solution
+from imulab.verdict import Note
+
+_SELDOM_MISSED = 6
+"""Degrees of freedom at the highest order tested from which a knock is seldom missed."""
+_TO_MICRO = 1e6
+_NEGLIGIBLE = 0.01
+
+
+@dataclass(frozen=True)
+class Found:
+    """All attitudes that were found, those set aside included, under the solution for the others."""
+
+    attitudes: Attitudes
+    problem: Problem
+    solution: Solution
+    aside: Aside
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Covariance in units of g and its degrees of freedom (None: noise known), as stated, and if the order is right."""
+
+    covariance: Array
+    freedom: float | None
+    given_order: Array | None = None
+    freedom_given_order: float | None = None
+    blended: Blended | None = None
+
+
+def uncertainty_entries(stated: Stated | None) -> dict[str, Any]:
+    """Return the record's entries on the stated uncertainty."""
+    entries: dict[str, Any] = {
+        "effective_degrees_of_freedom": None if stated is None else stated.freedom,
+        "coverage_factor_95": None if stated is None else coverage_factor(stated.freedom),
+    }
+    if stated is None or stated.blended is None:
+        return entries
+    if stated.given_order is not None:
+        entries["coverage_factor_95_given_order"] = coverage_factor(stated.freedom_given_order)
+    noise = {str(order): share for order, share in stated.blended.noise.items()}
+    return entries | {"blend": {"highest_order": stated.blended.order, "noise_share": noise}}
+
+
+def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
+    """Return which of the attitudes a record set aside, if it was made from these, shape (n,)."""
+    found = np.zeros(len(attitudes), dtype=np.bool_)
+    if np.array_equal(record.data.get("attitudes", {}).get("mean", ()), attitudes.mean):
+        found[[number - 1 for number in record.fit.get("set_aside", ())]] = True
+    return found
+
+
+def aside_warnings(found: Found, options: Mapping[str, Any]) -> list[str]:
+    """Name the attitudes that were set aside, or say why a knocked one may not have been."""
+    if options["loss"] != "auto":
+        return []
+    if options["method"] != "norm":
+        return [Note("method linearised keeps every attitude: only method norm sets knocked ones aside")]
+    aside = found.aside
+    named = [
+        f"{found.attitudes.label(index)} set aside: {1e3 * found.solution.residuals[0, index]:+.3f} mg "
+        f"({abs(deviations):.0f} standard uncertainties) from what the others give, as if it had been knocked or had "
+        "not settled; --loss square keeps it"
+        for index, deviations in zip(aside.index, aside.deviations, strict=True)
+    ]
+    n = len(found.attitudes)
+    lowest, highest = (options["order"],) * 2 if isinstance(options["order"], int) else (1, HIGHEST_TESTED)
+    enough = parameter_count(lowest) + 1 + FREEDOM[found.problem.covariance is not None]
+    if n < enough:
+        named.append(Note(f"{n} attitudes are too few to tell a knocked one from the others: {enough} or more can"))
+    elif n - parameter_count(highest) < _SELDOM_MISSED:
+        named.append(
+            Note(
+                f"a knocked attitude among only {n} may stay unseen: of those that are off by more than 8 standard "
+                "uncertainties 18 attitudes show 60 to 97 %, 24 show 97 % or more"
+            )
+        )
+    return named
+
+
+def assumption_notes(stated: Stated | None) -> list[str]:
+    """Say which nonlinearity the attitudes do not show, and what it would move."""
+    if stated is None or stated.blended is None:
+        return []
+    notes: list[str] = []
+    for order, (bias, scale) in stated.blended.assumed.items():
+        unit = f"µg/g{'⁰¹²³'[order]}"
+        moved = [
+            f"{value:.2g} {of}"
+            for value, of in ((bias, "µg of bias"), (scale, "ppm of scale factor"))
+            if value > _NEGLIGIBLE
+        ]
+        notes.append(
+            Note(
+                f"these attitudes do not show k{order}: the uncertainties assume k{order} = 0; 1 {unit} of it moves up "
+                f"to {' and '.join(moved)} (tumble plan --order 3 chooses attitudes that show it)"
+            )
+        )
+    return notes
