@@ -247,7 +247,7 @@ def test_compare_says_who_follows_a_dead_gyro(imulab, tmp_path):
     assert found.record.data["single"][0] == pytest.approx(readings[:, [0, 2, 3]].std(axis=0).mean(), rel=1e-9)
     assert found.figures["feedback"][0].reduction is None  # all the weight is the dead gyro's
     assert found.figures["robust"][0].over_limit == pytest.approx(1.0, abs=0.03)
-    assert "mean: it follows only 0.75 of a motion: a gyro that does not move counts in it" in found.warnings
+    assert "mean: it follows only 0.75 ± 0.01 of a motion: gyro_2 does not move and counts in it" in found.warnings
     assert not any(message.startswith("robust:") for message in found.warnings)
     il.write_csv(array_recording(readings, 100.0), tmp_path / "dead.csv")
     printed = imulab("array", "compare", "dead.csv").stdout

@@ -11,9 +11,9 @@ import numpy as np
 from imulab.calibration import Calibration, Covariance
 from imulab.errors import DataError, ImulabError
 from imulab.gyro_array.bandwidth import Response, responses
+from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
-from imulab.gyro_array.health import Turned
 from imulab.gyro_array.model import FEWEST_ROBUST, METHODS, Elements, array_calibration, find_elements
 from imulab.gyro_array.single import Singles, single_gyros
 from imulab.noise import allan_deviation
@@ -25,7 +25,7 @@ _QUIET_FACTOR = 3.0
 _SHORTEST_QUIET = 5.0
 _FILTERED = 0.9  # of half the sampling rate
 _BEYOND_LIMIT = 0.97  # of the least noise that weights alone can reach
-_FOLLOWS = 0.95
+_FOLLOWS, _SURE, _FINEST = 0.95, 2.0, 0.01
 _NOTHING = 1e-9  # of a gyro's noise
 _HALVES = 2 * FEWEST_ROBUST
 
@@ -93,10 +93,9 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
     for a, row in enumerate(elements.names):
         if not np.isfinite(logged[:, a]).any():
             raise DataError(f"{recording.name}: columns {row[0]} to {row[-1]}: expected finite readings, found none")
-    if not aligned:
-        turned = Turned(elements.names)
-        turned.watch(logged)
-        warnings += [f"{recording.name}: {line}" for line in turned.lines()]
+    checks = Checks(elements.names)
+    checks.watch(logged)
+    warnings += [type(line)(f"{recording.name}: {line}") for line in checks.lines(turned=not aligned)]
     truth = elements.truth(recording)
     start, stop = 0, len(recording)
     if truth is None:
@@ -318,11 +317,16 @@ def _filtering(
     for method, rows in figures.items():
         if isinstance(rows, str):
             continue
-        gain = min(answer.gain for answer in response[method])
+        slow = min(response[method], key=lambda answer: answer.gain)
         narrow = min(row.bandwidth for row in rows)
         beyond = min((row.over_limit for row in rows if row.over_limit > 0), default=1.0)
-        if gain < _FOLLOWS:
-            found.append(f"{method}: it follows only {gain:.2f} of a motion: a gyro that does not move counts in it")
+        if slow.gain + _SURE * slow.gain_uncertainty < _FOLLOWS:
+            verbs = "does not move and counts" if len(slow.blind) == 1 else "do not move and count"
+            why = f": {' '.join(slow.blind)} {verbs} in it"
+            found.append(
+                f"{method}: it follows only {slow.gain:.2f} ± {max(slow.gain_uncertainty, _FINEST):.2f} of a motion"
+                f"{why if slow.blind else ''}"
+            )
         elif narrow < _FILTERED * rate / 2:
             found.append(
                 f"{method}: its bandwidth is {narrow:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower that "

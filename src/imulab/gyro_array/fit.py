@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,18 +13,20 @@ from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.coefficients import COEFFICIENTS, coefficients_dict
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.gyro_array.align import Alignment
+from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.latency import align_in_time, latency_notes
 from imulab.gyro_array.model import Elements, find_elements, fixed_weights
+from imulab.gyro_array.rest import find_rest
 from imulab.noise import AllanCurve
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rows import LeftOut, leave_out
 from imulab.sampling import sampling_rate
 from imulab.units import parse_unit, to_si
+from imulab.verdict import Note
 
 _FEWEST_SAMPLES = 200
 _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
-_MOVES = 10.0
 _OVERLAP = 8
 _CLIPPED_RUN = 3
 _SHARED = 0.5
@@ -55,10 +57,10 @@ def calibrate_array(
 ) -> ArrayFit:
     """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
 
-    At rest: each element's bias is its plain mean, the common part included; N, B, K come from its Allan curve, and so
-    does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance matrix at `averaging_time` is
-    half the mean of the products of successive differences of means (the Allan covariance; Vaccaro and Zaki 2017).
-    In motion: `align`.
+    At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
+    come from its Allan curve, and so does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance
+    matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    covariance; Vaccaro and Zaki 2017). In motion: `align`.
 
     Parameters
     ----------
@@ -70,7 +72,7 @@ def calibrate_array(
     Raises
     ------
     DataError
-        Samples that are not finite, a dead element, too few samples, an array that moves while it should be at rest.
+        Samples that are not finite, a dead element, too few samples, no stretch at rest (`find_rest`).
     UnitError
         The elements have different units, or none of rate.
     ObservabilityError
@@ -85,12 +87,13 @@ def calibrate_array(
         raise DataError(f"{still.name}: {elements.count} element on each axis; expected 2 or more")
     if not averaging_time > 0:
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
+    _check_readings(still, elements)
     left_out = _leave_out(still, elements)
-    left_out.check(0, len(still), "the recording at rest")
-    still = left_out.recording
-    rest = _at_rest(still, elements)
     warnings = [f"{still.name}: {note}" for note in still.notes]
     warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
+    still, cut = _still_part(left_out, elements)
+    warnings += cut
+    rest = _at_rest(still, elements)
     _, notes = sampling_rate(still)
     warnings += notes
     aligned = None
@@ -98,6 +101,9 @@ def calibrate_array(
         aligned, more = _in_motion(moving, elements, rest)
         warnings += more
     readings = _si(still, elements) - rest.bias
+    checks = Checks(elements.names)
+    checks.watch(readings)
+    warnings += [type(line)(f"{still.name}: {line}") for line in checks.units()]
     if aligned is not None:
         readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
     covariance, used, count = _covariance(readings, rest.rate, averaging_time)
@@ -106,7 +112,6 @@ def calibrate_array(
             f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
             f"taken at {used:.3g} s"
         )
-    _check_at_rest(still, readings, rest, elements)
     noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
     warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
@@ -128,13 +133,48 @@ def _si(recording: Recording, elements: Elements) -> Array:
     return readings
 
 
-def _at_rest(still: Recording, elements: Elements) -> _AtRest:
-    rate, _ = sampling_rate(still)
+def _check_readings(recording: Recording, elements: Elements) -> None:
+    """Refuse readings that are no numbers, and gyros that are dead."""
+    names = [name for row in elements.names for name in row]
+    check_finite(recording, names)
+    for name in names:
+        values = recording.columns[name]
+        if len(values) and np.ptp(values) == 0:
+            raise DataError(f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead gyro")
+    checks = Checks(elements.names)
+    checks.watch(elements.readings(recording))
+    for line in checks.doubled():
+        raise DataError(f"{recording.name}: {line}")
+
+
+def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str]]:
+    """The longest stretch at rest, and a line where that is not everything."""
+    still = left_out.recording
     if len(still) < _FEWEST_SAMPLES:
         raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
-    for name in (name for row in elements.names for name in row):
-        if np.ptp(still.columns[name]) == 0:
-            raise DataError(f"{still.name}: column {name}: all samples are {still.columns[name][0]:g}: a dead gyro")
+    rate, _ = sampling_rate(still)
+    found = find_rest(_si(still, elements), rate, elements.names, still.name)
+    left_out.check(found.start, found.stop, "the recording at rest")
+    if not found.moved:
+        return still, []
+    time = still.si("time")
+    columns = {name: values[found.start : found.stop] for name, values in still.columns.items()}
+    part = replace(still, columns=columns, first_row=still.first_row + found.start)
+    if len(part) < _FEWEST_SAMPLES:
+        raise DataError(
+            f"{still.name}: not at rest throughout ({found.moved}), and the longest stretch at rest has {len(part)} "
+            f"samples; expected {_FEWEST_SAMPLES} or more"
+        )
+    first, last = time[found.start], time[found.stop - 1]
+    return part, [
+        f"{still.name}: not at rest throughout ({found.moved}): used is the longest stretch at rest, {first:.6g} to "
+        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval START,STOP chooses another"
+    ]
+
+
+def _at_rest(still: Recording, elements: Elements) -> _AtRest:
+    rate, _ = sampling_rate(still)
+    _check_readings(still, elements)
     readings = _si(still, elements)
     noise = tuple(
         tuple(column_noise(readings[:, a, i], rate) for i in range(elements.count)) for a in range(len(elements.axes))
@@ -152,6 +192,7 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
             f"{moving.name}: {its.count} elements on {len(its.axes)} axes; expected {elements.count} on "
             f"{len(elements.axes)} as at rest"
         )
+    _check_readings(moving, its)
     left_out = _leave_out(moving, its)
     moving = left_out.recording
     readings = _si(moving, its)
@@ -164,6 +205,10 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
     if truth is not None:
         truth = np.column_stack([to_si(truth[:, a], unit) for a, unit in enumerate(its.units)])[~clipped]
     kept = readings[~clipped] - rest.bias
+    checks = Checks(its.names)
+    checks.watch(kept)
+    notes += [type(line)(f"{moving.name}: {line}") for line in checks.units()]
+    notes += [Note(f"{moving.name}: {line}; the record puts it right") for line in checks.turned()]
     if len(kept) < _FEWEST_SAMPLES:
         raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
     try:
@@ -199,23 +244,6 @@ def _covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Ar
     # Equivalent number of independent differences under white noise: NIST SP 1065, table 5.
     freedom = max(2, round(1.5 * m / size))
     return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, freedom
-
-
-def _check_at_rest(still: Recording, readings: Array, rest: _AtRest, elements: Elements) -> None:
-    """Refuse an array that moves while it should be at rest."""
-    size = max(1, round(rest.rate))
-    blocks = len(readings) // size
-    means = readings[: blocks * size].reshape(blocks, size, len(elements.axes), elements.count).mean(axis=1)
-    for a, axis in enumerate(elements.axes):
-        common = means[:, a].mean(axis=1)
-        apart = (means[:, a] - common[:, None]).std()
-        if blocks > 4 and common.std() > _MOVES * max(apart, 1e-300):
-            where = f" about {axis}" if axis else ""
-            raise DataError(
-                f"{still.name}: the array moves{where}: its elements go together by "
-                f"{math.degrees(common.std()):.3g} deg/s, "
-                f"{common.std() / apart:.0f} times what they differ; expected a recording at rest"
-            )
 
 
 def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
@@ -337,7 +365,7 @@ def _over_axes(found: list[dict[str, Any]]) -> dict[str, Any]:
 def _shared(correlation: Array) -> float:
     n = correlation.shape[1]
     off = ~np.eye(n, dtype=bool)
-    return float(np.mean(correlation[:, off]))
+    return float(np.mean(np.abs(correlation[:, off])))
 
 
 def _temperature(still: Recording) -> dict[str, Any]:

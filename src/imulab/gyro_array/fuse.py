@@ -11,8 +11,9 @@ import numpy as np
 from imulab.blob import Blob
 from imulab.calibration import Calibration
 from imulab.errors import DataError, OptionError, RecordError, UnitError
+from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import Clock, to_one_clock
-from imulab.gyro_array.health import Health, Turned
+from imulab.gyro_array.health import Health
 from imulab.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
 from imulab.gyro_array.model import (
     FEWEST_ROBUST,
@@ -186,7 +187,7 @@ class Fuser:
     health: Health | None = None
     tell: Callable[[str], None] = lambda _: None
     name: str = "recording"
-    turned: Turned | None = None
+    checks: Checks | None = None
     before: Array | None = None
     lost: int = 0
 
@@ -213,14 +214,14 @@ class Fuser:
                 elements = find_elements(block)
                 self._check(block, elements)
                 self.health = Health(elements.names)
-                self.turned = None if self._aligns() else Turned(elements.names)
+                self.checks = Checks(elements.names)
             settled = stream is not None and self.clock.settled
             before = self.clock.rate
             self.clock.watch(block)
             readings, time = elements.readings(block), block.si("time")
             self._drop_zeros(readings)
-            if self.turned is not None:
-                self.turned.watch(readings)
+            if self.checks is not None:
+                self.checks.watch(readings)
             seen = 0
             if not settled:
                 early = np.concatenate([early, time])
@@ -240,12 +241,13 @@ class Fuser:
             yield self._fused(block, out, seen, elements)
 
     def notes(self) -> list[str]:
-        """Return what there is to say at the end: gaps in time, gyros that turn against the others."""
-        turned = self.turned.lines() if self.turned is not None else []
+        """Return what there is to say at the end: gaps, rows of zeros, and what the readings show (`Checks`)."""
+        known = self.health.stuck() if self.health is not None else ()
+        found = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
-            turned = [*turned, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
-        return [*self.clock.lines(self.name), *(f"{self.name}: {line}" for line in turned)]
+            found = [*found, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
+        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in found)]
 
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""

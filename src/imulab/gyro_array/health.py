@@ -9,8 +9,6 @@ import numpy as np
 
 NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, ALONE = 1, 2, 4, 8, 16, 32, 128
 """Flags of a gyro in a sample, as the C core sets them."""
-_FEWEST_TO_CORRELATE = 100
-_AGAINST = 0.9
 _KINDS = ((NON_FINITE, "non-finite"), (STUCK, "stuck"), (JUMPED, "jumped"), (EXCLUDED, "excluded"))
 
 
@@ -60,6 +58,10 @@ class Health:
         axis, element, kind = key
         return f"{self.names[axis][element]}: {kind} at {self.events[key].first:.6g} s"
 
+    def stuck(self) -> set[str]:
+        """Return the columns of the gyros that were stuck at any time."""
+        return {self.names[a][i] for a, i, kind in self.events if kind == "stuck"}
+
     def lines(self) -> list[str]:
         """Return one line per gyro that was excluded, stuck, jumped or non-finite, and one where all were lost."""
         found = []
@@ -82,42 +84,3 @@ class Health:
 
 def _samples(count: int) -> str:
     return f"{count} sample{'' if count == 1 else 's'}"
-
-
-@dataclass
-class Turned:
-    """Tells whether gyros of an axis are mounted the other way round, from readings before any alignment.
-
-    Under motion the readings of gyro i and gyro 1 correlate at +1 or -1; at rest, and on axes that are swapped, in
-    between: then nothing is said.
-    """
-
-    names: Sequence[Sequence[str]]
-    count: float = 0.0
-    sums: np.ndarray | None = None
-
-    def watch(self, readings: np.ndarray) -> None:
-        """Add the moments of readings, shape (m, axes, n); samples with a reading that is not finite do not count."""
-        fine = readings[np.isfinite(readings).all(axis=(1, 2))]
-        first = fine[:, :, :1]
-        sums = np.array([fine.sum(axis=0), (fine * fine).sum(axis=0), (fine * first).sum(axis=0)])
-        self.sums = sums if self.sums is None else self.sums + sums
-        self.count += len(fine)
-
-    def lines(self) -> list[str]:
-        """Return one line where some gyros turn against gyro 1 of their axis."""
-        if self.sums is None or self.count < _FEWEST_TO_CORRELATE:
-            return []
-        mean, square, product = self.sums / self.count
-        spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
-        scale = spread * spread[:, :1]
-        covariance = product - mean * mean[:, :1]
-        against = covariance < -_AGAINST * scale
-        named = [self.names[a][i] for a, i in zip(*np.nonzero(against & (scale > 0)), strict=True)]
-        if not named:
-            return []
-        verb = "turns" if len(named) == 1 else "turn"
-        return [
-            f"{' '.join(named)} {verb} against the first gyro of the axis: mounted the other way round? "
-            "array calibrate --moving finds it, and --calibration puts it right"
-        ]
