@@ -41,7 +41,7 @@ def slow_noise(rng, count, cutoff):
     return sosfilt(filtered, rng.standard_normal((count + 2000, 3)), axis=0)[2000:] / unit
 
 
-def held(seed, sway=0.0, tremor=0.0, noise=0.3 * MG, hold=6.0, count=24):
+def held(seed, sway=0.0, tremor=0.0, tilt=0.0, noise=0.3 * MG, hold=6.0, count=24):
     """Recording of a unit that is held in `count` directions; sway in rad rms per axis, tremor at 8 Hz in m/s^2."""
     rng = np.random.default_rng(seed)
     directions = reference.random_attitudes(rng, count)
@@ -51,7 +51,7 @@ def held(seed, sway=0.0, tremor=0.0, noise=0.3 * MG, hold=6.0, count=24):
     parts = []
     for k, up in enumerate(directions):
         wave = np.cos(2 * np.pi * 8.0 * time[:, None] + rng.uniform(0, 2 * np.pi, 3))
-        angles = sway * slow_noise(rng, resting, 0.5)
+        angles = sway * slow_noise(rng, resting, 0.5) + tilt * wave[:, [1, 2, 0]]
         parts.append(G * turned(np.tile(up, (resting, 1)), angles) + tremor * wave)
         there = directions[(k + 1) % count]
         angle = np.arccos(up @ there)
@@ -109,6 +109,18 @@ def test_shaking_is_not_taken_for_gravity():
     """Block by block the magnitude of f is taken, sample by sample it would be 200 ug too long."""
     off = [errors(fitted(il.find_attitudes(held(seed, tremor=20 * MG))))[0][3:6].mean() for seed in range(8)]
     assert abs(np.mean(off)) < 8e-6 + 3 * np.std(off) / np.sqrt(len(off))
+
+
+@pytest.mark.parametrize(("tilt", "shortened"), [(0.0, 0), (0.02, 200), (0.05, 1250)])
+def test_a_hand_that_trembles_is_told_so(tilt, shortened):
+    """8 Hz is too fast for blocks of an eighth of a second: what it may do is said, two axes of tilt^2 / 4 each."""
+    record = fitted(il.find_attitudes(held(2, tilt=tilt)))
+    said = [warning for warning in record.warnings if "the unit shakes" in warning]
+    assert len(said) == (tilt > 0)
+    if said:
+        most = float(said[0].split("up to ")[1].split(" ppm")[0])
+        assert 0.8 * shortened < most < 1.2 * shortened
+        assert -1e6 * errors(record)[0][3:6].mean() < 1.2 * shortened
 
 
 @pytest.mark.parametrize("options", [{"method": "linearised"}, {"loss": "huber"}, {"monte_carlo": 2000}])

@@ -55,24 +55,33 @@ class Motion:
         quiet ones, but not how strong the noise is at low frequencies; (n, 3, 3).
     freedom
         Degrees of freedom of `moments`, shape (n,).
+    shake
+        Variance of each axis within the blocks beyond white noise, which is faster than they tell, shape (n, 3).
     """
 
     lengthening: Array
     moments: Array
     usual: Array
     freedom: Array
+    shake: Array
 
     def scaled(self, scale: Array) -> Motion:
         """Return it for outputs that are divided by `scale`, shape (3,)."""
         square = scale[:, None] * scale
         each = np.concatenate([scale, scale**2, square[[0, 0, 1], [1, 2, 2]]])
         return Motion(
-            self.lengthening / square, self.moments / (each[:, None] * each), self.usual / square, self.freedom
+            self.lengthening / square,
+            self.moments / (each[:, None] * each),
+            self.usual / square,
+            self.freedom,
+            self.shake / scale**2,
         )
 
     def __getitem__(self, which: NDArray[Any]) -> Motion:
         """Return it for some of the attitudes."""
-        return Motion(self.lengthening[which], self.moments[which], self.usual[which], self.freedom[which])
+        return Motion(
+            self.lengthening[which], self.moments[which], self.usual[which], self.freedom[which], self.shake[which]
+        )
 
 
 @dataclass(frozen=True)

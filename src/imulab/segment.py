@@ -388,11 +388,15 @@ def _motion(held: _Held, moments: Array, freedom: Array, share: Array) -> Motion
     difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
     white = difference / (2 * held.length)
     pooled = np.median(white, axis=0)
+    each = np.repeat(held.attitude, size)
+    within: Array = np.column_stack([np.bincount(each, held.scatter[:, axis], count) for axis in range(3)])
+    within = within * held.length / (held.length - 1) / np.bincount(each, minlength=count)[:, None]
     return Motion(
         lengthening=white * (1 + 1 / 24) - spread - slope / 12,
         moments=moments,
         usual=(pooled + (1e-3 * np.trace(pooled) + np.finfo(float).tiny) * np.eye(3)) * share[:, None, None],
         freedom=freedom,
+        shake=np.maximum(within - held.length * np.einsum("nii->ni", white), 0.0),
     )
 
 

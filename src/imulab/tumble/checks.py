@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.attitudes import Attitudes
+from imulab.attitudes import Attitudes, Motion
 from imulab.calibration import Calibration
 from imulab.errors import DataError, RecordError
 from imulab.estimate import median
@@ -21,6 +21,7 @@ _PROPORTIONAL = 0.9999
 _FARTHEST = 5.0
 _WORST_RMS = 0.1
 _LEAST_EIGENVALUE = 1e-12
+_SHAKES, _LEAST_SHORTENING = 3.0, 2e-5  # standard uncertainties of |f| in an attitude; of g
 
 
 def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
@@ -117,6 +118,20 @@ def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) ->
             f"{attitudes.recording.name}: the calibrated magnitudes miss gravity ({gravity:.5g} m/s^2) by "
             f"{typical * gravity:.3g} m/s^2 in the median attitude: these are not static attitudes of an accelerometer"
         )
+
+
+def shake_warnings(motion: Motion | None, solution: Solution) -> list[str]:
+    """Say that holds shake too fast for magnitudes to be averaged, if that may matter: a tilt to and fro shortens f."""
+    if motion is None:
+        return []
+    shake = median(motion.shake.sum(axis=1))
+    if shake / 2 < max(_SHAKES * median(np.sqrt(solution.own_variance[0])), _LEAST_SHORTENING):
+        return []
+    return [
+        f"the unit shakes by {1e3 * np.sqrt(shake):.2g} mg rms within an eighth of a second while it is held: if it "
+        f"tilts to and fro, as in a hand that trembles, scale factors are up to {1e6 * shake / 2:.2g} ppm too small; "
+        "put it on something firm"
+    ]
 
 
 def check_fresh(residuals: Array, gravity: float, name: str) -> None:

@@ -14,6 +14,7 @@ from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.estimate import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.recording import Array
+from imulab.tumble.checks import shake_warnings
 from imulab.tumble.findings import Found, Stated, aside_warnings, assumption_notes, uncertainty_entries
 from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, gravity_slope, parameter_names, parameter_units
 from imulab.tumble.montecarlo import MonteCarlo
@@ -139,6 +140,7 @@ def make_record(
         warnings=(
             *_warnings(attitudes, gravity, problem, solution, observability, options),
             *_scatter_warnings(problem, solution, chi_square, freedom),
+            *shake_warnings(problem.motion, solution),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
             *aside_warnings(found, options),
             *assumption_notes(stated),
