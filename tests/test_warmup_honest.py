@@ -176,6 +176,34 @@ def test_a_stuck_gyro_a_pause_and_rows_of_zeros_are_said() -> None:
     assert not [w for w in clean.calibration.warnings if "stuck" in w or "never" in w or "zero" in w]
 
 
+def test_a_knock_that_fills_whole_bins_is_left_out_and_an_odd_cycle_is_named() -> None:
+    good = [replace(r, name=f"cycle_{k}.csv") for k, r in enumerate(cycles())]
+    knocked = good[1].columns["gyro_x"].copy()
+    knocked[500:510] += 3e4  # 100 to 102 s
+    found = fit([good[0], changed(good[1], gyro_x=knocked), *good[2:]], model="exponential")
+    assert [w for w in found.calibration.warnings if "moved" in w and "cycle_1.csv (4 s, first at 99 s)" in w]
+    clean = fit(good, model="exponential")
+    time = np.linspace(0, 290, 30)
+    off = evaluate(found.table, time, -20.0) - evaluate(clean.table, time, -20.0)  # type: ignore[operator]
+    assert np.abs(off).max() < 0.5 * HOUR
+    stepped = good[3].columns["gyro_y"] + 300.0 * (good[3].columns["time"] > 100)
+    odd = fit([*good[:3], changed(good[3], gyro_y=stepped), *good[4:]], model="exponential").calibration
+    (said,) = (w for w in odd.warnings if "differs from the others" in w)
+    assert "gyro_y" in said
+    assert "cycle_3.csv" in said
+    assert not [w for w in clean.calibration.warnings if "differs" in w or "moved" in w]
+
+
+def test_time_must_rise_from_block_to_block(folder: Path) -> None:
+    from imulab.applying import apply_blocks
+
+    start = cycle(3.0, 1)
+    first = replace(start, columns={n: v[:500] for n, v in start.columns.items()})
+    second = replace(start, columns={n: v[400:] for n, v in start.columns.items()}, first_row=501)
+    with pytest.raises(il.ImulabError, match=r"row 501.*time does not rise"):
+        list(apply_blocks([il.load(folder / "zero.json")], [first, second]))
+
+
 def test_the_worst_temperature_is_what_the_gap_makes_of_a_bent_law() -> None:
     """Z = c(T) exp(-t / 40 s), c quadratic in T: linear knots err by c'' h^2 / 8 in the middle of the wide gap."""
     at, size = (-20.0, -10.0, 0.0, 30.0, 40.0), 0.05

@@ -42,7 +42,13 @@ def _zeros(recording):
     return _columns(recording, **{axis: np.where(gone, 0.0, recording.columns[axis]) for axis in AXES})
 
 
-_FAULTS = ("stuck", "never changes", "exactly zero", "milliseconds", "unit moved")
+def _knocked(recording):
+    x = recording.columns["gyro_x"].copy()
+    x[500:510] += 3e4
+    return _columns(recording, gyro_x=x)
+
+
+_FAULTS = ("stuck", "never changes", "exactly zero", "milliseconds", "unit moved", "differs from")
 
 
 def fitted(change, word: str, seed: int) -> Trial:
@@ -137,6 +143,7 @@ SCENARIOS = [
     Scenario("Warm-up", "fit: nothing wrong", partial(fitted, None, ""), 12, None, false_alarms=5),
     Scenario("Warm-up", "fit: ms titled as s", partial(fitted, _milliseconds, "milliseconds"), 8, None, warned=95),
     Scenario("Warm-up", "fit: a stuck gyro", partial(fitted, _stuck, "never changes"), 8, None, warned=95),
+    Scenario("Warm-up", "fit: a knock of 2 s, 8 deg/s", partial(fitted, _knocked, "moved"), 8, None, warned=95),
     Scenario("Warm-up", "fit: every 50th row zero", partial(fitted, _zeros, "exactly zero"), 8, None, warned=95),
     _refused("apply: ms titled as s", _milliseconds, "milliseconds"),
     _refused("apply: starts 20 s late", partial(_moved, 20.0), "after power-on"),

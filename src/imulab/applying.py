@@ -5,6 +5,7 @@ Not named after its function: a submodule ``imulab.apply`` would take the place 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -144,7 +145,16 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
         None of the records corrects anything in it; and what `apply` raises.
     """
     chain = [record if isinstance(record, Loaded) else loaded(record) for record in records]
+    warm_up = any(kind == "warmup" for ready in chain for kind, _ in ready.sections)
+    end = -math.inf
     for number, given in enumerate(blocks):
+        if warm_up and given.time is not None and len(given):  # within a block `apply` looks itself
+            if not given.time[0] > end:
+                raise DataError(
+                    f"{given.name}: {given.place(0)}, column time: time does not rise: expected more than {end:.9g} s, "
+                    f"found {given.time[0]:.9g} s"
+                )
+            end = float(given.time[-1])
         block = given
         for ready in chain:
             block = apply(ready, block)

@@ -18,6 +18,7 @@ _WIDTH, _GROWTH = 2.0, 0.15
 """Bins are two seconds wide at first, later this share of the time since power-on: few, so that noise weighs little."""
 _MOVED = 9.0
 _MOVED_RANGE = 0.02
+_APART, _APART_RANGE = 10.0, 0.1
 _QUIET = 60  # s
 _FEWEST = 10
 _NEARLY = 1e-9
@@ -268,17 +269,24 @@ def _quietest(variance: Array) -> Array:
 def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
     """Return the bins in which the unit stood still; seconds left out, and when it first moved.
 
-    A bin counts as moved when its variance is far above `quiet` and above what the warm-up curve itself makes of it.
+    A bin counts as moved when its variance is far above `quiet` and above what the warm-up curve itself makes of it, or
+    when its mean stands apart from those around it, as a knock that fills a bin leaves it.
     """
     bins = cycle.bins
     slope = np.gradient(bins.mean, axis=0) if len(bins) > 1 else 0.0
     excess = bins.variance - np.square(slope) / 12
     noise = _MOVED * (1 + 10 / bins.count[:, None]) * quiet
+    away = np.square(bins.mean - _middling(bins.mean))
+    # Its own noise from neighbouring bins: within a bin of a few samples the variance says little.
+    steps = np.diff(bins.mean, axis=0)
+    usual = np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) if len(steps) else np.inf
+    alone = _APART**2 * np.maximum(quiet / bins.count[:, None], (1.05 * usual) ** 2)
     moved = np.zeros(len(bins), dtype=np.bool_)
     while not moved.all():
         # The curve's range is that of the bins at rest: in motion it would hide the motion.
         spread = np.subtract(*np.quantile(bins.mean[~moved], [0.95, 0.05], axis=0))
         found = (excess > noise + (_MOVED_RANGE * spread) ** 2).any(axis=1) & (bins.count > 2)
+        found |= (away > alone + (_APART_RANGE * spread) ** 2).any(axis=1)
         if not (found & ~moved).any():
             break
         moved |= found
@@ -289,6 +297,14 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
     if (~near).sum() < 2 * _FEWEST:
         raise DataError(f"{cycle.name}: the unit moved from {began:g} s on: {int((~near).sum())} s at rest are too few")
     return bins.where(~near), (float(near.sum()), began)
+
+
+def _middling(values: Array) -> Array:
+    """Median of each row and the three on either side, which two bad ones do not move."""
+    if len(values) <= 3:
+        return np.asarray(np.median(values, axis=0, keepdims=True))
+    padded = np.pad(values, ((3, 3), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 7, axis=0), axis=-1))
 
 
 def _white_noise(still: Sequence[Bins]) -> Array:

@@ -24,7 +24,7 @@ _COUNTS = 0.05
 _ROUNDING = 1e-12
 _PAUSE, _MOSTLY = 5, 0.5
 """Seconds of exactly repeated samples that are no coarse output, in a column that changes most of the time."""
-_MORE = 1.2
+_MORE, _ODD = 1.2, 4.0
 _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 """A change after power-on that no instrument with a warm-up table has: 5 deg/s, 0.1 g."""
 
@@ -40,6 +40,7 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
         *_drifts(curves, chosen),
         *_temperatures(curves),
         *_single(curves),
+        *_odd(curves),
         *_intervals(curves, chosen),
         *_constants(curves, chosen),
     ]
@@ -204,6 +205,29 @@ def _single(curves: Curves) -> list[str]:
     if not alone:
         return []
     return [f"one cycle only at {' '.join(alone)} degC: its repeatability is not known there"]
+
+
+def _odd(curves: Curves) -> list[str]:
+    """Cycles that differ from the others at their temperature far more than cycles of this test do."""
+    means, _ = curves.group_means()
+    apart = np.einsum("cb,cba->ca", curves.seconds, (curves.mean - means[curves.group]) ** 2)
+    apart = np.sqrt(apart / curves.seconds.sum(axis=1)[:, None])
+    several = np.bincount(curves.group)[curves.group] > 1
+    if several.sum() < _MOST_NAMED + 1:
+        return []
+    usual = np.median(apart[several], axis=0)
+    limit = _ODD * np.maximum(usual, np.sqrt(curves.expected_noise().mean(axis=0)))
+    odd = (apart > limit + _ROUNDING * np.abs(curves.reference).max(axis=0)) & several[:, None]
+    if not odd.any():
+        return []
+    row, column = np.unravel_index(int(np.argmax(np.where(odd, apart / np.maximum(limit, 1e-300), 0.0))), odd.shape)
+    unit = curves.units[column]
+    names = [curves.cycles[i].name for i in np.flatnonzero(odd.any(axis=1))]
+    return [
+        f"a power cycle differs from the others at its temperature by {in_engineering(apart[row, column], unit)} "
+        f"({curves.axes[column]}), where cycles usually differ by {in_engineering(usual[column], unit)}: look at "
+        f"{_named(names)}, and leave out what is wrong"
+    ]
 
 
 def _intervals(curves: Curves, chosen: Judged) -> list[str]:
