@@ -56,7 +56,8 @@ enum {
     IL_ALONE = 128     /* array: fewer than three gyros left, nothing to compare with */
 };
 
-/* ---- accelerometer triad: M_i = S_i (A_i + b_i), A = s + k2 s^2 + ..., s = T f ------------------------------------ */
+/* ---- accelerometer triad: M_i = S_i (A_i + b_i), A = s + k2 s^2 + ..., s = T f ------------------------------------
+ * With cross terms A_x has k_xy s_x s_y more, A_y k_yz s_y s_z, and A_z k_zx s_z s_x. */
 
 #define IL_TUMBLE_ORDER 5
 
@@ -67,6 +68,8 @@ typedef struct {
     il_real misalignment[3];                    /* m_yx, m_zx, m_zy, rad */
     il_real low[3], high[3];                    /* A between the polynomial's turning points, m/s^2 */
     il_real nonlinearity[IL_TUMBLE_ORDER - 1][3]; /* k2 .. k5, 1/(m/s^2)^(power - 1) */
+    int32_t has_cross;
+    il_real cross[3];                           /* k_xy, k_yz, k_zx, 1/(m/s^2) */
 } il_tumble;
 
 /* Outputs to specific force [m/s^2]; force may be output. */

@@ -11,6 +11,7 @@
 #include "real.h"
 
 enum { HEAD = 16, TAIL = 4, SECTION_HEAD = 8, MANY = 65536 };
+enum { CROSSED = 256 }; /* on top of a tumble's order: cross terms follow the polynomial */
 enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5 };
 
 static const uint8_t MAGIC[8] = {0x89, 0x49, 0x4D, 0x55, 0x4C, 0x41, 0x42, 0x0A};
@@ -130,7 +131,13 @@ static const il_real *kept(cursor *c, size_t n) {
 }
 
 static void read_tumble(cursor *c, il_tumble *t) {
-    t->order = count(c, 1, IL_TUMBLE_ORDER);
+    t->order = count(c, 1, CROSSED + IL_TUMBLE_ORDER);
+    t->has_cross = t->order > CROSSED;
+    if (t->has_cross) t->order -= CROSSED;
+    if (t->order > IL_TUMBLE_ORDER) {
+        fail(c, IL_TABLE_CONTENT);
+        return;
+    }
     numbers(c, t->gain, 3);
     numbers(c, t->bias, 3);
     numbers(c, t->misalignment, 3);
@@ -139,6 +146,7 @@ static void read_tumble(cursor *c, il_tumble *t) {
     for (int p = 0; p < IL_TUMBLE_ORDER - 1; p++) {
         if (p < t->order - 1) numbers(c, t->nonlinearity[p], 3);
     }
+    if (t->has_cross) numbers(c, t->cross, 3);
 }
 
 static void read_gyro(cursor *c, il_gyro *g) {

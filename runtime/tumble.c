@@ -3,7 +3,7 @@
 
 /* Newton's method doubles the correct digits: at MEMS size three or four steps reach the last bit of a double; twelve get
  * within a thousandth of a turning point. No more are ever made. */
-enum { NEWTON_STEPS = 12 };
+enum { NEWTON_STEPS = 12, CROSS_STEPS = 30 };
 static const il_real SOLVED = IL_C(64.0) * IL_EPSILON; /* last step, relative, below which a solution stands */
 
 /* Solve s + k2 s^2 + ... = a for one axis. */
@@ -29,12 +29,40 @@ static il_real unbent(const il_tumble *t, int axis, il_real a, unsigned *flags) 
     return il_nan();
 }
 
+/* Solve the axes together where products of two enter: each by itself, with the products at the last solution taken off,
+ * again and again. An error shrinks by twice the product of cross term and specific force at a step: three or four reach the
+ * last bit at 1000 ug/g^2 and 1 g. What does not come to rest lies beyond what these terms are for. */
+static unsigned crossed(const il_tumble *t, il_real s[3]) {
+    const il_real a[3] = {s[0], s[1], s[2]};
+    unsigned flags = 0;
+    il_real step = IL_C(0.0), size = IL_C(0.0);
+    for (int k = 0; k < CROSS_STEPS && flags == 0; k++) {
+        const il_real last[3] = {s[0], s[1], s[2]};
+        step = size = IL_C(0.0);
+        for (int i = 0; i < 3; i++) {
+            s[i] = unbent(t, i, a[i] - t->cross[i] * last[i] * last[(i + 1) % 3], &flags);
+            step += il_fabs(s[i] - last[i]);
+            size += il_fabs(s[i]);
+        }
+        if (step <= IL_EPSILON * size) break;
+    }
+    if (flags == 0 && step <= SOLVED * (size + IL_C(1.0))) return 0;
+    s[0] = s[1] = s[2] = il_nan();
+    return il_finite(a[0] + a[1] + a[2]) ? (unsigned)IL_BEYOND : (unsigned)IL_NOT_FINITE;
+}
+
 /* One sample; inlined, so that the block function compiles to straight code for each stride. */
 static inline unsigned tumble_sample(const il_tumble *t, il_real mx, il_real my, il_real mz, il_real *fx, il_real *fy,
                                      il_real *fz) {
     il_real x = mx * t->gain[0] - t->bias[0], y = my * t->gain[1] - t->bias[1], z = mz * t->gain[2] - t->bias[2];
     unsigned flags = il_finite(x + y + z) ? 0u : (unsigned)IL_NOT_FINITE;
-    if (t->order > 1) {
+    if (t->has_cross) {
+        il_real s[3] = {x, y, z};
+        flags |= crossed(t, s);
+        x = s[0];
+        y = s[1];
+        z = s[2];
+    } else if (t->order > 1) {
         x = unbent(t, 0, x, &flags);
         y = unbent(t, 1, y, &flags);
         z = unbent(t, 2, z, &flags);

@@ -61,10 +61,16 @@ def test_cross_terms_are_named_with_their_sizes():
 def test_an_order_that_is_too_low_is_named():
     rng = np.random.default_rng(2)
     direction, _ = warned(rng, 36, sigma=10 * UG, order=1, power=(2, 300e-6))
-    assert "the next power (k2_x +" in direction
+    assert "the next order (k2_x +" in direction
     assert "--order 2 fits it" in direction
     direction, _ = warned(rng, 36, sigma=10 * UG, order=2, power=(3, 300e-6))
     assert "k3_x +" in direction
+
+
+def test_misalignment_that_order_0_leaves_out_is_named():
+    direction, _ = warned(np.random.default_rng(6), 36, sigma=10 * UG, order=0)
+    assert "the next order (misalignment_yx " in direction
+    assert "--order 1 fits it" in direction
 
 
 def test_a_drift_of_the_zero_is_stated_as_the_residuals_show_it():

@@ -505,7 +505,8 @@ def make_blobs(w):
     tumble_of, gyro_of, drift, warm, sensors = make_sections(w)
     text = section(0, b'{"format": "imulab.blob"}')
     made = [blob(w), blob(w, text), blob(w, text, tumble_of[1], gyro_of[1], drift, warm[3], sensors[4])]
-    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, *warm, *sensors)]
+    crossed = section(1, words(256 + 2), counted(w, 15, 2), counted(w, 6, 50))  # with cross terms
+    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors)]
 
 
 def blobs():
@@ -517,7 +518,7 @@ def blobs():
         LINES.append(f"static const uint8_t *const v_blob{w}[] = {{{names}}};")
         LINES.append(f"static const size_t v_blob{w}_size[] = {{{', '.join(str(len(b)) for b in made)}}};")
     LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
-    LINES.append("enum { V_BLOB_DRIFT = 10, V_BLOB_WARMUP = 11, V_BLOB_ARRAY = 15 };")
+    LINES.append("enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16 };")
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)
     LINES.append(f"static const uint32_t v_crc = {zlib.crc32(letters)}u;")

@@ -46,7 +46,7 @@ static void crc_is_that_of_ieee_802_3(void) {
 }
 
 static void whole_tables_load(void) {
-    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16};
+    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16};
     for (int b = 0; b < V_BLOBS; b++) {
         uint32_t found = 99;
         CHECK(load_exactly(v_blob4[b], v_blob4_size[b], &found) == IL_OK && found == has[b]);
@@ -79,6 +79,11 @@ static void contents_arrive(void) {
             counted(&unit.tumble.nonlinearity[0][0], 3 * (order - 1), REAL(50), 0);
             for (int p = order - 1; p < IL_TUMBLE_ORDER - 1; p++) CHECK(unit.tumble.nonlinearity[p][0] == REAL(0));
         }
+        CHECK(unit.tumble.has_cross == 0);
+        CHECK(il_table_load(&unit, blobs[V_BLOB_CROSS], sizes[V_BLOB_CROSS], NULL, 0) == IL_OK);
+        CHECK(unit.tumble.order == 2 && unit.tumble.has_cross == 1);
+        counted(&unit.tumble.nonlinearity[0][0], 3, REAL(50), 0);
+        counted(unit.tumble.cross, 3, REAL(50), 3);
         for (int sensitive = 0; sensitive < 2; sensitive++) {
             const int b = V_BLOB_GYRO + sensitive;
             CHECK(il_table_load(&unit, blobs[b], sizes[b], NULL, 0) == IL_OK);

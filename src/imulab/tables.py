@@ -17,6 +17,8 @@ from imulab.recording import Array
 MODELS = ("interval-cubic", "knot-cubic", "knot-log-cubic", "exponential")
 EXITS = ("zero", "hold", "taper")
 _AXES = "xyz"
+_CROSSED = 256
+"""Added to the order of a table that has cross terms."""
 
 
 def tables_of(record: Calibration) -> tuple[Table, ...]:
@@ -46,16 +48,18 @@ def _tumble(record: Calibration) -> tuple[Table, ...]:
     ).reshape(-1, 3)
     ends = np.array([monotone_range(nonlinearity[:, axis]) for axis in range(3)])
     largest = float(np.finfo(np.float32).max)
+    crossed = "k_xy" in record.parameters
     table = Table(
         "tumble",
         (
-            Field("order", _whole(max(order, 1))),
+            Field("order", _whole(max(order, 1) + _CROSSED * crossed)),
             Field("gain", 1.0 / _nonzero(scale)),
             Field("bias", _each(record, "bias_{}", _AXES, "m/s^2")),
             Field("misalignment", _each(record, "misalignment_{}", ("yx", "zx", "zy"), "rad")),
             Field("low", np.clip(ends[:, 0], -largest, largest)),
             Field("high", np.clip(ends[:, 1], -largest, largest)),
             Field("nonlinearity", nonlinearity),
+            *([Field("cross", _each(record, "k_{}", ("xy", "yz", "zx"), "1/(m/s^2)"))] if crossed else []),
         ),
         {"output_unit": output},
     )

@@ -149,6 +149,9 @@ def fit(
         str | None,
         typer.Option("--monte-carlo", metavar="N", help="Trials of a propagation of distributions, 1000 or more."),
     ] = None,
+    cross: Annotated[
+        bool, typer.Option("--cross", help="Fit cross terms k_xy, k_yz, k_zx: products of two axes.")
+    ] = False,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -170,6 +173,7 @@ def fit(
         "height": height,
         "prior": prior,
         "ageing": ageing,
+        "cross": "yes" if cross else "no",
         "monte_carlo": monte_carlo,
         "layout": layout,
         "topic": topic,

@@ -25,6 +25,7 @@ from imulab.refitting import linear_record
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
 AXES = "xyz"
+_CROSS = ("k_xy", "k_yz", "k_zx")
 _NEGLIGIBLE = 1e-6
 _GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
 _ELSEWHERE = {
@@ -52,12 +53,16 @@ class Gyroscopes:
 
 @dataclass(frozen=True)
 class Accelerometers:
-    """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M."""
+    """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M.
+
+    With cross terms k_xy, k_yz, k_zx (3,) in A.
+    """
 
     scale: Array
     matrix: Array
     bias: Array
     nonlinearity: Array
+    cross: Array
     unit: str
 
     @property
@@ -69,6 +74,7 @@ class Accelerometers:
         """Return the outputs for specific forces, m/s^2, shape (n, 3)."""
         sensed = force @ self.matrix.T
         reading = sensed + sum(k * sensed ** (power + 2) for power, k in enumerate(self.nonlinearity))
+        reading = reading + self.cross * sensed * np.roll(sensed, -1, axis=1)
         output: Array = self.scale * (reading + self.bias)
         return output
 
@@ -134,6 +140,7 @@ def _accelerometers(record: Calibration) -> Accelerometers:
         matrix=matrix,
         bias=np.array([record.value(f"bias_{axis}") for axis in AXES]),
         nonlinearity=np.array(terms).reshape(-1, 3),
+        cross=np.array([record.value(name) for name in _CROSS]) if _CROSS[0] in record.parameters else np.zeros(3),
         unit=kept,
     )
 
@@ -250,6 +257,7 @@ def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
         for axis, k in zip(AXES, row, strict=True)
         if k
     ]
+    names += [name for name, k in zip(_CROSS, accel.cross, strict=True) if k]
     return names
 
 

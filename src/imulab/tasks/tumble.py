@@ -30,15 +30,22 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "monte_carlo": None if trials is None else whole_number(trials, label.format("monte-carlo")),
         "prior": texts.get("prior"),
         "ageing": _ageing(texts.get("ageing"), label.format("ageing")),
+        "cross": _yes(texts.get("cross", "no"), label.format("cross")),
         "layout": texts.get("layout"),
         "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
     }
     check_options(
         values["order"], values["method"], values["loss"],
         monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
-        nonlinearity=values["nonlinearity"],
+        nonlinearity=values["nonlinearity"], cross=values["cross"],
     )  # fmt: skip
     return values
+
+
+def _yes(text: str, name: str) -> bool:
+    if text not in ("yes", "no"):
+        raise OptionError(f"{name} {text!r}: expected yes or no")
+    return text == "yes"
 
 
 def _tumble_fit(
@@ -60,6 +67,7 @@ def _tumble_fit(
         prior=prior,
         ageing=values["ageing"],
         monte_carlo=values["monte_carlo"],
+        cross=values["cross"],
         progress=progress,
     ).calibration
 
@@ -119,6 +127,7 @@ TASK = Task(
         "monte_carlo",
         "prior",
         "ageing",
+        "cross",
         "layout",
         "topic",
         "instance",

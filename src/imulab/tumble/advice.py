@@ -28,9 +28,10 @@ def helpful_attitudes(order: int, solution: Solution, count: int) -> str:
     D-criterion (Fedorov 1972).
     """
     candidates = sphere_points(_CANDIDATES)
-    rows = norm_and_jacobian(start_parameters(order), candidates[None], order)[1][0]
     present = solution.jacobian[0]
-    information = present.T @ present + 1e-6 * np.eye(parameter_count(order))
+    cross = present.shape[1] > parameter_count(order)
+    rows = norm_and_jacobian(start_parameters(order, cross=cross), candidates[None], order)[1][0]
+    information = present.T @ present + 1e-6 * np.eye(present.shape[1])
     chosen = []
     for _ in range(count):
         gain = np.einsum("ij,jk,ik->i", rows, np.linalg.inv(information), rows)

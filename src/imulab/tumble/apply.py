@@ -107,7 +107,7 @@ def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
 
     Counted only where the record has nonlinearity, which gravity has shown within 1 g and nowhere else.
     """
-    if record.model["order"] <= 1:
+    if record.model["order"] <= 1 and not record.model.get("cross"):
         return 0, 0.0
     scale = np.array([record.value(f"scale_factor_{axis}") for axis in AXES])
     bias = np.array([record.value(f"bias_{axis}") for axis in AXES])

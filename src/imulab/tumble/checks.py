@@ -165,6 +165,8 @@ def check_prior(record: Calibration) -> None:
     order = record.model["order"]
     if order not in range(HIGHEST_ORDER + 1):
         raise RecordError(f"a record of order {order} cannot be a prior; expected 0 to {HIGHEST_ORDER}")
+    if record.model.get("cross"):
+        raise RecordError("a record with cross terms cannot be a prior")
     if record.model["gauge"] != GAUGE:
         raise RecordError(f"a record in the gauge {record.model['gauge']!r} cannot be a prior; expected {GAUGE!r}")
     for name in parameter_names(order):

@@ -127,6 +127,6 @@ def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, 
         return 1.0, 0.0, f"{output}/(m/s²)"
     if stem == "misalignment":
         return 1e3, 0.0, "mrad"
-    power = int(stem[1:])
+    power = int(stem[1:] or "2")  # a cross term is k_xy: of the second degree, as k2
     superscript = "⁰¹²³⁴⁵"[power]
     return 1e6 * STANDARD_GRAVITY ** (power - 1), 0.0, f"µg/g{superscript}"

@@ -78,6 +78,7 @@ def fit_tumble(
     prior: Calibration | None = None,
     ageing: Sequence[float] = (),
     monte_carlo: int | None = None,
+    cross: bool = False,
     progress: Callable[[int], None] = lambda _: None,
 ) -> TumbleFit:
     """Calibrate an accelerometer triad from static attitudes.
@@ -111,6 +112,8 @@ def fit_tumble(
         was made, as many as are known; the attitudes tell the others.
     monte_carlo
         Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
+    cross
+        Whether the model has cross terms k_xy, k_yz, k_zx, at an order that is given; no attitude is set aside then.
     progress
         Called with the number of trials done so far.
 
@@ -127,7 +130,7 @@ def fit_tumble(
     """
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
-        nonlinearity=nonlinearity,
+        nonlinearity=nonlinearity, cross=cross,
     )  # fmt: skip
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
@@ -142,7 +145,7 @@ def fit_tumble(
         order = _prior_order(prior, order, attitudes)
         known = known_of(prior, scaling, local, attitudes.unit)
     aside, fitted = NONE_ASIDE, dict[int, Solution]()
-    if loss == "auto" and method == "norm":
+    if loss == "auto" and method == "norm" and not cross:
         aside, fitted = set_aside(every, lambda of: _fits(of, order))
     used, kept = every, attitudes
     if aside.index:
@@ -150,7 +153,7 @@ def fit_tumble(
     choice: OrderChoice | None = None
     if order in FROM_DATA and len(kept) >= parameter_count(1):
         choice = choose_order(used, local.value, fitted or solve_orders(used))
-    problem = replace(used, order=choice.order if choice else 1 if order in FROM_DATA else int(order))
+    problem = replace(used, order=choice.order if choice else 1 if order in FROM_DATA else int(order), cross=cross)
     aged = None
     if known is not None:
         aged = put_together(problem, known, local, _scaled_ageing(ageing, local.value))
@@ -165,7 +168,7 @@ def fit_tumble(
             stated = Stated(blended.covariance, blended.freedom, blended=blended)
         else:
             stated = Stated(blended.about(solution.theta[0]), blended.freedom, matrix, freedom, blended)
-    found = _found(attitudes, replace(every, order=problem.order), solution, aside)
+    found = _found(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
     check_residuals(kept, solution, local.value)
     check_axes(attitudes, forces(found.problem, found.solution)[0])
     trials = None
@@ -188,7 +191,8 @@ def fit_tumble(
         orders=choice.rows if choice else (),
         options={"order": order, "method": method, "loss": loss, "gravity": local.value}
         | ({} if nonlinearity is None else {"nonlinearity": list(nonlinearity)})
-        | ({} if monte_carlo is None else {"monte_carlo": monte_carlo}),
+        | ({} if monte_carlo is None else {"monte_carlo": monte_carlo})
+        | ({"cross": True} if cross else {}),
         monte_carlo=trials,
         **_prior_found(prior, known, aged, scaling, local, kept),
     )
@@ -210,6 +214,7 @@ def check_options(
     with_prior: bool = False,
     ageing: Sequence[float] = (),
     nonlinearity: tuple[float, float] | None = None,
+    cross: bool = False,
 ) -> None:
     """Check what can be checked before there is data.
 
@@ -245,6 +250,10 @@ def check_options(
             raise OptionError(f"nonlinearity needs order auto or blend without a prior, found order {order}")
         if not all(0 < value < np.inf for value in nonlinearity):
             raise OptionError(f"nonlinearity {nonlinearity}: expected two standard deviations above 0, of k2 and k3")
+    if cross and (method != "norm" or order in (0, *FROM_DATA) or with_prior or monte_carlo is not None):
+        raise OptionError(
+            f"cross needs method norm and an order of 1 to {HIGHEST_ORDER}, and goes with no prior and no monte-carlo"
+        )
     if monte_carlo is None:
         return
     check_trials(monte_carlo)
@@ -327,14 +336,14 @@ def _solve(
     problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None, solved: Solution | None
 ) -> tuple[Solution, Observability]:
     """Solve the problem, unless that has been done by norm, and see what it determines."""
-    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     if method == "norm" and choice is not None:
         solution, seen = choice.solution, choice.observability
     else:
         solution = solved or _solved(problem, attitudes, method)
         seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
     if seen.rank < size:
-        names = parameter_names(problem.order)
+        names = parameter_names(problem.order, problem.cross)
         confused = seen.confused(names)
         shown = " ".join(confused[:8]) + (f" and {len(confused) - 8} more" if len(confused) > 8 else "")
         help_from = helpful_attitudes(problem.order, solution, count=2)
@@ -354,7 +363,7 @@ def _solve(
 
 
 def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
-    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     if method == "linearised" and n >= size:
         return solve_linearised(problem, attitudes.recording.name)
     return solve_norm(problem)
@@ -362,7 +371,7 @@ def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
 
 def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
     """Covariance of theta given the order, (p, p), and the degrees of freedom of its scale (None: noise known)."""
-    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     freedom = n - size
     base = covariance(solution.jacobian, 1 / solution.variance)[0]
     known = problem.covariance is not None

@@ -4,6 +4,10 @@
     A_i = s_i + k2_i s_i^2 + ... + ke_i s_i^e
     M_i = S_i (A_i + b_i)
 
+With cross terms A_x has k_xy s_x s_y more, A_y k_yz s_y s_z, A_z k_zx s_z s_x: with bias (3) and k2 (3) they leave of
+the ten functions of third degree that |f| can show only xyz. Products of other pairs (k_xz in A_x ...) differ from
+these, in |f|, by biases and k2 alone.
+
 The gauge: the x input axis is the body x axis, the y input axis lies in the body xy plane (IEEE Std 1293 calls the
 off-diagonals input-axis misalignments). Gravity's magnitude cannot see a rotation of the whole triad.
 """
@@ -13,9 +17,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.attitudes import POOL_DEGREES, Motion
-from imulab.estimate import Fit
+from imulab.estimate import Fit, levenberg_marquardt
 from imulab.recording import Array
 from imulab.tumble import _model
 
@@ -23,36 +28,43 @@ AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
 HIGHEST_ORDER = 5
 _UNUSUAL = 3.0
+CROSS_TERMS = ("k_xy", "k_yz", "k_zx")
+_NEXT = [1, 2, 0]
+_CROSS_PASSES = 30
 GAUGE = "x input axis along body x, y input axis in the body xy plane"
 
 
-def parameter_count(order: int) -> int:
-    """Return the number of parameters of the model, 3 (order + 2); order 0 is order 1 without misalignment."""
-    return 3 * (order + 2)
+def parameter_count(order: int, cross: bool = False) -> int:
+    """Return the number of parameters, 3 (order + 2), with cross terms three more; order 0 has no misalignment."""
+    return 3 * (order + 2 + cross)
 
 
-def parameter_names(order: int) -> list[str]:
+def parameter_names(order: int, cross: bool = False) -> list[str]:
     """Return the names of the parameters in the order of the parameter vector."""
     return [
         *(f"bias_{axis}" for axis in AXES),
         *(f"scale_factor_{axis}" for axis in AXES),
         *(f"misalignment_{pair}" for pair in MISALIGNMENTS if order > 0),
         *(f"k{power}_{axis}" for power in range(2, order + 1) for axis in AXES),
+        *(CROSS_TERMS if cross else ()),
     ]
 
 
-def parameter_units(order: int, output: str) -> list[str]:
+def parameter_units(order: int, output: str, cross: bool = False) -> list[str]:
     """Return the units of the parameters in a record, in the same order."""
     nonlinearity = ["1/(m/s^2)" if j == 1 else f"1/(m/s^2)^{j}" for j in range(1, order)]
     return (
         ["m/s^2"] * 3
         + [f"{output}/(m/s^2)"] * 3
         + ["rad"] * 3 * (order > 0)
-        + [unit for unit in nonlinearity for _ in AXES]
+        + [
+            *(unit for unit in nonlinearity for _ in AXES),
+            *(["1/(m/s^2)"] * 3 if cross else []),
+        ]
     )
 
 
-def gravity_slope(values: Array) -> Array:
+def gravity_slope(values: Array, order: int) -> Array:
     """Return the derivatives of the parameters, in SI, by the logarithm of gravity, shapes (p,).
 
     Outputs say how large the parameters are in units of gravity: ``dS/S = -dg/g``, ``db/b = dg/g``,
@@ -60,8 +72,14 @@ def gravity_slope(values: Array) -> Array:
     """
     slope = np.zeros_like(values)
     slope[:3], slope[3:6] = values[:3], -values[3:6]
-    slope[9:] = -np.repeat(np.arange(1.0, len(values) // 3 - 2), 3) * values[9:]
+    slope[9:] = -powers_of_gravity(order, len(values)) * values[9:]
     return slope
+
+
+def powers_of_gravity(order: int, size: int) -> Array:
+    """Return the power of an inverse acceleration that each parameter after the ninth is, shape (size - 9,)."""
+    powers: Array = np.concatenate([np.repeat(np.arange(1.0, order), 3), np.ones(size - parameter_count(order))])
+    return powers
 
 
 @dataclass(frozen=True)
@@ -104,7 +122,7 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
     ----------
     theta
         Scaled parameters, shape (b, p): zero (in the unit of `reading`), relative scale factor, misalignment,
-        nonlinearity.
+        nonlinearity, and cross terms where there are three more.
     reading
         Outputs, shape (b, n, 3), or (1, n, 3) for all problems alike, already divided by a nominal scale factor.
     order
@@ -115,6 +133,8 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
     tuple
         |f| (b, n); its derivatives with respect to theta (b, n, p); f (b, n, 3); ``q = d|f|/d reading`` (b, n, 3).
     """
+    if theta.shape[1] > parameter_count(order):
+        return _crossed(theta, reading, order)
     problems, n = len(theta), reading.shape[1]
     norm, force = np.empty((problems, n)), np.empty((problems, n, 3))
     jacobian = np.empty((problems, n, theta.shape[1]))
@@ -123,6 +143,27 @@ def norm_and_jacobian(theta: Array, reading: Array, order: int) -> tuple[Array, 
         norm, jacobian, force,
     )  # fmt: skip
     return norm, jacobian, force, -jacobian[:, :, 0:3]
+
+
+def _crossed(theta: Array, reading: Array, order: int) -> tuple[Array, Array, Array, Array]:
+    """`norm_and_jacobian` with cross terms: their products, from the last solution, are taken off until they rest.
+
+    An error shrinks by about 2 |k s| a pass. The derivatives leave out how one axis's term moves the others' products,
+    which is smaller by the same factor.
+    """
+    plain, k = np.ascontiguousarray(theta[:, :-3]), theta[:, None, -3:]
+    scale, m = theta[:, None, 3:6], theta[:, None, 6:9]
+    products = np.zeros((len(theta), reading.shape[1], 3))
+    for _ in range(_CROSS_PASSES):
+        norm, jacobian, force, slope = norm_and_jacobian(plain, reading - scale * k * products, order)
+        s = force.copy()
+        s[..., 1] += m[..., 0] * force[..., 0]
+        s[..., 2] += m[..., 1] * force[..., 0] + m[..., 2] * force[..., 1]
+        before, products = products, s * s[..., _NEXT]
+        if not np.any(np.abs(products - before) > 1e-14):
+            break
+    jacobian[:, :, 3:6] += jacobian[:, :, 0:3] * k * products
+    return norm, np.concatenate([jacobian, jacobian[:, :, 0:3] * scale * products], axis=2), force, slope
 
 
 def length_noise(theta: Array, jacobian: Array, covariance: Array, motion: Motion | None = None) -> tuple[Array, Array]:
@@ -183,6 +224,13 @@ def fit_lengths(
     tolerance, most
         Largest step that counts as converged, and how many steps are tried.
     """
+    if start.shape[1] > parameter_count(order):
+
+        def model(theta: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
+            norm, jacobian = norm_and_jacobian(theta, reading if len(reading) == 1 else reading[index], order)[:2]
+            return norm - 1 - lengthening[index], jacobian
+
+        return levenberg_marquardt(model, start, weights, tolerance=tolerance, max_iterations=most)
     count, n = weights.shape
     theta = np.array(start, dtype=np.float64)
     residuals, jacobian = np.empty((count, n)), np.empty((count, n, theta.shape[1]))

@@ -193,7 +193,7 @@ def _largest_uncertainty(problem: Problem, fit: Solution) -> float:
 def absolute_weights(problem: Problem, fit: Solution) -> Array:
     """Weights in true inverse variances, shape (n,): where noise is unknown, its level comes from the residuals."""
     weights: Array = fit.weights[0] / max(fit.scale[0] ** 2, _ROUNDING)  # as many attitudes as parameters leave nothing
-    n, size = problem.reading.shape[1], parameter_count(problem.order)
+    n, size = problem.reading.shape[1], fit.theta.shape[1]
     if problem.covariance is None and n > size and not problem.robust:
         mean_square = float((weights * fit.residuals[0] ** 2).sum()) / (n - size)
         weights = weights / max(mean_square, _ROUNDING)

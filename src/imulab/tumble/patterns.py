@@ -18,7 +18,7 @@ import numpy as np
 from imulab.attitudes import Attitudes
 from imulab.estimate import f_test
 from imulab.recording import Array
-from imulab.tumble.model import AXES
+from imulab.tumble.model import AXES, CROSS_TERMS, MISALIGNMENTS
 from imulab.tumble.solve import Problem, Solution, forces
 
 FALSE_ALARM = 0.01
@@ -98,7 +98,10 @@ def direction_findings(problem: Problem, solution: Solution, *, order_chosen: bo
         "other": np.column_stack([x * y * z, x**3 * y, y**3 * z, z**3 * x, x * y**3, y * z**3, z * x**3]),
     }
     if not order_chosen:
-        groups["order"] = np.column_stack([x**power, y**power, z**power])
+        alike = [x**power, y**power, z**power] if problem.order else [x * y, z * x, z * y]
+        groups["order"] = np.column_stack(alike)
+    if problem.cross:
+        del groups["cross"]
     found = {name: find_pattern(columns, solution) for name, columns in groups.items()}
     patterns = {name: pattern for name, pattern in found.items() if pattern is not None and pattern.size > _TINY}
     if not patterns:
@@ -107,15 +110,24 @@ def direction_findings(problem: Problem, solution: Solution, *, order_chosen: bo
     pattern = patterns[likeliest]
     if pattern.probability * len(patterns) > FALSE_ALARM:
         return []
-    g = f"µg/g{'²³⁴⁵⁶'[power - 3]}" if likeliest == "order" else "µg/g²"
-    terms = (f"k{power - 1}_{axis}" for axis in AXES) if likeliest == "order" else ("k_xy", "k_yz", "k_zx")
+    unit, terms = "µg/g²", list(CROSS_TERMS)
+    if likeliest == "order" and problem.order:
+        unit, terms = f"µg/g{'²³⁴⁵⁶'[power - 3]}", [f"k{power - 1}_{axis}" for axis in AXES]
+    elif likeliest == "order":
+        unit, terms = "µrad", [f"misalignment_{pair}" for pair in MISALIGNMENTS]
     sizes = ", ".join(
         f"{name} {_MICRO * value:+.0f} ± {_MICRO * u:.0f}"
         for name, value, u in zip(terms, pattern.value, pattern.uncertainty, strict=False)
     )
     looks, remedy = {
-        "cross": (f"they look like products of two axes ({sizes} {g})", "more attitudes do not help"),
-        "order": (f"they look like the next power ({sizes} {g})", f"--order {power - 1} fits it, or --order auto"),
+        "cross": (
+            f"they look like products of two axes ({sizes} {unit})",
+            f"--cross --order {problem.order or 1} fits these",
+        ),
+        "order": (
+            f"they look like the next order ({sizes} {unit})",
+            f"--order {problem.order + 1} fits it, or --order auto",
+        ),
         "other": ("they look like products of the third and fourth degree", "no option fits these; repeat the test"),
     }[likeliest]
     return [

@@ -16,7 +16,15 @@ from imulab.gravity import Gravity, gravity_findings
 from imulab.recording import Array
 from imulab.tumble.checks import shake_warnings
 from imulab.tumble.findings import Found, Stated, aside_warnings, assumption_notes, uncertainty_entries
-from imulab.tumble.model import AXES, GAUGE, MISALIGNMENTS, gravity_slope, parameter_names, parameter_units
+from imulab.tumble.model import (
+    AXES,
+    GAUGE,
+    MISALIGNMENTS,
+    gravity_slope,
+    parameter_names,
+    parameter_units,
+    powers_of_gravity,
+)
 from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
 from imulab.tumble.patterns import direction_findings, time_findings
@@ -76,9 +84,10 @@ def make_record(
     says that the covariance holds it already; `entries` and `findings` are added to the fit's and to the warnings.
     """
     g, order = gravity.value, problem.order
-    names = parameter_names(order)
+    names = parameter_names(order, problem.cross)
+    units = parameter_units(order, attitudes.unit, problem.cross)
     values, derivative = _to_si(solution.theta[0], scaling, g, order)
-    shared = (not with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values)
+    shared = (not with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values, order)
     matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
     given = np.full(len(names), np.nan)
     if stated is not None and stated.given_order is not None:
@@ -95,6 +104,7 @@ def make_record(
         "gravity": gravity.entry(),
         "output_unit": attitudes.unit,
         "gauge": GAUGE,
+        **({"cross": True} if problem.cross else {}),
     }
     if attitudes.temperature is not None:
         model["temperature"] = {"value": attitudes.temperature, "unit": "degC"}
@@ -107,7 +117,7 @@ def make_record(
                 unit,
                 standard_uncertainty_given_order=None if np.isnan(given[i]) else float(given[i]),
             )
-            for i, (name, unit) in enumerate(zip(names, parameter_units(order, attitudes.unit), strict=True))
+            for i, (name, unit) in enumerate(zip(names, units, strict=True))
         },
         covariance=Covariance((), ())
         if matrix is None
@@ -187,7 +197,7 @@ def _si_values(theta: Array, scaling: Scaling, g: float | Array, order: int) -> 
     """Parameter vectors in SI, shape (b, p); one gravity, or one for each, shape (b, 1)."""
     scale_factor = scaling.scale * theta[:, 3:6] / g
     bias = (scaling.zero + scaling.scale * theta[:, 0:3]) / scale_factor
-    powers = np.repeat(np.arange(1, order), 3)
+    powers = powers_of_gravity(order, theta.shape[1])
     return np.hstack([bias, scale_factor, theta[:, 6:9], theta[:, 9:] / g**powers])
 
 
@@ -214,11 +224,9 @@ def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array,
     """Return the parameter vector in SI and its derivative with respect to theta, shape (p, p)."""
     values = _si_values(theta[None], scaling, g, order)[0]
     bias, scale_factor, sigma = values[:3], values[3:6], theta[3:6]
-    powers = np.repeat(np.arange(1, order), 3)
+    powers = powers_of_gravity(order, len(theta))
     derivative = np.diag(
-        np.concatenate(
-            [scaling.scale / scale_factor, scaling.scale / g, np.ones(len(theta[6:9])), g ** -powers.astype(float)]
-        )
+        np.concatenate([scaling.scale / scale_factor, scaling.scale / g, np.ones(len(theta[6:9])), g**-powers])
     )
     derivative[range(3), range(3, 6)] = -bias / sigma
     return values, derivative
@@ -229,7 +237,7 @@ def _leave_one_out(
 ) -> dict[str, Any] | None:
     """Error of each attitude predicted from the others, rms: from the table of orders, or by the linear formula."""
     for row in orders:
-        if row.order == problem.order and row.leave_one_out is not None and method == "norm":
+        if row.order == problem.order and row.leave_one_out is not None and method == "norm" and not problem.cross:
             return {"value": row.leave_one_out, "unit": "m/s^2"}
     if problem.reading.shape[1] <= solution.theta.shape[1]:
         return None
@@ -348,7 +356,7 @@ def _freedom_warnings(problem: Problem, solution: Solution, observability: Obser
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     found = []
     if observability.condition > _HIGH_CONDITION:
-        confused = observability.confused(parameter_names(problem.order))
+        confused = observability.confused(parameter_names(problem.order, problem.cross))
         found.append(
             f"condition number {observability.condition:.0f}: these attitudes hardly separate {' '.join(confused[:6])}"
         )

@@ -80,7 +80,7 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     values = np.concatenate([g * zero / relative, nominal * relative, theta[6:]])
     slope = np.diag(np.concatenate([g / relative, nominal, np.ones(3)]))
     slope[range(3), range(3, 6)] = -g * zero / relative**2
-    shared = float(record.model["gravity"].get("standard_uncertainty") or 0.0) / g * gravity_slope(values)
+    shared = float(record.model["gravity"].get("standard_uncertainty") or 0.0) / g * gravity_slope(values, _LINEAR)
     whole = slope[:, free] @ (covariance(fit.jacobian, 1 / variance)[0] * factor) @ slope[:, free].T
     whole += np.outer(shared, shared)
     fitted = {
@@ -94,6 +94,6 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
         record,
         parameters=fitted | gyro,
         covariance=Covariance(tuple(names), tuple(map(tuple, whole.tolist()))),
-        model={**record.model, "order": _LINEAR},
+        model={key: value for key, value in record.model.items() if key != "cross"} | {"order": _LINEAR},
         fit={"attitudes": n, "rms": {"value": g * float(np.sqrt(np.mean(fit.residuals**2))), "unit": "m/s^2"}},
     )

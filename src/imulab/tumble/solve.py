@@ -69,6 +69,8 @@ class Problem:
         Whether the attitudes get the common further variance that their scatter makes plausible.
     prior
         Earlier knowledge of the parameters.
+    cross
+        Whether the model has cross terms.
     motion
         How the attitudes moved while they were held, in g and g^2; None where nothing is known of it.
     """
@@ -79,6 +81,7 @@ class Problem:
     robust: bool = False
     excess: bool = True
     prior: Prior | None = None
+    cross: bool = False
     motion: Motion | None = None
 
     def only(self, which: NDArray[Any]) -> Problem:
@@ -162,9 +165,9 @@ class Solution:
         return self.residuals / (np.sqrt(self.variance) * self.scale[:, None])
 
 
-def start_parameters(order: int, count: int = 1) -> Array:
+def start_parameters(order: int, count: int = 1, cross: bool = False) -> Array:
     """Return the nominal sensor as a start, shape (count, p)."""
-    theta = np.zeros((count, parameter_count(order)))
+    theta = np.zeros((count, parameter_count(order, cross)))
     theta[:, 3:6] = 1.0
     return theta
 
@@ -184,8 +187,8 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
         Start parameters, shape (b, p); the nominal sensor if not given.
     """
     count, n, _ = problem.reading.shape
-    theta = start_parameters(problem.order, count) if start is None else start
-    size = parameter_count(problem.order)
+    theta = start_parameters(problem.order, count, problem.cross) if start is None else start
+    size = theta.shape[1]
     lengthening, own = _noise(problem, theta)
     variance, down, scale = own, np.ones((count, n)), np.ones(count)
     excess, freedom = np.zeros(count), np.full(count, np.inf)
@@ -301,7 +304,7 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
     The n refits have the weights of the whole fit and no prior. Beyond some hundred attitudes no single one moves the
     fit, and the linear formula r / (1 - h) is exact enough.
     """
-    if problem.reading.shape[1] > _REFIT_AT_MOST:
+    if problem.reading.shape[1] > _REFIT_AT_MOST or problem.cross:
         errors: Array = (solution.residuals / (1 - leverage(solution.jacobian, solution.weights)))[0]
         return errors
     return left_out_lengths(
