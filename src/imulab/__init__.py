@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from imulab.readers import read_blocks as read_blocks
     from imulab.recording import Recording as Recording
     from imulab.segment import find_attitudes as find_attitudes
+    from imulab.tumble.compare import check_tumble as check_tumble
     from imulab.tumble.fit import TumbleFit as TumbleFit
     from imulab.tumble.fit import fit_tumble as fit_tumble
     from imulab.tumble.simulate import simulate_tumble as simulate_tumble
@@ -69,6 +70,7 @@ _HOME = {
     "Fused": "gyro_array.fuse",
     "allan_deviation": "noise",
     "calibrate_array": "gyro_array.fit",
+    "check_tumble": "tumble.compare",
     "compare_methods": "gyro_array.compare",
     "fuse": "gyro_array.fuse",
     "simulate_array": "gyro_array.simulate",
