@@ -113,7 +113,7 @@ def array(seed: int, *, late: tuple[float, ...], axes: int = 1) -> Trial:
 def row(name: str, **options: object) -> Scenario:
     """Return a scenario of the gyroscopes: settings of `Scenario` and arguments of `gyro`."""
     settings = {key: options.pop(key) for key in ("coverage", "warned", "false_alarms", "trials") if key in options}
-    settings = {"trials": 60, "unit": "ppm of scale factor", **settings}
+    settings = {"trials": 40, "unit": "ppm of scale factor", **settings}
     return Scenario(GYRO, name, partial(gyro, **options), **settings)  # type: ignore[arg-type]
 
 
@@ -137,10 +137,10 @@ SCENARIOS = [
     row("a range of 130 deg/s", limit=np.radians(130.0)),
     row("deg/s labelled rad/s", scale=57.29578, words="in deg/s?", coverage=None, warned=95.0, trials=20),
     row("time stamps of half the rate", fast=1.0, words="twice what", coverage=None, warned=95.0, trials=20),
-    Scenario(ARRAY, "no latency", partial(array, late=()), 100, false_alarms=5.0, unit="ppm"),
-    Scenario(ARRAY, "one element 10 ms late", partial(array, late=(0.01,)), 100, warned=95.0, largest_error=50,
+    Scenario(ARRAY, "no latency", partial(array, late=()), 60, false_alarms=5.0, unit="ppm"),
+    Scenario(ARRAY, "one element 10 ms late", partial(array, late=(0.01,)), 60, warned=95.0, largest_error=50,
              unit="ppm"),
-    Scenario(ARRAY, "three late: 10, -20, 5 ms", partial(array, late=(0.01, -0.02, 0.005)), 100, warned=95.0,
+    Scenario(ARRAY, "three late: 10, -20, 5 ms", partial(array, late=(0.01, -0.02, 0.005)), 60, warned=95.0,
              largest_error=50, unit="ppm"),
     Scenario(ARRAY, "the same, three axes", partial(array, late=(0.01, -0.02, 0.005), axes=3), 20, None, warned=95.0,
              largest_error=100, unit="ppm"),
