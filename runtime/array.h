@@ -17,6 +17,7 @@ typedef struct {
     il_real recent;     /* gain of the mean of a second, */
     il_real keep;       /* and 1 less that gain */
     il_real gate;       /* half of the squared gate */
+    il_real quick;      /* share of the rate that its smoothing over 10 ms takes in */
     il_real jump;       /* share of a variance that the squared mean of a second may have without any doubt */
 } il_robust_terms;
 

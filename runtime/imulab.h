@@ -52,7 +52,8 @@ enum {
     IL_JUMPED = 8,     /* array: bias jump, being estimated again */
     IL_EXCLUDED = 16,  /* array: not in the fused output in this sample */
     IL_QUIET = 32,     /* array: coming back, watched before it is used */
-    IL_BEYOND = 64,    /* tumble: output that no specific force gives; centrifuge: beyond the levels tested */
+    IL_BEYOND = 64,    /* tumble: output that no specific force gives; centrifuge: beyond the levels tested; array: a
+                        * reading held, as at the end of a range */
     IL_ALONE = 128     /* array: fewer than three gyros left, nothing to compare with */
 };
 
@@ -176,7 +177,7 @@ typedef struct {
     il_real gate;              /* robust: standard deviations of a gyro's own noise */
     il_real spread_gate;       /* robust: standard deviations of the array in this sample */
     il_real scale_tolerance;   /* robust: share of the rate by which healthy gyros may differ, 1 */
-    il_real weight_cap;        /* robust: largest weight of one gyro, 1 */
+    il_real weight_cap;        /* robust: largest weight of one gyro while it is new, 1 */
     il_real weight_floor;      /* robust: smallest variance, in mean variances, 1 */
     const il_real *offset;     /* [axes][elements] calibrated bias, subtracted first, or NULL */
     const il_real *matrix;     /* [elements][axes][axes] alignment and scale, applied after it, or NULL */
@@ -191,6 +192,10 @@ typedef struct {
     il_real spread;                         /* support: mean square difference of pairs */
     il_real filtered;                       /* kalman: rate */
     il_real resolution;                     /* robust: smallest change of a reading seen, 0 before any */
+    il_real slow;                           /* robust: rate, smoothed over 10 ms */
+    il_real motion_mean[2];                 /* robust: of change and hundredth of the rate, */
+    il_real motion_square[3];               /* and their squares and product about it */
+    uint32_t motion;                        /* robust: rates so far, up to 16; 17 while what moves with the rate is told apart */
     uint32_t count;                         /* samples so far, from settings.start on */
     uint32_t still;                         /* zero-rate updates so far */
     uint32_t clean;                         /* robust: samples not yet counted in seen, compared, changed */
@@ -201,6 +206,8 @@ typedef struct {
     il_real last[IL_ARRAY_ELEMENTS];        /* last finite reading */
     il_real ratio[IL_ARRAY_ROOM];       /* variance by calibration, in mean variances */
     il_real fast[IL_ARRAY_ROOM];        /* mean residual of the last second or so */
+    il_real late[IL_ARRAY_ROOM];        /* robust: residual in a change of the rate within 10 ms, */
+    il_real scale[IL_ARRAY_ROOM];       /* and in a hundredth of the rate */
     il_real away_mean[IL_ARRAY_ELEMENTS];   /* of a run of gated readings, */
     il_real away_square[IL_ARRAY_ELEMENTS]; /* and the sum of squares about it */
     uint32_t seen[IL_ARRAY_ELEMENTS];       /* residuals learnt from */

@@ -24,7 +24,7 @@ static void forget(const il_array *a, il_array_axis *s, int32_t i) {
     for (int32_t j = 0; j < a->elements; j++) {
         if (j != i && s->seen[j] != 0) s->bias[j] -= sum / (il_real)others;
     }
-    s->bias[i] = s->variance[i] = IL_C(0.0);
+    s->bias[i] = s->variance[i] = s->late[i] = s->scale[i] = IL_C(0.0);
     s->seen[i] = 0;
 }
 
@@ -40,12 +40,27 @@ static void halve(il_array_axis *s, int32_t i) {
     s->compared[i] >>= 1;
 }
 
+/* Whether a reading repeats oftener than by chance, which is told by so many pairs that changed, and repeated before. */
+static int is_held(uint32_t run, uint64_t changed, uint64_t repeated) {
+    if (changed <= repeated) return 0; /* a coarse gyro at rest: it may be stuck, but that takes longer to tell */
+    il_real usual = (il_real)(repeated + 1) / (il_real)(changed + repeated + 2), chance = IL_C(1.0);
+    for (uint32_t k = 0; k < run && chance > CHANCE; k++) chance *= usual;
+    return chance <= CHANCE;
+}
+
+/* Pairs of a gyro's readings that were equal, before the present run of them. */
+static uint32_t repeated_before(const il_array_axis *s, int32_t i) {
+    uint32_t equal = s->compared[i] - 1 - s->changed[i];
+    return equal > s->repeats[i] ? equal - s->repeats[i] : 0;
+}
+
 /* Repeated and missing readings. Returns whether there is anything that needs a closer look. */
 static int examine(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, sample *p) {
     int closer = 0;
     for (int32_t i = 0; i < a->elements; i++) {
         int fine = il_finite(z[i]);
         p->usable[i] = (uint8_t)fine;
+        p->held[i] = 0;
         s->flags[i] = fine ? 0 : (uint8_t)IL_NOT_FINITE;
         closer |= !fine;
         if (!fine) continue;
@@ -59,7 +74,8 @@ static int examine(const il_array *a, il_array_axis *s, const il_real *z, const 
         }
         s->compared[i]++; /* pairs seen, plus one: 0 means that there is no reading to compare with */
         s->last[i] = reading[i];
-        closer |= (s->repeats[i] >= a->stuck) | (s->standing[i] & STUCK);
+        p->held[i] = (uint8_t)(same && is_held(s->repeats[i], s->changed[i], repeated_before(s, i)));
+        closer |= p->held[i] | (same && s->changed[i] == 0) | (s->repeats[i] >= a->stuck) | (s->standing[i] & STUCK);
     }
     return closer;
 }
@@ -69,11 +85,20 @@ static il_real share_changed(const il_array_axis *s, int32_t i) {
     return (il_real)s->changed[i] / (il_real)pairs;
 }
 
-/* A gyro is stuck when its readings repeat longer than they usually do while somebody else is alive. */
+/* A gyro is stuck when its readings repeat longer than they usually do while somebody else is alive. Before that it is
+ * held: what it tells is not the rate. */
 static void find_stuck(const il_array *a, il_array_axis *s, sample *p) {
     il_real shares[IL_ARRAY_ELEMENTS], usual = IL_C(0.0);
-    int32_t alive = 0;
+    uint64_t repeated = 0, changed = 0;
+    int32_t alive = 0, free = 0;
     for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->usable[i] || s->changed[i] == 0) continue;
+        repeated += repeated_before(s, i);
+        changed += s->changed[i];
+    }
+    for (int32_t i = 0; i < a->elements; i++) { /* one that has never changed is judged by the others */
+        if (p->usable[i] && s->changed[i] == 0) p->held[i] = (uint8_t)is_held(s->repeats[i], changed, repeated);
+        free += p->usable[i] && !p->held[i];
         if (p->usable[i] && s->repeats[i] < a->stuck) shares[alive++] = share_changed(s, i);
     }
     if (alive > 0) usual = median(shares, alive);
@@ -81,10 +106,13 @@ static void find_stuck(const il_array *a, il_array_axis *s, sample *p) {
         if (!p->usable[i]) continue;
         il_real share = s->changed[i] ? share_changed(s, i) : usual;
         int stuck = alive > 0 && s->repeats[i] >= a->stuck && (il_real)s->repeats[i] * share >= (il_real)ENOUGH;
-        if (stuck) {
-            s->flags[i] |= IL_STUCK;
+        int held = p->held[i] && free > 0;
+        if (stuck || held) {
+            s->flags[i] |= stuck ? IL_STUCK : IL_BEYOND;
             p->usable[i] = 0;
-            if (!(s->standing[i] & STUCK) && (uint64_t)s->repeats[i] * 2 >= s->seen[i]) forget(a, s, i);
+            s->compared[i] -= s->compared[i] > 1; /* such pairs are not what is usual */
+            int taught = s->seen[i] > 0 && (uint64_t)s->repeats[i] * 2 >= s->seen[i];
+            if (!(s->standing[i] & STUCK) && taught) forget(a, s, i);
         }
         s->standing[i] = (uint8_t)((s->standing[i] & ~STUCK) | (stuck ? STUCK : 0));
     }
@@ -128,16 +156,27 @@ static void trust(const il_array *a, const il_array_axis *s, sample *p) {
     }
 }
 
+/* Take off what moves with this rate. Returns whether there is anything. */
+static int explain(const il_array *a, const il_array_axis *s, il_real rate, sample *p) {
+    const int moves = il_robust_move(a, s, rate, p);
+    if (!moves) memcpy(p->r_still, p->r, sizeof p->r);
+    return moves;
+}
+
 /* Both gates about the median: inside[] counts in the output, learns[] teaches as well. */
 static void gates(const il_array *a, il_array_axis *s, const il_real *z, sample *p, int32_t core) {
     il_real spread = IL_C(0.0);
     p->middle = il_nan();
     if (core > 0) p->middle = median_of(a->elements, p->core, p->r, &spread);
+    il_real total = IL_C(0.0);
+    for (int32_t i = 0; i < a->elements; i++) total += p->core[i] ? IL_C(1.0) / p->trust[i] : IL_C(0.0);
+    p->noise = (il_real)core / total;
+    const int moves = explain(a, s, p->middle, p);
     for (int32_t i = 0; i < a->elements; i++) {
         /* of two that are trusted none can judge the other, but both can judge who wants to come back */
         int judged = core > 2 || (core == 2 && !p->core[i]);
         p->inside[i] = p->learns[i] = (uint8_t)(p->usable[i] && !judged);
-        p->half[i] = IL_C(0.0);
+        p->half[i] = p->raw[i] = IL_C(0.0);
         if (!p->usable[i] || !judged) continue;
         il_real narrow = (core > 3 ? IL_C(30.0) : IL_C(100.0)) * spread; /* three gyros tell little about their noise */
         if (p->learnt >= 2) {
@@ -150,7 +189,8 @@ static void gates(const il_array *a, il_array_axis *s, const il_real *z, sample 
         narrow = larger(narrow, IL_C(1.5) * s->resolution);
         narrow = larger(narrow, ROUNDING * larger(il_fabs(z[i]), il_fabs(p->middle)));
         p->half[i] = larger(narrow, a->spread_gate * spread);
-        il_real distance = il_fabs(p->r[i] - p->middle);
+        p->raw[i] = il_fabs(p->r[i] - p->middle);
+        il_real distance = moves ? smaller(p->raw[i], il_fabs(p->r_still[i] - p->middle)) : p->raw[i];
         p->learns[i] = distance <= narrow;
         /* a bias that is learnt anew has half of the watch to settle */
         p->inside[i] = distance <= p->half[i] || ((s->standing[i] & FRESH) && s->calm[i] < a->quiet / 2);
@@ -159,7 +199,7 @@ static void gates(const il_array *a, il_array_axis *s, const il_real *z, sample 
 
 /* A gyro that left the gate and stays off by the same amount has jumped, also if its noise takes it in at times. */
 static void follow(const il_array *a, il_array_axis *s, const sample *p, int32_t i) {
-    il_real distance = p->r[i] - p->middle;
+    il_real distance = p->r_still[i] - p->middle;
     if (++s->away[i] == 1) {
         s->away_mean[i] = distance;
         s->away_square[i] = IL_C(0.0);
@@ -208,7 +248,7 @@ static void judge(const il_array *a, il_array_axis *s, const sample *p) {
             if (s->seen[i] < a->quiet) s->seen[i] = a->quiet;
         }
         s->standing[i] &= (uint8_t) ~(OUT | FRESH | JUMPED);
-        s->fast[i] = IL_C(0.0);
+        memset(s->fast, 0, sizeof s->fast); /* those of the others hold what it did when it left */
     }
 }
 
@@ -224,7 +264,7 @@ static void weigh(const il_array *a, il_array_axis *s, const sample *p, int32_t 
             top = i;
         }
     }
-    il_real scale = IL_C(1.0) / total, cap = used < 3 ? IL_C(1.0) : a->weight_cap;
+    il_real scale = IL_C(1.0) / total, cap = used < 3 ? IL_C(1.0) : most_weight(a, s->seen[top]);
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] *= scale;
     if (s->weight[top] <= cap) return;
     /* The others' sum, not what the top one leaves of 1: that may be nothing but rounding. */
@@ -258,10 +298,11 @@ void il_robust_find_small_jumps(const il_array *a, il_array_axis *s, sample *p) 
 }
 
 /* Residuals against the mean of those who learn, of readings held to what may teach about the fused rate. */
-static void residuals(const il_array *a, const il_array_axis *s, const sample *p, il_real m, il_real rate, il_real *e) {
+static void residuals(const il_array *a, const il_array_axis *s, const sample *p, const il_real *r, il_real m,
+                      il_real rate, il_real *e) {
     il_real mean = IL_C(0.0), most = MOST * MOST * p->mean_variance;
     for (int32_t i = 0; i < a->elements; i++) {
-        e[i] = p->learns[i] ? p->r[i] - rate : IL_C(0.0);
+        e[i] = p->learns[i] ? r[i] - rate : IL_C(0.0);
         if (e[i] * e[i] > most && e[i] * e[i] > MOST * MOST * p->trust[i] && s->seen[i] >= SETTLING) {
             il_real bound = MOST * il_sqrt(larger(p->trust[i], p->mean_variance));
             e[i] = e[i] > IL_C(0.0) ? bound : -bound;
@@ -275,8 +316,15 @@ static void residuals(const il_array *a, const il_array_axis *s, const sample *p
 /* Biases, variances and means of a second take in the sample; learns[] says whose. */
 static void learn(const il_array *a, il_array_axis *s, sample *p, int32_t pupils, il_real rate) {
     il_real m = (il_real)pupils, squares = IL_C(0.0), gain = IL_C(0.0), recent = IL_C(1.0) / (il_real)a->quiet;
-    il_real e[IL_ARRAY_ELEMENTS];
-    residuals(a, s, p, m, rate, e);
+    il_real e[IL_ARRAY_ELEMENTS], f[IL_ARRAY_ELEMENTS];
+    residuals(a, s, p, p->r, m, rate, e);
+    const int moves = explain(a, s, rate, p);
+    if (moves) {
+        residuals(a, s, p, p->r_still, m, rate, f);
+    } else {
+        memcpy(f, e, sizeof e);
+    }
+    const il_real before = sum_of(a->elements, s->bias);
     uint32_t known = 0; /* nearly always all gyros have seen the same: one division serves */
     for (int32_t i = 0; i < a->elements; i++) {
         p->gain[i] = IL_C(0.0);
@@ -293,7 +341,12 @@ static void learn(const il_array *a, il_array_axis *s, sample *p, int32_t pupils
         if (a->start > 1 && a->memory == IL_C(0.0) && !(known == 1 && a->initial == IL_FIRST)) {
             bias_gain = learning_gain(a, il_counted(known, a->start - 1));
         }
-        s->bias[i] += bias_gain * e[i];
+        s->bias[i] += bias_gain * f[i];
+    }
+    if (moves) il_robust_learn_motion(a, s, p, f);
+    if (forming(a, p->learnt)) {
+        const il_real drift = (sum_of(a->elements, s->bias) - before) / m;
+        for (int32_t i = 0; i < a->elements; i++) s->bias[i] -= p->learns[i] ? drift : IL_C(0.0);
     }
     if (pupils < 3) return;
     squares /= m * (m - IL_C(1.0));
@@ -302,7 +355,7 @@ static void learn(const il_array *a, il_array_axis *s, sample *p, int32_t pupils
         if (!p->learns[i]) continue;
         il_real grubbs = hat * (e[i] * e[i] - squares);
         s->variance[i] = (IL_C(1.0) - p->gain[i]) * (s->variance[i] + p->gain[i] * grubbs);
-        s->fast[i] = (IL_C(1.0) - recent) * s->fast[i] + recent * (p->r[i] - rate); /* as it came */
+        s->fast[i] = (IL_C(1.0) - recent) * s->fast[i] + recent * (p->r_still[i] - rate); /* as it came */
     }
     il_robust_find_small_jumps(a, s, p);
 }
@@ -315,7 +368,9 @@ static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, sam
     trust(a, s, p);
     for (int32_t i = 0; i < a->elements; i++) {
         int here = p->waived ? p->core[i] : p->usable[i] && !(s->standing[i] & OUT);
-        p->used[i] = (uint8_t)(here && p->inside[i]);
+        p->used[i] = (uint8_t)(here && p->inside[i] && (p->raw[i] <= p->half[i] || (s->standing[i] & FRESH)));
+        p->excused[i] = here && p->inside[i] && !p->used[i];
+        if (p->excused[i]) s->flags[i] |= IL_GATED;
         used += p->used[i];
         if (!p->core[i]) continue;
         if (nearest < 0 || il_fabs(p->r[i] - p->middle) < il_fabs(p->r[nearest] - p->middle)) nearest = i;
@@ -324,7 +379,7 @@ static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, sam
         p->used[nearest] = 1;
         used = 1;
     }
-    for (int32_t i = 0; i < a->elements; i++) p->learns[i] = p->learns[i] && p->used[i];
+    for (int32_t i = 0; i < a->elements; i++) p->learns[i] = p->learns[i] && (p->used[i] || p->excused[i]);
     return used;
 }
 
@@ -342,12 +397,13 @@ static void report(const il_array *a, il_array_axis *s, const sample *p, int32_t
 static void teach_fresh(const il_array *a, il_array_axis *s, const sample *p, il_real rate) {
     for (int32_t i = 0; i < a->elements; i++) {
         int fresh = p->usable[i] && (s->standing[i] & OUT) && (s->standing[i] & FRESH);
-        if (fresh && !p->used[i] && s->calm[i] > 0) s->bias[i] += (p->r[i] - rate) / (il_real)s->calm[i];
+        if (fresh && !p->used[i] && s->calm[i] > 0) s->bias[i] += (p->r_still[i] - rate) / (il_real)s->calm[i];
     }
 }
 
 /* The long way, for samples in which something is wrong or new. */
-static il_real look_closely(const il_array *a, il_array_axis *s, const il_real *z, sample *p, int closer) {
+static il_real look_closely(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z, sample *p,
+                            int closer) {
     il_real rate = IL_C(0.0);
     int32_t pupils = 0;
     if (closer) find_stuck(a, s, p);
@@ -368,6 +424,7 @@ static il_real look_closely(const il_array *a, il_array_axis *s, const il_real *
     }
     if (used < a->elements) teach_fresh(a, s, p, rate);
     if (pupils >= 2) learn(a, s, p, pupils, rate);
+    il_robust_pass(t, s, rate);
     return rate;
 }
 
@@ -408,7 +465,7 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         il_robust_settle(a, s);
         int closer = examine(a, s, z, reading, &p);
         if (closer || !well) {
-            const il_real rate = look_closely(a, s, z, &p, closer);
+            const il_real rate = look_closely(a, t, s, z, &p, closer);
             il_robust_muster(a, s);
             return rate;
         }
@@ -419,5 +476,6 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         memset(s->flags, 0, (size_t)a->elements);
     }
     il_robust_learn(a, t, s, &p);
+    il_robust_pass(t, s, p.rate);
     return p.rate;
 }

@@ -83,7 +83,7 @@ static void compare(int32_t n, il_real gate, il_real floor, const il_real *restr
 }
 
 /* Hold the largest weight to the cap. */
-static void hold(const il_array *a, il_real *weight, sample *p) {
+static void hold(const il_array *a, const il_array_axis *s, il_real *weight, sample *p) {
     il_real others = IL_C(0.0), rate = IL_C(0.0);
     int32_t top = 0;
     while (weight[top] < p->top) top++;
@@ -92,22 +92,25 @@ static void hold(const il_array *a, il_real *weight, sample *p) {
         others += weight[i];
         rate += weight[i] * p->r[i];
     }
-    weight[top] = a->weight_cap / (IL_C(1.0) - a->weight_cap) * others;
+    const il_real cap = most_weight(a, il_counted(s->seen[top], s->clean));
+    if (weight[top] <= cap * p->total) return;
+    weight[top] = cap / (IL_C(1.0) - cap) * others;
     p->total = others + weight[top];
     p->rate = (rate + weight[top] * p->r[top]) / p->total;
 }
 
 /* Biases, variances, means of a second. Returns by how much one of these is beyond what shows that none has jumped. */
 static il_real teach(int32_t n, const il_robust_terms *restrict t, const sample *restrict p, const il_real *restrict r,
-                     const il_real *restrict gain, const il_real *restrict trusted, il_real *restrict bias,
+                     const il_real *restrict still, il_real centre, const il_real *restrict gain, const il_real *restrict trusted, il_real *restrict bias,
                      il_real *restrict variance, il_real *restrict fast) {
     const il_real middle = p->middle, rate = p->rate, level = t->cross * p->squares, hat = t->hat, keep = t->keep;
     const il_real recent = t->recent, jump = t->jump;
     il_real sum[2] = {IL_C(0.0), IL_C(0.0)}, far[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
     for (int32_t i = 0; i < n; i += 2) {
         for (int32_t j = 0; j < 2; j++) {
-            il_real e = r[i + j] - middle, mean = keep * fast[i + j] + recent * (r[i + j] - rate), square = mean * mean;
-            bias[i + j] += gain[i + j] * e;
+            il_real e = r[i + j] - middle, f = still[i + j];
+            il_real mean = keep * fast[i + j] + recent * (f - rate), square = mean * mean;
+            bias[i + j] += gain[i + j] * (f - centre);
             variance[i + j] = (IL_C(1.0) - gain[i + j]) * (variance[i + j] + gain[i + j] * (hat * (e * e) - level));
             fast[i + j] = mean;
             sum[j] += square;
@@ -118,10 +121,10 @@ static il_real teach(int32_t n, const il_robust_terms *restrict t, const sample 
 }
 
 /* Whether no residual is beyond full teaching; exactly, where the margin of `compare` leaves it open. */
-static int straight(int32_t n, const sample *p) {
+static int straight(int32_t n, const sample *p, const il_real *r) {
     int all = 1;
     for (int32_t i = 0; i < n; i++) {
-        const il_real e = p->r[i] - p->rate;
+        const il_real e = r[i] - p->rate;
         all &= e * e <= MOST * MOST * larger(p->trust[i], p->mean_variance);
     }
     return all;
@@ -142,10 +145,13 @@ int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axi
     experience(a, s, p);
     const il_real floor = larger(a->weight_floor * p->mean_variance, IL_TINY);
     compare(n, t->gate, floor, p->r, s->variance, s->ratio, p->pull, p->trust, s->weight, p);
-    if (p->top > a->weight_cap * p->total) hold(a, s->weight, p);
+    p->noise = (il_real)n / p->total;
+    if (p->top > a->weight_cap * p->total) hold(a, s, s->weight, p);
     const il_real apart = p->middle - p->rate, room = IL_C(2.0) * t->gate * p->mean_variance - p->squares;
     if (!(p->outside <= room * t->share)) return 0;
-    return p->bent + IL_C(5.0) * apart * apart <= IL_C(0.0) || straight(n, p);
+    if (p->bent + IL_C(5.0) * apart * apart > IL_C(0.0) && !straight(n, p, p->r)) return 0;
+    p->moves = il_robust_move(a, s, p->rate, p);
+    return !p->moves || straight(n, p, p->r_still);
 }
 
 /* Whether the means of a second are so near to each other that none can have jumped. As in il_robust_find_small_jumps half
@@ -172,8 +178,27 @@ static void suspect(const il_array *a, il_array_axis *s, sample *p) {
 
 /* What `learn` does in robust.c. */
 void il_robust_learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, sample *p) {
+    const int unlike = s->well == UNEQUAL && forming(a, il_counted(most_seen(a, s), s->clean) - 1);
+    const il_real before = unlike ? sum_of(a->elements, s->bias) : IL_C(0.0);
+    const il_real *still = p->r;
+    il_real centre = p->middle;
+    if (p->moves) {
+        il_real f[IL_ARRAY_ROOM];
+        still = p->r_still;
+        centre = IL_C(0.0);
+        for (int32_t i = 0; i < a->elements; i++) centre += p->r_still[i];
+        centre *= t->share;
+        for (int32_t i = 0; i < a->elements; i++) f[i] = p->r_still[i] - centre;
+        p->r_still[a->elements] = centre;
+        il_robust_learn_motion(a, s, p, f);
+    }
     /* The median of the means of a second is no further from 0 than sqrt(2) times their root mean square. */
-    if (teach(a->elements, t, p, p->r, p->gain, p->trust, s->bias, s->variance, s->fast) <= IL_C(0.0)) return;
+    const il_real doubt = teach(a->elements, t, p, p->r, still, centre, p->gain, p->trust, s->bias, s->variance, s->fast);
+    if (unlike) {
+        const il_real drift = (sum_of(a->elements, s->bias) - before) * t->share;
+        for (int32_t i = 0; i < a->elements; i++) s->bias[i] -= drift;
+    }
+    if (doubt <= IL_C(0.0)) return;
     if (!agree(a->elements, t, s->fast, p->trust)) suspect(a, s, p);
 }
 
@@ -184,6 +209,7 @@ il_robust_terms il_robust_prepare(const il_array *a) {
     t.hat = n / (n - IL_C(2.0));
     t.cross = IL_C(1.0) / ((n - IL_C(1.0)) * (n - IL_C(2.0)));
     t.recent = IL_C(1.0) / (il_real)a->quiet;
+    t.quick = smaller(IL_C(100.0) * t.recent, IL_C(1.0));
     t.keep = IL_C(1.0) - t.recent;
     t.gate = a->gate * a->gate * IL_C(0.5);
     t.jump = larger(IL_C(32.0) * t.recent, IL_C(1.0)) * IL_C(0.25);

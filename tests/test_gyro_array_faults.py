@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from imulab.gyro_array.fuse import Fused, FuseOptions, fuse
-from imulab.gyro_array.health import EXCLUDED, JUMPED, NON_FINITE, STUCK
+from imulab.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
 from imulab.runtime import array_stream
 from reference import gyro_array as reference
 from test_gyro_array_fuse import array_recording, dynamic
@@ -183,6 +183,79 @@ def test_one_gyro_saturates_in_every_period(seed, limit, elements):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("limit", [4.0, 8.0, 10.0])
+def test_two_of_six_saturate_in_every_period(seed, limit):
+    # Equal readings at the end of the range, on both sides and from the first sample on, are told from the rate.
+    readings, truth, _ = dynamic(seed)
+    pair = [1, 4]
+    broken = readings.copy()
+    broken[:, pair] = np.clip(readings[:, pair], -limit, limit)
+    fused = run(broken)
+    assert np.abs(fused.rate[:, 0] - truth)[RATE:].max() < 0.40
+    assert (fused.flags[np.abs(truth) > limit + 2][RATE:, 0][:, pair] & (HELD | STUCK)).all()
+    others = [i for i in range(6) if i not in pair]
+    assert not (fused.flags[:, 0, others] & (STUCK | HELD | JUMPED)).any()
+    assert any(line.startswith("gyro_2: ") and "held" in line for line in fused.health.lines())
+
+
+@pytest.mark.parametrize("elements", [3, 6])
+def test_equal_readings_of_a_sensor_that_holds_them_are_no_end_of_a_range(elements):
+    # Read four times as often as they are made.
+    slow = dynamic(3, count=1500, elements=elements)[0]
+    fused = run(np.repeat(slow, 4, axis=0))
+    assert not (fused.flags & (HELD | STUCK)).any()
+
+
+def in_motion(seed: int, delay: float, count: int = 10_000) -> tuple[np.ndarray, np.ndarray]:
+    """Six gyros at 100 Hz that start in motion of 49 deg/s rms below 2 Hz, one of them late: readings, truth."""
+    rng = np.random.default_rng(seed)
+    frequency, phase = rng.uniform(0.05, 2, 12), rng.uniform(0, 2 * np.pi, 12)
+    size = rng.standard_normal(12)
+    size *= 49 * np.sqrt(2 / np.sum(size**2))
+
+    def rate(time: np.ndarray) -> np.ndarray:
+        return np.sin(2 * np.pi * frequency * time[:, None] + phase) @ size
+
+    time = np.arange(count) / 100
+    truth = rate(time)
+    bias = 0.02 * rng.standard_normal(6)
+    readings = truth[:, None] + bias - bias.mean() + 0.05 * rng.uniform(0.6, 1.6, 6) * rng.standard_normal((count, 6))
+    readings[:, FAULTY] += rate(time - delay) - truth
+    return readings, truth
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.002, 0.005, 0.01])
+def test_a_late_gyro_is_no_bias_where_the_array_starts_in_motion(delay):
+    # The mean error that was asked for is 0.03 deg/s; 0 is what a healthy array must not lose.
+    mean = []
+    for seed in range(12):
+        readings, truth = in_motion(seed, delay)
+        fused = array_stream("robust", 6, rate=100.0).process(readings)
+        mean.append(abs((fused.rate[:, 0] - truth).mean()))
+        assert not (fused.flags & (JUMPED | STUCK | HELD)).any()
+    assert max(mean) < (0.03 if delay else 0.002)
+
+
+@pytest.mark.parametrize("elements", [3, 5, 6])
+def test_motion_is_told_apart_as_in_the_transcription(elements):
+    readings = in_motion(elements, 0.006, 3000)[0][:, :elements] * np.linspace(0.98, 1.02, elements)
+    readings[2000:] -= in_motion(elements, 0.0, 3000)[1][2000:, None]  # and at rest
+    ours = array_stream("robust", elements, rate=100.0, memory=0.02 if elements == 5 else None).process(readings)
+    recursion = reference.Robust(elements, rate=100.0, memory=0.02 if elements == 5 else None)
+    for k, row in enumerate(readings.tolist()):
+        assert ours.rate[k, 0] == pytest.approx(recursion.step(row), abs=1e-8), k
+        assert (ours.flags[k, 0] & 127).tolist() == recursion.flags, k
+
+
+def test_one_gyro_ten_times_better_than_the_others_is_used():
+    # The best weights leave 0.0976 of the noise of the others, the smallest variance that is believed 1.16 times that.
+    rng = np.random.default_rng(4)
+    sigma = 0.05 * np.array([1, 0.1, 1, 1, 1, 1])
+    ours = array_stream("robust", 6, rate=100.0).process(sigma * rng.standard_normal((20_000, 6))).rate[10_000:, 0]
+    assert ours.std() < 1.2 / np.sqrt(np.sum(sigma**-2))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_gyro_that_comes_back_wrong_does_not_move_the_others(seed):
     # Lost for 6 s, back with another scale factor: the mean of the others stays the mean of the output.
     readings, truth, _ = dynamic(seed)
@@ -274,5 +347,5 @@ def test_any_mixture_of_faults_gives_the_flags_and_rates_of_the_transcription(se
     recursion = reference.Robust(elements, rate=rate, memory=memory, reliability=known)
     for k, row in enumerate(readings.tolist()):
         expected = recursion.step(row)
-        assert (ours.flags[k, 0] & 63).tolist() == recursion.flags, k
+        assert (ours.flags[k, 0] & 127).tolist() == recursion.flags, k
         assert ours.rate[k, 0] == pytest.approx(expected, abs=1e-11, nan_ok=True), k

@@ -42,11 +42,12 @@ static void no_weight_is_no_rate(void) {
     il_real out = REAL(0);
     CHECK(il_array_start(&a, &state) == IL_OK);
     for (int k = 0; k < 4; k++) {
-        il_real reading[V_ELEMENTS];
-        for (int i = 0; i < V_ELEMENTS; i++) reading[i] = ((i + k) % 2 ? REAL(1) : REAL(-1)) * (IS_FLOAT ? REAL(1e30) : REAL(1e200));
-        CHECK(((il_array_step(&a, &state, reading, &out) & IL_NOT_FINITE) != 0) == (isnan(out) != 0));
+        il_real reading[V_ELEMENTS], far = REAL(1);
+        for (int times = k < 3 ? 0 : IS_FLOAT ? 1 : 7; times > 0; times--) far *= REAL(1e30);
+        for (int i = 0; i < V_ELEMENTS; i++) reading[i] = i % 2 ? far : -far;
+        (void)il_array_step(&a, &state, reading, &out);
+        CHECK((isnan(out) != 0) == (k == 3));
     }
-    CHECK(isnan(out));
 }
 
 static void kalman_starts_with_what_is_there(void) {

@@ -137,7 +137,8 @@ static void three_gyros_are_enough(void) {
             CHECK_CLOSE(out, v_array_turn[k], scenario == 1 ? REAL(1) / REAL(3) + REAL(0.02) : REAL(0.02));
         }
         CHECK(((met & IL_STUCK) != 0) == (scenario == 3));
-        CHECK(((met & IL_GATED) != 0) == (scenario > 0));
+        CHECK(((met & IL_GATED) != 0) == (scenario == 1 || scenario == 2));
+        CHECK(((met & IL_BEYOND) != 0) == (scenario == 3)); /* held, before they are known to be stuck */
         CHECK((met == 0) == (scenario == 0));
     }
 }
@@ -184,6 +185,83 @@ static void the_most_central_gyro_serves_where_all_are_gated(void) {
     CHECK(il_array_step(&a, &state, reading, &out) & IL_ALONE);
     CHECK_CLOSE(out < REAL(0) ? -out : out, REAL(1), REAL(0.01));
     CHECK(state.axis[0].weight[0] + state.axis[0].weight[2] == REAL(1));
+}
+
+static il_real sine(il_real x) {
+    return (il_real)sin((double)x);
+}
+
+/* Three sines of 60 deg/s together, in rad/s at time t. */
+static il_real turning(il_real t) {
+    return REAL(0.5) * sine(REAL(3) * t + REAL(1)) + REAL(0.4) * sine(REAL(7) * t + REAL(2)) + REAL(0.2) * sine(REAL(11) * t);
+}
+
+/* An array that starts in motion takes nothing of a gyro's lateness or scale factor for a bias; at rest it forgets. */
+static void what_moves_with_the_rate_is_no_bias(void) {
+    for (int fault = 0; fault < 3; fault++) {
+        il_array a = settings_of(IL_ROBUST);
+        il_array_state state;
+        il_array_axis *s = &state.axis[0];
+        il_real out, away = REAL(0);
+        unsigned met = 0;
+        a.elements = 6 - fault % 2;
+        a.memory = fault == 2 ? REAL(0.0078125) : REAL(0);
+        CHECK(il_array_start(&a, &state) == IL_OK);
+        for (int k = 0; k < 6000; k++) {
+            const il_real t = REAL(k) / REAL(50), rate_now = k < 3000 ? turning(t) : REAL(0);
+            il_real reading[6];
+            for (int i = 0; i < a.elements; i++) reading[i] = rate_now + REAL(1e-3) * random_real() + REAL(0.002) * REAL(i - 2);
+            if (k < 3000 && fault != 1) reading[3] += turning(t - REAL(0.006)) - rate_now;
+            if (k < 3000 && fault == 1) reading[3] += REAL(0.03) * rate_now;
+            met |= il_array_step(&a, &state, reading, &out);
+            if (k == 2999) {
+                for (int i = 0; i < a.elements; i++) { /* differences of the biases, which are 0.002 from one to the next */
+                    const il_real off = s->bias[i] - s->bias[0] - REAL(0.002) * REAL(i);
+                    CHECK((off < REAL(0) ? -off : off) < (fault == 2 ? REAL(4e-3) : REAL(1e-3)));
+                }
+                CHECK(s->motion == 17);
+            }
+            if (k >= 250 && k < 3000) away += (out - rate_now - (a.elements == 6 ? REAL(0.001) : REAL(0))) / REAL(2750);
+        }
+        CHECK((away < REAL(0) ? -away : away) < REAL(5e-4));
+        CHECK(!(met & (IL_JUMPED | IL_STUCK | IL_BEYOND)));
+        CHECK((s->motion == 16) == (fault == 2)); /* growing memory would take longer */
+    }
+}
+
+/* Rates whose squares are beyond all numbers tell nothing of the motion, and leave nothing behind. */
+static void motion_beyond_all_numbers(void) {
+    const il_array a = settings_of(IL_ROBUST);
+    const il_real far = IS_FLOAT ? REAL(1e25) : REAL(1e80) * REAL(1e80);
+    il_array_state state;
+    il_real out = REAL(0);
+    CHECK(il_array_start(&a, &state) == IL_OK);
+    for (int k = 0; k < 60; k++) {
+        il_real reading[V_ELEMENTS];
+        for (int i = 0; i < V_ELEMENTS; i++) reading[i] = k == 40 ? far : v_array_base[k][i];
+        (void)il_array_step(&a, &state, reading, &out);
+        CHECK(isfinite(out) && isfinite(state.axis[0].motion_square[0]));
+        if (k <= 40) CHECK(state.axis[0].motion == (k < 15 ? (uint32_t)k + 1 : 16));
+    }
+}
+
+/* Two of six at the end of their range, on both sides, from the first sample on. */
+static void held_readings_do_not_count(void) {
+    il_array a = settings_of(IL_ROBUST);
+    il_array_state state;
+    CHECK(il_array_start(&a, &state) == IL_OK);
+    for (int k = 0; k < 1000; k++) {
+        const il_real now = -REAL(0.22) * sine(REAL(0.02) * REAL(k) + REAL(1)), range = REAL(0.17);
+        il_real reading[V_ELEMENTS], out;
+        for (int i = 0; i < V_ELEMENTS; i++) {
+            reading[i] = now + REAL(1e-3) * random_real();
+            if (i < 2 && reading[i] > range) reading[i] = range;
+            if (i < 2 && reading[i] < -range) reading[i] = -range;
+        }
+        const unsigned met = il_array_step(&a, &state, reading, &out);
+        CHECK(((met & (IL_BEYOND | IL_STUCK)) != 0) <= (now < -range + REAL(0.01) || now > range - REAL(0.01)));
+        if (k > 50) CHECK_CLOSE(out, now, REAL(4e-3));
+    }
 }
 
 /* Newcomers are used at once where nobody else is left. */
@@ -269,6 +347,9 @@ void test_robust(void) {
     three_gyros_are_enough();
     a_scale_factor_is_no_jump();
     the_most_central_gyro_serves_where_all_are_gated();
+    what_moves_with_the_rate_is_no_bias();
+    motion_beyond_all_numbers();
+    held_readings_do_not_count();
     nobody_waits_for_nobody();
     weights_survive_any_variances();
     random_faults_never_break_it();

@@ -6,7 +6,7 @@ what was used in the last sample.
 
 import math
 
-NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET = 1, 2, 4, 8, 16, 32
+NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, HELD = 1, 2, 4, 8, 16, 32, 64
 NAN = float("nan")
 
 
@@ -113,6 +113,11 @@ class Support:
         return sum(self.weights[i] * z[i] for i in range(n))
 
 
+def is_held(run, changed, repeated):
+    """Whether a run of equal readings is one that chance makes less than once in a million times."""
+    return changed > repeated and ((repeated + 1) / (changed + repeated + 2)) ** run <= 1e-6
+
+
 class Robust:
     """Grubbs weights, gate, stuck counter, jumps and re-admission; `rate` in Hz turns times into samples.
 
@@ -163,6 +168,11 @@ class Robust:
         self.away_mean = [0.0] * n
         self.away_square = [0.0] * n
         self.fast = [0.0] * n  # mean residual of the last second or so
+        self.late = [0.0] * n  # residual in a change of the rate within 10 ms
+        self.scale = [0.0] * n  # and in a hundredth of the rate
+        self.quick = min(1.0, 100 / self.quiet_after)
+        self.slow, self.rates, self.moved = 0.0, 0, False  # rate smoothed over 10 ms, rates so far (up to 16)
+        self.turn_mean, self.turn_square = [0.0, 0.0], [0.0, 0.0, 0.0]
 
     def step(self, z):
         n = self.n
@@ -184,15 +194,24 @@ class Robust:
             self.last[i] = z[i]
         alive = [j for j in range(n) if usable[j] and self.repeats[j] < self.stuck_after]
         usual = median_of([self.changed[j] / max(self.compared[j], 1) for j in alive]) if alive else 0.0
+        repeated = [max(0, self.compared[i] - self.changed[i] - self.repeats[i]) for i in range(n)]
+        known = [i for i in range(n) if usable[i] and self.changed[i]]
+        pool = sum(self.changed[i] for i in known), sum(repeated[i] for i in known)
+        held = [
+            usable[i] and is_held(self.repeats[i], *((self.changed[i], repeated[i]) if self.changed[i] else pool))
+            for i in range(n)
+        ]
+        free = any(usable[i] and not held[i] for i in range(n))
         for i in range(n):
             if not usable[i]:
                 continue
-            share = self.changed[i] / self.compared[i] if self.changed[i] else usual
+            share = self.changed[i] / max(self.compared[i], 1) if self.changed[i] else usual
             stuck = bool(alive) and self.repeats[i] >= self.stuck_after and self.repeats[i] * share >= 20
-            if stuck:
-                flags[i] |= STUCK
+            if stuck or (held[i] and free):
+                flags[i] |= STUCK if stuck else HELD
                 usable[i] = False
-                if not self.stuck[i] and 2 * self.repeats[i] >= self.count[i]:
+                self.compared[i] -= self.compared[i] > 0
+                if not self.stuck[i] and 0 < self.count[i] <= 2 * self.repeats[i]:
                     self._forget(i)
             self.stuck[i] = stuck
         # 2. who is there: gyros in use so far; newcomers and all others wait
@@ -210,6 +229,10 @@ class Robust:
         middle = median_of([r[i] for i in core]) if core else NAN
         spread = 1.4826 * median_of([abs(r[i] - middle) for i in core]) if core else 0.0
         vbar = self._vbar()
+        noise = len(core) / sum(1 / self._variance(i, vbar) for i in core) if core else NAN
+        turn = self._turn(middle, noise)
+        still = self._still(r, turn)
+        raw = [0.0] * n
         inside = [False] * n
         learn = [False] * n
         half = [0.0] * n
@@ -228,7 +251,8 @@ class Robust:
                 narrow = max(narrow, 1.5 * self.resolution)
             narrow = max(narrow, 1e-12 * max(abs(z[i]), abs(middle)))
             half[i] = max(narrow, self.spread_gate * spread)
-            distance = abs(r[i] - middle)
+            raw[i] = abs(r[i] - middle)
+            distance = min(raw[i], abs(still[i] - middle))
             learn[i] = distance <= narrow
             inside[i] = distance <= half[i] or (self.fresh[i] and self.calm[i] < self.quiet_after // 2)
         # 4. what that does to each gyro
@@ -247,11 +271,11 @@ class Robust:
                 self.calm[i] = 0
                 if self.bad[i] >= max(self.quiet_after // 5, 1):
                     self.out[i] = True
-                self._follow_away(i, r[i] - middle, middle, half[i], vbar)
+                self._follow_away(i, still[i] - middle, middle, half[i], vbar)
             else:
                 self.bad[i] = 0
                 if self.out[i] and not self.fresh[i] and half[i] > 0:
-                    self._follow_away(i, r[i] - middle, middle, half[i], vbar)
+                    self._follow_away(i, still[i] - middle, middle, half[i], vbar)
                 else:
                     self.away[i] = 0
                 if self.out[i]:
@@ -261,11 +285,13 @@ class Robust:
                             self.v[i] = self.v[i] if self.count[i] else vbar
                             self.count[i] = max(self.count[i], self.quiet_after)
                         self.out[i] = self.fresh[i] = self.jumped[i] = False
-                        self.fast[i] = 0.0
+                        self.fast = [0.0] * n
         # 5. the output
-        used = [i for i in core if inside[i] and usable[i] and (waived or not self.out[i])]
-        used += [i for i in range(n) if usable[i] and not waived and not self.out[i] and i not in core and inside[i]]
-        used.sort()
+        here = [inside[i] and (i in core if waived else usable[i] and not self.out[i]) for i in range(n)]
+        used = [i for i in range(n) if here[i] and (raw[i] <= half[i] or self.fresh[i])]
+        excused = [i for i in range(n) if here[i] and i not in used]  # beyond the gate by what moves with the rate
+        for i in excused:
+            flags[i] |= GATED
         if not used and core:
             used = [min(core, key=lambda i: abs(r[i] - middle))]
         w = self._weigh(used, vbar)
@@ -277,30 +303,73 @@ class Robust:
             if usable[i] and self.out[i]:
                 flags[i] |= QUIET
                 if self.fresh[i] and used and i not in used and self.calm[i]:
-                    self.b[i] += (r[i] - rate) / self.calm[i]
+                    self.b[i] += (still[i] - rate) / self.calm[i]
             if self.jumped[i]:
                 flags[i] |= JUMPED
-        pupils = [i for i in used if learn[i]]
+        pupils = [i for i in range(n) if learn[i] and (i in used or i in excused)]
         if len(pupils) >= 2:
-            self._learn(pupils, r, rate, middle, vbar, learnt)
+            self._learn(pupils, r, rate, middle, vbar, noise, learnt)
+        if used:
+            self.slow = self.slow + self.quick * (rate - self.slow) if self.rates else rate
+            self.rates = min(self.rates + 1, 16)
         self.weights, self.flags = w, flags
         return rate
 
-    def _learn(self, pupils, r, rate, middle, vbar, learnt):
-        m = len(pupils)
-        # No more than 3 sigma from the fused rate teach, once there is a variance to tell.
+    def _turn(self, rate, noise):
+        """Change of the rate within 10 ms and a hundredth of it; nothing where the noise of the gyros hides both."""
+        turn = (rate - self.slow, 0.01 * rate)
+        least = (3 if self.moved else 10) ** 2 * noise
+        return turn if self.rates >= 16 and turn[0] ** 2 + turn[1] ** 2 > least else (0.0, 0.0)
+
+    def _still(self, r, turn):
+        return [r[i] - (self.late[i] * turn[0] + self.scale[i] * turn[1]) for i in range(self.n)]
+
+    def _held_to(self, pupils, r, rate, vbar):
+        """Residuals about their mean; no more than 3 sigma from the fused rate teach, once there is a variance."""
         held = {i: r[i] - rate for i in pupils}
         for i in pupils:
             if self.count[i] >= 16:
                 most = 3 * math.sqrt(max(self._variance(i, vbar), vbar))
                 held[i] = min(max(held[i], -most), most)
         centre = mean_of(list(held.values()))
-        e = {i: held[i] - centre for i in pupils}
-        squares = sum(x * x for x in e.values())
+        return {i: held[i] - centre for i in pupils}
+
+    def _learn_turn(self, turn, f, gains, noise):
+        """Recursive least squares of the residuals on (1, turn); returns the gain of the bias, in its usual one."""
+        g = min(gains.values())
+        mean, square = self.turn_mean, self.turn_square
+        away = [turn[j] - mean[j] for j in range(2)]
+        self.turn_mean = mean = [mean[j] + g * away[j] for j in range(2)]
+        products = (away[0] ** 2, away[1] ** 2, away[0] * away[1])
+        self.turn_square = square = [(1 - g) * (square[j] + g * products[j]) for j in range(3)]
+        left = [turn[j] - mean[j] for j in range(2)]
+        first, second = square[0] + noise, square[1] + noise
+        scale = 1 / (first * second - square[2] ** 2)
+        k = scale * (second * left[0] - square[2] * left[1]), scale * (first * left[1] - square[2] * left[0])
+        for i in f:
+            self.late[i] = min(max(self.late[i] + gains[i] * k[0] * f[i], -2.0), 2.0)
+            self.scale[i] = min(max(self.scale[i] + gains[i] * k[1] * f[i], -5.0), 5.0)
+        self.moved = square[0] + square[1] > noise or turn[1] != 0.0
+        if not self.moved:
+            self.turn_mean, self.turn_square = [0.0, 0.0], [0.0, 0.0, 0.0]
+        return 1 - k[0] * mean[0] - k[1] * mean[1]
+
+    def _learn(self, pupils, r, rate, middle, vbar, noise, learnt):
+        m = len(pupils)
+        turn = self._turn(rate, noise)
+        still = self._still(r, turn)
+        e, f = self._held_to(pupils, r, rate, vbar), self._held_to(pupils, still, rate, vbar)
+        gains = {}
         for i in pupils:
             self.count[i] += 1
-            g = 1 / min(self.count[i], self.cap) if self.memory is None else max(self.memory, 1 / self.count[i])
-            self.b[i] += g * e[i]
+            gains[i] = 1 / min(self.count[i], self.cap) if self.memory is None else max(self.memory, 1 / self.count[i])
+        own = self._learn_turn(turn, f, gains, noise) if self.moved or turn != (0.0, 0.0) else 1.0
+        # While the array finds its biases, their sum stays, whatever the gains are.
+        drift = sum(own * gains[i] * f[i] for i in pupils) / m if learnt < 5 * self.quiet_after else 0.0
+        squares = sum(x * x for x in e.values())
+        for i in pupils:
+            g = gains[i]
+            self.b[i] += own * g * f[i] - drift
             if m > 2:
                 grubbs = m / (m - 2) * (e[i] ** 2 - squares / (m * (m - 1)))
                 self.v[i] = (1 - g) * (self.v[i] + g * grubbs)
@@ -308,14 +377,14 @@ class Robust:
             return
         # A jump too small for the gate shows in the mean of a second, where the others' means agree; not in the array's
         # first five seconds, in which its biases settle.
-        f = 1 / self.quiet_after
+        share = 1 / self.quiet_after
         for i in pupils:
-            self.fast[i] = (1 - f) * self.fast[i] + f * (r[i] - rate)
+            self.fast[i] = (1 - share) * self.fast[i] + share * (still[i] - rate)
         usual = median_of([self.fast[i] for i in pupils])
         scatter = 1.4826 * median_of([abs(self.fast[i] - usual) for i in pupils])
         young = self.quiet_after * (5 if learnt < 5 * self.quiet_after else 1)
         for i in pupils:
-            limit = max(8 * math.sqrt(f / 2), 1.0) * math.sqrt(self._variance(i, vbar))
+            limit = max(8 * math.sqrt(share / 2), 1.0) * math.sqrt(self._variance(i, vbar))
             limit = max(limit, 8 * scatter, self.motion * abs(middle))
             if self.count[i] >= young and abs(self.fast[i] - usual) > limit:
                 self._jump(i)
@@ -350,15 +419,18 @@ class Robust:
             mean = mean_of([self.b[j] for j in others])
             for j in others:
                 self.b[j] -= mean
-        self.b[i] = self.v[i] = 0.0
+        self.b[i] = self.v[i] = self.late[i] = self.scale[i] = 0.0
         self.count[i] = 0
 
     def _vbar(self):
         known = [self.v[i] for i in range(self.n) if self.count[i] > 1]
         return max(mean_of(known), 0.0) if known else 0.0
 
+    def _remembered(self, i):
+        return min(self.count[i], self.cap) if self.memory is None else min(self.count[i], self.cap, 1 / self.memory)
+
     def _variance(self, i, vbar):
-        count = min(self.count[i], self.cap) if self.memory is None else min(self.count[i], 1 / self.memory)
+        count = self._remembered(i)
         mixed = (self.prior * self.ratio[i] * vbar + count * self.v[i]) / (self.prior + count)
         return max(mixed, self.floor * vbar, 1e-300)
 
@@ -374,8 +446,9 @@ class Robust:
         top = max(used, key=lambda i: inverse[i])
         for i in used:
             w[i] = inverse[i] / total
-        if w[top] > self.weight_cap:
+        cap = 1 - (1 - self.weight_cap) * min(10 * self.quiet_after / max(self._remembered(top), 1), 1)
+        if w[top] > cap:
             rest = 1 - w[top]
             for i in used:
-                w[i] = self.weight_cap if i == top else w[i] / rest * (1 - self.weight_cap)
+                w[i] = cap if i == top else w[i] / rest * (1 - cap)
         return w

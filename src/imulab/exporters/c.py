@@ -27,6 +27,7 @@ _CORE = (
     "array.c",
     "robust.c",
     "robust_well.c",
+    "robust_motion.c",
     "table.c",
 )
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h

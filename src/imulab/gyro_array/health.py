@@ -7,9 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, ALONE = 1, 2, 4, 8, 16, 32, 128
+NON_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, HELD, ALONE = (1 << bit for bit in range(8))
 """Flags of a gyro in a sample, as the C core sets them."""
-_KINDS = ((NON_FINITE, "non-finite"), (STUCK, "stuck"), (JUMPED, "jumped"), (EXCLUDED, "excluded"))
+_KINDS = (
+    (NON_FINITE, "non-finite"),
+    (STUCK, "stuck"),
+    (HELD, "held (end of its range?)"),
+    (JUMPED, "jumped"),
+    (EXCLUDED, "excluded"),
+)
 
 
 @dataclass
