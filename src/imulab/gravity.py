@@ -95,7 +95,7 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
     """Return what a user must know of the gravity that was used, a sentence each."""
     head = _of_head(recording)
     if head is not None:
-        allowed = _TOLD_APART * head.value + 2 * math.hypot(head.standard_uncertainty, gravity.standard_uncertainty)
+        allowed = _TOLD_APART * head.value + 2 * gravity.standard_uncertainty
         if abs(gravity.value - head.value) > allowed:
             return [
                 f"gravity {gravity.value:.6g} m/s^2 was used, but the head of {recording.name} says {head.value:.6g} "
@@ -202,7 +202,11 @@ def _of_head(recording: Recording) -> Gravity | None:
         found = stated_gravity(text, "gravity")
     except OptionError:
         return None
-    said = f"gravity {found.value:.6g} m/s^2 was taken from the head of {recording.name}, as no option gave another"
+    relative = _TO_MICRO * found.standard_uncertainty / found.value
+    known = f" (± {relative:.2g} ppm)" if relative else ""
+    said = (
+        f"gravity {found.value:.6g} m/s^2{known} was taken from the head of {recording.name}, as no option gave another"
+    )
     return Gravity(found.value, f"head of {recording.name}", found.standard_uncertainty, Note(said))
 
 
