@@ -115,7 +115,7 @@ def test_the_head_of_a_file_is_believed_and_named():
     assert record.model["gravity"]["value"] == G
     assert record.model["gravity"]["standard_uncertainty"] == 2e-5
     assert record.model["gravity"]["from"] == "head of t.csv"
-    assert any("(± 2 ppm) was taken from the head of t.csv" in w for w in record.warnings)
+    assert any("(± 2.04 ppm) was taken from the head of t.csv" in w for w in record.warnings)
     assert record.verdict.state == "good"
     silent = fit(recording_of(truth, 1, head="unknown"), None, 1)
     assert silent.model["gravity"]["value"] == 9.80665

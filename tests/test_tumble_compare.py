@@ -96,7 +96,7 @@ def test_a_check_without_noise_takes_that_of_the_record_and_says_so(truth):
     _, fresh = fitted(truth, 1, seed=2)
     check = check_tumble(record, fresh)
     assert check.passed
-    assert any("nothing is known of the noise of these attitudes: the 1e+02 µg" in note for note in check.notes)
+    assert any("nothing is known of the noise of these attitudes: the 102 µg" in note for note in check.notes)
 
 
 def test_disturbed_holds_are_no_change_of_the_unit(truth):

@@ -141,7 +141,7 @@ def gravity_option(gravity: str | None, latitude: str | None, height: str | None
         uncertainty,
         Note(
             f"gravity {value:.6g} m/s^2 is normal gravity, from which that of a place differs: "
-            f"{from_si(uncertainty, 'ug'):.2g} µg"
+            f"{from_si(uncertainty, 'ug'):.3g} µg"
             + (f" (the height was not given; {names['height']} lowers it)" if unknown else "")
             + f" are part of every scale factor's uncertainty; a surveyed value ({names['gravity']} "
             "9.81362+-0.00002) does without"
@@ -178,7 +178,7 @@ def stated_gravity(text: str, option: str) -> Gravity:
         "argument, rounded",
         uncertainty,
         Note(
-            f"gravity {value:.6g} m/s^2 counts as rounded: {_TO_MICRO * uncertainty / value:.2g} ppm are part of every "
+            f"gravity {value:.6g} m/s^2 counts as rounded: {_TO_MICRO * uncertainty / value:.3g} ppm are part of every "
             f"scale factor's uncertainty; give five decimals, or say how well it is known ({option} "
             f"{value:.6g}+-0.0001, +-0 if exact)"
         ),
@@ -203,7 +203,7 @@ def _of_head(recording: Recording) -> Gravity | None:
     except OptionError:
         return None
     relative = _TO_MICRO * found.standard_uncertainty / found.value
-    known = f" (± {relative:.2g} ppm)" if relative else ""
+    known = f" (± {relative:.3g} ppm)" if relative else ""
     said = (
         f"gravity {found.value:.6g} m/s^2{known} was taken from the head of {recording.name}, as no option gave another"
     )

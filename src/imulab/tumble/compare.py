@@ -126,7 +126,7 @@ def check_tumble(
     more = scatter(rows, seen, own_variance)
     if more > 0:
         notes.append(
-            f"the attitudes scatter by {1e6 * np.sqrt(more):.2g} µg beyond their noise, which no change of the record "
+            f"the attitudes scatter by {1e6 * np.sqrt(more):.3g} µg beyond their noise, which no change of the record "
             "explains and the test allows for: holds that were disturbed, or a model of too low an order"
         )
     known = known_of(record, scaling, local, attitudes.unit)
@@ -173,7 +173,7 @@ def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple
     chi_square = fit.get("reduced_chi_square")
     sigma = median(np.array(stated)) if stated else float(np.sqrt(chi_square)) if chi_square else 0.0
     said = Note(
-        f"nothing is known of the noise of these attitudes: the {1e6 * sigma / g:.2g} µg of those that the record was "
+        f"nothing is known of the noise of these attitudes: the {1e6 * sigma / g:.3g} µg of those that the record was "
         "made from were used; a recording, or std_* columns, would say"
     )
     return np.broadcast_to((sigma / g) ** 2 * np.eye(3), (len(attitudes), 3, 3)), [said]

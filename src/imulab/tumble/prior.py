@@ -302,7 +302,7 @@ def findings(record: Calibration, aged: Aged, recording: Recording, count: int) 
     if mine and its and mine != its:
         found.append(f"the prior is a record of {mine}, the recording one of {its}")
     if aged.probability < FALSE_ALARM:
-        sizes = [f"{1e6 * tau:.2g} {unit}" for tau, unit in zip(aged.ageing, ("µg", "ppm", "µrad"), strict=False)]
+        sizes = [f"{1e6 * tau:.3g} {unit}" for tau, unit in zip(aged.ageing, ("µg", "ppm", "µrad"), strict=False)]
         few = (
             f"; with {count} attitudes intervals may be too narrow where several parameters changed at once, "
             f"{_FEW} or more are asked for"
