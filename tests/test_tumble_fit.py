@@ -246,10 +246,10 @@ def test_the_attitudes_that_would_help_do_help():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"order": 6}, "expected one of auto 1 2 3 4 5"),
-        ({"order": "best"}, "expected one of auto 1 2 3 4 5"),
+        ({"order": 6}, "expected one of auto 0 1 2 3 4 5 blend"),
+        ({"order": "best"}, "expected one of auto 0 1 2 3 4 5 blend"),
         ({"method": "magic"}, "expected one of norm linearised"),
-        ({"loss": "cauchy"}, "expected one of square huber"),
+        ({"loss": "cauchy"}, "expected one of square huber auto"),
         ({"gravity": 981.0}, "expected the local value in m/s^2"),
         ({"method": "linearised", "loss": "huber"}, "needs method norm"),
     ],
