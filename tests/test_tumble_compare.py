@@ -96,7 +96,10 @@ def test_a_check_without_noise_takes_that_of_the_record_and_says_so(truth):
     _, fresh = fitted(truth, 1, seed=2)
     check = check_tumble(record, fresh)
     assert check.passed
-    assert any("nothing is known of the noise of these attitudes: the 102 µg" in note for note in check.notes)
+    (said,) = [
+        note for note in check.notes if note.startswith("nothing is known of the noise of these attitudes: the ")
+    ]
+    assert float(said.split("the ")[2].split(" µg")[0]) == pytest.approx(1e6 * 1e-3 / G, rel=0.1)
 
 
 def test_disturbed_holds_are_no_change_of_the_unit(truth):
