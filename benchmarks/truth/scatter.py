@@ -94,12 +94,13 @@ def trial(
     drift: float = 0.0,
     shaking: float = 0.0,
     order: int | str = 1,
+    fit_cross: bool = False,
     sign: str = "",
 ) -> Trial:
     """Fit one recording; `sign` is what a warning that names the fault contains."""
     rng = np.random.default_rng([seed, count, int(1e7 * (cross + wander + drift + shaking))])
     made, truth = recording(rng, count, cross, wander, drift, shaking)
-    record = il.fit_tumble(il.find_attitudes(made), order=order, gravity=G).calibration
+    record = il.fit_tumble(il.find_attitudes(made), order=order, gravity=G, cross=fit_cross).calibration
     factor = record.fit["coverage_factor_95"]
     covered = []
     for name in NAMES:
@@ -131,6 +132,7 @@ SCENARIOS = [
         "cross-axis nonlinearity of 200 µg/g², 48 attitudes",
         cross=200e-6, count=48, coverage=None, warned=95.0, sign="function of the direction",
     ),
+    row("cross-axis nonlinearity of 200 µg/g², 48 attitudes, --cross", cross=200e-6, count=48, fit_cross=True),
     row(
         "cross-axis nonlinearity of 200 µg/g², 48 attitudes, --order auto",
         cross=200e-6, count=48, order="auto", coverage=None, warned=95.0, sign="function of the direction", trials=60,
