@@ -109,12 +109,12 @@ def column_noise(samples: Array, rate: float, moved: str = "") -> ColumnNoise:
         As for `allan_deviation` and `read_coefficients`.
     """
     curve = allan_deviation(samples, rate)
-    if not np.ptp(samples):
-        dead = "all samples are the same: a dead sensor"
-        return ColumnNoise(curve, undetermined(dead), spectral_lines(samples, rate))
+    why = moved if np.ptp(samples) else "all samples are the same: a dead sensor"
+    if why:
+        return ColumnNoise(curve, undetermined(why), Lines(np.empty(0), np.empty(0), samples))
     lines = spectral_lines(samples, rate)
     of_noise = allan_deviation(lines.samples, rate) if len(lines.frequency) else curve
-    found = undetermined(moved) if moved else read_coefficients(of_noise, resolution(samples))
+    found = read_coefficients(of_noise, resolution(samples))
     return ColumnNoise(curve, found, lines)
 
 
