@@ -174,6 +174,8 @@ def _basis(record: Calibration) -> str:
     """Say what the uncertainties rest on."""
     fit = record.fit
     freedom = fit.get("effective_degrees_of_freedom", fit["degrees_of_freedom"])
+    if fit["noise"] != "known" and freedom is None:
+        return "As many parameters as attitudes: nothing tells the noise, and no uncertainty is stated."
     if fit["noise"] != "known":
         return f"Noise estimated from the residuals; Student's t with {freedom:.0f} degrees of freedom."
     if not fit["excess"]["value"] or freedom is None:
