@@ -159,7 +159,7 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     assert "LINE-0007 changed since the last calibration" in done.stdout
     assert il.load(tmp_path / "here" / "tumble.json").model["order"] == 2
     assert "±" in done.stdout
-    assert "down-weighted" in done.stdout
+    assert "set aside" in done.stdout
     assert "self-test: pass" in done.stdout
     assert done.stdout.rstrip().splitlines()[-1] == f"open {Path('here') / 'index.html'}"
     record = il.load(tmp_path / "here" / "tumble.json")

@@ -28,6 +28,8 @@ _HUBER = 1.345
 """95 % efficiency for normal errors (Huber 1981)."""
 _MAX_DAMPING = 1e12
 _LEAST_DAMPING = 1e-12
+_NEAR = 100.0
+"""Steps of so many tolerances are taken where the cost changes by no more than rounding."""
 """Keeps combinations that nothing determines in place; slows no others."""
 _PEAK, _PEAK_PER_DEGREE = 0.25, 1 / 40
 """Exponent b of the prior of an excess variance: the smaller, the more is thought of none."""
@@ -110,8 +112,9 @@ def levenberg_marquardt(
             new_residuals, new_jacobian = model(trial, active)
             new_cost = np.einsum("bn,bn,bn->b", weights[rows], new_residuals, new_residuals)
         small = np.abs(step).max(axis=1) <= tolerance
-        # Near the minimum the cost is flat to rounding: a small step that changes nothing is an arrival.
-        better = new_cost <= cost[rows] * (1 + 1e-12 * small)
+        # Near the minimum the cost is flat to rounding, which must not turn a step towards it away.
+        near = np.abs(step).max(axis=1) <= _NEAR * tolerance
+        better = new_cost <= cost[rows] * (1 + 1e-12 * near)
         iterations[rows] += 1
         if better.all():
             parameters[rows], residuals[rows], jacobian[rows], cost[rows] = trial, new_residuals, new_jacobian, new_cost

@@ -8,7 +8,7 @@
 #include <stdint.h>
 #include <string.h>
 
-static const double SENSED = 1e-9, LEAST_DAMPING = 1e-12, MAX_DAMPING = 1e12; /* as in estimate.py */
+static const double SENSED = 1e-9, LEAST_DAMPING = 1e-12, MAX_DAMPING = 1e12, NEAR = 100.0; /* as in estimate.py */
 
 /* What the fit of one problem works on: n observations, p parameters, two evaluations that take turns. */
 typedef struct {
@@ -127,7 +127,7 @@ static int minimise(Work *w, double *theta, double cost, double tolerance, int m
         }
         const int small = largest <= tolerance;
         const double found = evaluate(w, w->trial, w->new_residuals, w->new_jacobian);
-        const int better = found <= cost * (small ? 1.0 + 1e-12 : 1.0);
+        const int better = found <= cost * (largest <= NEAR * tolerance ? 1.0 + 1e-12 : 1.0);
         if (better) {
             swap(&w->residuals, &w->new_residuals);
             swap(&w->jacobian, &w->new_jacobian);
