@@ -56,6 +56,17 @@ def test_an_uncertainty_that_is_none_is_refused(imulab, text):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("text", ["0", "0.000000", "-9.81", "981", "0+-0"])
+def test_a_gravity_of_no_place_is_refused(imulab, text):
+    with pytest.raises(OptionError, match=rf"^gravity {float(text.split('+')[0]):g}: expected the local value"):
+        stated_gravity(text, "--gravity")
+    done = imulab("tumble", "fit", "nothing.csv", "--gravity", text)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    truth = reference.random_truth(np.random.default_rng(3), 3)
+    silent = fit(recording_of(truth, head=text), None)
+    assert silent.model["gravity"]["from"] == "standard gravity, none given"
+
+
 def test_normal_gravity_has_the_uncertainty_of_the_anomaly_and_of_a_height_that_is_not_given():
     known, guessed = (gravity_option(None, "48.137", height, "--{}") for height in ("520", None))
     assert known.standard_uncertainty == pytest.approx(ANOMALY, rel=0.01)

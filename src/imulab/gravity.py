@@ -35,6 +35,8 @@ _ANYWHERE = 0.0265 / math.sqrt(3)
 """Standard uncertainty of standard gravity, m/s^2: all values from equator to pole (9.780 to 9.832) are possible."""
 _TOLD_APART = 3e-6
 """Relative; far below any scale factor's uncertainty; a height of 10 m."""
+_POSSIBLE = (0.5, 50.0)
+"""What the gravity of some place may be, m/s^2: a small moon's, twice Jupiter's."""
 _ON_EARTH = (9.76, 9.84)
 _ROUNDED = 1e-5
 """Half of the last digit, m/s^2, above which a stated value counts as rounded."""
@@ -86,9 +88,14 @@ def local_gravity(given: float | str | Gravity | None, recording: Recording) -> 
         local = stated_gravity(given, "gravity")
     else:
         local = given if isinstance(given, Gravity) else Gravity(float(given), "argument")
-    if not 0.5 < local.value < 50.0:
-        raise OptionError(f"gravity {local.value:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
+    _check_possible(local.value)
     return local
+
+
+def _check_possible(value: float) -> None:
+    low, high = _POSSIBLE
+    if not low < value < high:
+        raise OptionError(f"gravity {value:g}: expected the local value in m/s^2, about 9.78 to 9.83 on Earth")
 
 
 def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
@@ -158,10 +165,11 @@ def stated_gravity(text: str, option: str) -> Gravity:
     Raises
     ------
     OptionError
-        It is none; the message begins with `option`.
+        It is none (the message begins with `option`), or cannot be the gravity of any place.
     """
     first, sign, second = re.sub(r"\+/?-|±", "±", text).partition("±")
     value = quantity(first, option, "acceleration", "m/s^2")
+    _check_possible(value)
     if sign:
         uncertainty = quantity(second, f"{option} {text!r}, uncertainty", "acceleration", "m/s^2")
         if not 0 <= uncertainty < 0.1 * abs(value):
