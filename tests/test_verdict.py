@@ -48,6 +48,25 @@ def test_a_record_keeps_its_verdict(record, tmp_path):
     assert il.load(tmp_path / "r.json").verdict == Verdict("bad", ("wrong unit",))
 
 
+def test_findings_are_what_they_were_when_a_record_is_read_and_judged_anew(record, tmp_path):
+    findings = (Note("by the way"), "look here", Bad("wrong unit"))
+    for said in (findings, findings[:2], findings[:1]):
+        replace(record, warnings=said, verdict=verdict_of(said)).save(tmp_path / "r.json")
+        read = il.load(tmp_path / "r.json")
+        assert list(map(type, read.warnings)) == list(map(type, said))
+        assert verdict_of(read.warnings) == verdict_of(said)
+
+
+def test_gyroscopes_do_not_make_doubts_of_notes(record, imulab, tmp_path):
+    imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "20", "--hold", "3", "--order", "1")
+    imulab("tumble", "fit", "t.csv", "--order", "1", "-o", "t.json")  # gravity of the head: a note
+    imulab("tumble", "gyro", "t.csv", "--accel", "t.json", "-o", "g.json")
+    one, both = (il.load(tmp_path / name) for name in ("t.json", "g.json"))
+    noted = [w for w in one.warnings if w not in one.verdict.reasons]
+    assert noted
+    assert not set(noted) & set(both.verdict.reasons)
+
+
 def test_records_from_before_there_were_verdicts_are_judged_by_their_warnings(record):
     content = {key: value for key, value in record.to_dict().items() if key not in ("verdict", "content_sha256")}
     content["warnings"] = ["the head of the file is odd"]

@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -26,7 +26,7 @@ from imulab.jsontext import content_sha256, sealed_text
 from imulab.jsontext import json_text as json_text
 from imulab.printable import first_hidden, has_hidden, printable
 from imulab.recording import Source
-from imulab.verdict import UNJUDGED, Verdict, verdict_of
+from imulab.verdict import UNJUDGED, Verdict, as_judged, verdict_of
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
@@ -295,7 +295,7 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
     size = len(record.covariance.names)
     if len(record.covariance.matrix) != size or any(len(row) != size for row in record.covariance.matrix):
         raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
-    return record
+    return replace(record, warnings=as_judged(record.warnings, record.verdict))
 
 
 def plain_values(value: Any, where: str) -> Any:

@@ -51,6 +51,18 @@ def verdict_of(findings: Iterable[str]) -> Verdict:
     return Verdict("bad" if grave else "look" if doubtful else "good", tuple(map(str, grave + doubtful)))
 
 
+def as_judged(findings: Iterable[str], verdict: Verdict) -> tuple[str, ...]:
+    """Return findings, read back as plain texts, as what they were when they led to a verdict.
+
+    What is no reason is a `Note`; the first reason of a bad verdict is `Bad` (the others cannot be told apart).
+    """
+    worst = verdict.reasons[0] if verdict.state == "bad" and verdict.reasons else None
+    return tuple(
+        Bad(finding) if finding == worst else finding if finding in verdict.reasons else Note(finding)
+        for finding in findings
+    )
+
+
 def worse(first: Verdict, second: Verdict) -> Verdict:
     """Return the verdict on a result that two results make up."""
     order: tuple[State, ...] = ("good", "look", "bad")

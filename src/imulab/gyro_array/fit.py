@@ -89,7 +89,7 @@ def calibrate_array(
         raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
     _check_readings(still, elements)
     left_out = _leave_out(still, elements)
-    warnings = [f"{still.name}: {note}" for note in still.notes]
+    warnings = [type(note)(f"{still.name}: {note}") for note in still.notes]
     warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
     still, cut = _still_part(left_out, elements)
     warnings += cut
@@ -197,7 +197,7 @@ def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Al
     moving = left_out.recording
     readings = _si(moving, its)
     clipped = _clipped(readings)
-    notes = [f"{moving.name}: {note}" for note in moving.notes]
+    notes = [type(note)(f"{moving.name}: {note}") for note in moving.notes]
     notes += [type(note)(f"{moving.name}: {note}") for note in left_out.notes()]
     if clipped.any():
         notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
