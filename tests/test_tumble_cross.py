@@ -132,6 +132,14 @@ def test_what_cross_terms_do_not_go_with_is_refused(imulab):
         il.apply(replace(record, parameters=broken), table(np.ones((3, 3))))
 
 
+def test_a_record_with_cross_terms_is_not_checked():
+    record = fitted(unit(3), 2, sigma=1e-4, noise=1e-4, cross=True)
+    attitudes = il.find_attitudes(table(G * reference.random_attitudes(np.random.default_rng(4), 12), sigma=1e-4))
+    for limit in (None, 1e-3 * G):
+        with pytest.raises(RecordError, match="a record with cross terms cannot be checked"):
+            il.check_tumble(record, attitudes, limit=limit)
+
+
 def test_the_command_fits_and_shows_them(imulab, tmp_path):
     truth = unit(10, 1)
     rng = np.random.default_rng(3)

@@ -89,7 +89,7 @@ def check_tumble(
     Raises
     ------
     RecordError
-        The record is of another procedure, or states no uncertainties and there is no limit.
+        The record is of another procedure, has cross terms, or states no uncertainties and there is no limit.
     UnitError
         The attitudes' unit cannot be converted to the record's.
     OptionError
@@ -99,6 +99,8 @@ def check_tumble(
     """
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")
+    if record.model.get("cross"):
+        raise RecordError("a record with cross terms cannot be checked; expected one without, of the same attitudes")
     if limit is not None and not limit > 0:
         raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
     if limit is None and not record.covariance.names:
