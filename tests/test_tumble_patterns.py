@@ -87,3 +87,8 @@ def test_exact_data_have_no_pattern():
 
 def test_few_attitudes_tell_nothing():
     assert warned(np.random.default_rng(5), 15, sigma=10 * UG, cross=(1e-3, 0, 0))[0] == ""
+
+
+def test_no_order_is_asked_for_that_there_is_not():
+    direction, _ = warned(np.random.default_rng(6), 60, sigma=2 * UG, order=5, power=(6, 2e-3))
+    assert "--order 6" not in direction

@@ -18,7 +18,7 @@ import numpy as np
 from imulab.attitudes import Attitudes
 from imulab.estimate import f_test
 from imulab.recording import Array
-from imulab.tumble.model import AXES, CROSS_TERMS, MISALIGNMENTS
+from imulab.tumble.model import AXES, CROSS_TERMS, HIGHEST_ORDER, MISALIGNMENTS
 from imulab.tumble.solve import Problem, Solution, forces
 
 FALSE_ALARM = 0.01
@@ -97,7 +97,7 @@ def direction_findings(problem: Problem, solution: Solution, *, order_chosen: bo
         "cross": np.column_stack([x * x * y, y * y * z, z * z * x]),
         "other": np.column_stack([x * y * z, x**3 * y, y**3 * z, z**3 * x, x * y**3, y * z**3, z * x**3]),
     }
-    if not order_chosen:
+    if not order_chosen and problem.order < HIGHEST_ORDER:
         alike = [x**power, y**power, z**power] if problem.order else [x * y, z * x, z * y]
         groups["order"] = np.column_stack(alike)
     if problem.cross:
@@ -112,7 +112,7 @@ def direction_findings(problem: Problem, solution: Solution, *, order_chosen: bo
         return []
     unit, terms = "µg/g²", list(CROSS_TERMS)
     if likeliest == "order" and problem.order:
-        unit, terms = f"µg/g{'²³⁴⁵⁶'[power - 3]}", [f"k{power - 1}_{axis}" for axis in AXES]
+        unit, terms = f"µg/g{'²³⁴⁵'[power - 3]}", [f"k{power - 1}_{axis}" for axis in AXES]
     elif likeliest == "order":
         unit, terms = "µrad", [f"misalignment_{pair}" for pair in MISALIGNMENTS]
     sizes = ", ".join(
