@@ -21,6 +21,7 @@ from imulab.tables import tables_of
 from imulab.tumble.apply import apply_gyro, apply_tumble, beyond_test
 from imulab.units import from_si
 from imulab.warmup.apply import apply_warmup, record_table, unchanged
+from imulab.warmup.poweron import LATEST_START
 
 _FAR_IN_TEMPERATURE = 20.0
 
@@ -60,7 +61,7 @@ class Loaded:
 
 
 def loaded(
-    record: Calibration | Blob, name: str | None = None, *, again: bool = False, latest_start: float = 5.0
+    record: Calibration | Blob, name: str | None = None, *, again: bool = False, latest_start: float = LATEST_START
 ) -> Loaded:
     """Return a record (in double) or a blob (with its floats) ready to run.
 
