@@ -114,7 +114,7 @@ def main(wanted: list[str]) -> int:
                 print(f"{time.perf_counter() - begun:6.1f} s {scenario.group}: {line}", flush=True)
     minutes = (time.perf_counter() - started) / 60
     if not wanted:
-        parts = [HEAD.format(duration=f" ({minutes:.0f} minutes on two processors)")]
+        parts = [HEAD.format(minutes=minutes)]
         for group, lines in groups.items():
             parts.append(f"\n## {group}\n\n{TITLES}\n" + "\n".join(lines) + "\n")
         PAGE.write_text("".join(parts), encoding="utf-8")
