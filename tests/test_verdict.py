@@ -105,5 +105,6 @@ def test_show_and_the_report_begin_with_it(record, imulab, tmp_path, findings, s
 def test_a_fit_prints_it_first(imulab, tmp_path):
     imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "20", "--hold", "3", "--order", "1")
     done = imulab("tumble", "fit", "t.csv", "--order", "1", "-o", "t.json")  # no gravity given
+    assert done.stderr.startswith("imulab: note: gravity 9.80665 m/s^2 was taken from the head of t.csv")
     stored = json.loads((tmp_path / "t.json").read_text())["verdict"]
     assert done.stdout.startswith(f"{stored['state']}: ")

@@ -15,6 +15,7 @@ from imulab.printable import printable
 from imulab.texts import chosen as chosen
 from imulab.texts import quantity as quantity
 from imulab.texts import whole_number as whole_number
+from imulab.verdict import Note
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
@@ -164,10 +165,11 @@ def progress_bar(title: str, total: int | None) -> Iterator[Callable[[int], None
 
 
 def warn(message: str) -> None:
-    """Print one line on standard error, after what was held."""
+    """Print one line on standard error, after what was held; a `Note` is called one."""
     release()
     if message not in _released:
-        print(printable(f"imulab: warning: {message}"), file=sys.stderr)
+        kind = "note" if isinstance(message, Note) else "warning"
+        print(printable(f"imulab: {kind}: {message}"), file=sys.stderr)
 
 
 def release() -> None:
