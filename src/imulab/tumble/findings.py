@@ -21,7 +21,6 @@ from imulab.verdict import Note
 
 _SELDOM_MISSED = 6
 """Degrees of freedom at the highest order tested from which a knock is seldom missed."""
-_TO_MICRO = 1e6
 _NEGLIGIBLE = 0.01
 
 
