@@ -126,8 +126,8 @@ def test_a_column_without_a_unit_is_written_with_its_title():
     ],
 )
 def test_text_that_would_break_the_file_is_refused_or_made_to_fit(change):
-    before = make(2, **change)
     try:
+        before = make(2, **change)
         data = written(before)
     except ImulabError:
         return
