@@ -20,6 +20,7 @@ from imulab.runtime import Unit
 from imulab.tables import tables_of
 from imulab.tumble.apply import apply_gyro, apply_tumble, beyond_test
 from imulab.units import from_si
+from imulab.verdict import SENTENCES
 from imulab.warmup.apply import apply_warmup, record_table, unchanged
 from imulab.warmup.poweron import LATEST_START
 
@@ -200,6 +201,8 @@ def _missing_triad(record: Calibration | Blob, recording: Recording) -> list[str
 def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     """Return what a user should know about applying this record to this recording."""
     found = []
+    if isinstance(record, Calibration) and record.verdict.state == "bad":
+        found.append(f"the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     sensor = record.text["sensor"] if isinstance(record, Blob) else record.sensor
     mine, its = sensor.get("serial"), recording.metadata.get("serial")
     if mine and its and mine != its:

@@ -27,11 +27,11 @@ Model = Callable[[Array, Index], tuple[Array, Array]]
 _HUBER = 1.345
 """95 % efficiency for normal errors (Huber 1981)."""
 _MAX_DAMPING = 1e12
-_LEAST_DAMPING = 1e-12
 _NEAR = 100.0
 """Steps of so many tolerances are taken where the cost changes by no more than rounding."""
+_LEAST_DAMPING = 1e-12
 """Keeps combinations that nothing determines in place; slows no others."""
-_PEAK, _PEAK_PER_DEGREE = 0.25, 1 / 40
+_PEAK, _PEAK_FROM = 0.25, 10.0
 """Exponent b of the prior of an excess variance: the smaller, the more is thought of none."""
 _TOLD = 0.5  # degrees of freedom below which nothing is left to tell an excess from
 _EXCESSES = 64
@@ -295,7 +295,8 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     Returned are tau^2 at the mean of kappa, and ``2 mean^2 / variance`` of kappa, which Student's t of the same spread
     has. No test decides: the result goes from the observations' own variances (and a normal distribution) to their
     scatter (and its degrees of freedom) as the scatter grows. With b = 1/4 intervals of 95 % cover 96 to 97 % where
-    there is no excess and 92.5 to 95 % where there is one (from 9 degrees of freedom; b is less below 10).
+    there is no excess and 92.5 to 95 % where there is one. Below 10 degrees of freedom b
+    falls as their square, or intervals would be too wide where there is none; at 6 they cover 90 % where there is one.
 
     Parameters
     ----------
@@ -311,7 +312,7 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     """
     squares, freedom = residuals**2, spare.sum(axis=1)
     told, freedom = freedom >= _TOLD, np.maximum(freedom, _TOLD)
-    peak = np.minimum(_PEAK, freedom * _PEAK_PER_DEGREE)[:, None]
+    peak = _PEAK * (np.minimum(freedom / _PEAK_FROM, 1.0) ** 2)[:, None]
     reach = _REACH * np.sqrt(2 * freedom)
     typical = np.median(variance, axis=1)[:, None]
     first = np.maximum(excess_variance(residuals, variance, freedom + reach)[:, None], _LEAST_EXCESS * typical)

@@ -39,6 +39,7 @@ _POSSIBLE = (0.5, 50.0)
 """What the gravity of some place may be, m/s^2: a small moon's, twice Jupiter's."""
 _ON_EARTH = (9.76, 9.84)
 _ROUNDED = 1e-5
+_USELESS = 0.01
 """Half of the last digit, m/s^2, above which a stated value counts as rounded."""
 _TO_MICRO = 1e6
 
@@ -181,6 +182,11 @@ def stated_gravity(text: str, option: str) -> Gravity:
     if half <= _ROUNDED:
         return Gravity(value, "argument")
     uncertainty = half / math.sqrt(3)
+    if uncertainty > _USELESS * value:
+        raise OptionError(
+            f"{option} {text!r}: gravity to {100 * uncertainty / value:.0f} % makes no scale factor; expected the local "
+            "value in m/s^2, about 9.78 to 9.83 on Earth"
+        )
     return Gravity(
         value,
         "argument, rounded",

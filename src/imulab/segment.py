@@ -174,7 +174,11 @@ def find_attitudes(
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
         motion=_motion(held, moments, freedom, share),
-        notes=(*left_out.notes(_at_rest(stretches, len(time))), *_notes(blocks, variance)),
+        notes=(
+            *_corrected_notes(recording),
+            *left_out.notes(_at_rest(stretches, len(time))),
+            *_notes(blocks, variance),
+        ),
     )
 
 
@@ -200,7 +204,7 @@ def _table(recording: Recording, sensor: str, names: list[str], unit: str, tempe
         unit=unit,
         recording=recording,
         temperature=temperature,
-        notes=tuple(notes),
+        notes=(*_corrected_notes(recording), *notes),
     )
 
 
@@ -210,6 +214,14 @@ def _at_rest(stretches: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
     for start, stop, _ in stretches.tolist():
         rest[start:stop] = True
     return rest
+
+
+def _corrected_notes(recording: Recording) -> tuple[str, ...]:
+    return tuple(
+        f"the recording was corrected by {entry.rpartition(' sha256:')[0]}: what is found is what that left; expected "
+        "the recording as it was measured"
+        for entry in recording.corrected_by
+    )
 
 
 def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:

@@ -272,12 +272,15 @@ def compare(
             else arraytext.experiment(experiment, count, rows)
         )
         return
+    from imulab.cli.show import verdict_line
     from imulab.gyro_array.compare import compare_methods
     from imulab.readers import read
 
     record = None if calibration is None else _load(calibration, "--calibration")
     comparison = compare_methods(read(str(file), layout), calibration=record)
     arraytext.write(comparison.record, output, report)
+    if not json:
+        print(verdict_line(comparison.record.verdict))
     print(comparison.record.to_json().rstrip("\n") if json else arraytext.comparison(comparison))
     for name, what in ((output, "record"), (report, "report")):
         if name and not json:

@@ -8,6 +8,7 @@ import numpy as np
 
 from imulab.jsontext import json_text
 from imulab.tumble.figures import small_g
+from imulab.tumble.prior import FALSE_ALARM
 
 if TYPE_CHECKING:
     from imulab.attitudes import Attitudes
@@ -27,8 +28,11 @@ def as_text(check: Check, attitudes: Attitudes, record: str, file: str) -> str:
     ]
     if not check.passed:
         lines.append(
-            "the unit has changed since the record was made, or attitudes were disturbed: measure again, or "
-            f"'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the change"
+            "no change of the unit is shown; the limit is smaller than the uncertainty of the attitudes can tell"
+            if check.probability is not None and check.probability >= FALSE_ALARM
+            else "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed: "
+            f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
+            "change"
         )
     for index, value in enumerate(check.residuals.tolist()):
         beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""

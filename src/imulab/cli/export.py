@@ -31,6 +31,7 @@ def export(
     from imulab.exporters import EXPORTERS, ExportOptions
     from imulab.exporters import export as write
     from imulab.tables import tables_of
+    from imulab.verdict import SENTENCES
 
     if to not in EXPORTERS:
         raise OptionError(f"--to {to!r}: unknown target; known targets: {' '.join(EXPORTERS)}")
@@ -49,6 +50,9 @@ def export(
         for name, record in zip(records, loaded, strict=True):
             with naming(name):
                 tables_of(record)
+    for name, record in zip(records, loaded, strict=True):
+        if record.verdict.state == "bad":
+            warn(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     for file in write(to, loaded, output, options):
         print(f"{to}: {file}")
 

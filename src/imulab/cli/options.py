@@ -172,6 +172,12 @@ def warn(message: str) -> None:
         print(printable(f"imulab: {kind}: {message}"), file=sys.stderr)
 
 
+def note(message: str) -> None:
+    """Print one line on standard error that is worth knowing and no warning."""
+    release()
+    print(printable(f"imulab: note: {message}"), file=sys.stderr)
+
+
 def release() -> None:
     """Print the warnings held so far: the work went on."""
     for name in list(_held):

@@ -50,7 +50,7 @@ def run(
     )
     predicted = predicted_rows(plan.uncertainties(sigma))
     there = f" with the {plan.already} already there" if plan.already else ""
-    noise_text = f"{from_si(sigma * STANDARD_GRAVITY, 'ug'):g} µg"
+    noise_text = f"{from_si(sigma * STANDARD_GRAVITY, 'ug'):.4g} µg"
     lead = (
         f"{len(plan.directions)} attitudes{there} for order {plan.order}, criterion {criterion}: condition number "
         f"{plan.condition_number:.1f}, {np.degrees(turning(plan.directions)):.0f} deg of turning. Predicted for a "
@@ -98,7 +98,7 @@ def _noise(text: str | None) -> tuple[float, str]:
     if found.covariance is None:
         raise OptionError(f"{text}: a table without std_* columns does not say what noise its attitudes have")
     try:
-        return _noise_of(fit_tumble(found, order=1).calibration), f" (that of {text})"
+        return _noise_of(fit_tumble(found).calibration), f" (that of {text})"
     except ImulabError:  # too few for a fit: any direction and length are good enough for a noise
         up = found.mean / np.linalg.norm(found.mean, axis=1, keepdims=True)
         variance = np.einsum("ni,nij,nj->n", up, found.covariance, up) / (found.mean**2).sum(axis=1)

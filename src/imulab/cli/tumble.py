@@ -19,6 +19,7 @@ from imulab.cli.options import (
     Window,
     check_outputs,
     chosen,
+    note,
     progress_bar,
     quantity,
     read_recording,
@@ -28,6 +29,8 @@ from imulab.cli.options import (
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
+
+_WORST_CLOCK = 0.05
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -210,7 +213,15 @@ def finish(record: Calibration, output: str | None, report: str | None, *, json:
         if name:
             print(f"{what}: {name}")
     for message in record.warnings:
-        warn(message)
+        (warn if message in record.verdict.reasons else note)(message)
+
+
+def _clock(text: str) -> float:
+    """Return the clock's relative standard uncertainty; no crystal or oscillator is worse than a few percent."""
+    value = quantity(text, "--clock", "number", "ppm")
+    if value > _WORST_CLOCK:
+        raise OptionError(f"--clock {text!r}: expected at most {_WORST_CLOCK * 1e6:g}ppm; a bare number is a fraction")
+    return value
 
 
 def gyro(
@@ -252,7 +263,7 @@ def gyro(
     own = recording if accel_file is None else read_recording(accel_file, accel_layout or layout, {})
     result = fit_gyro(
         record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
-        clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
+        clock=_clock(clock), clock_of=clock_of,
     )  # fmt: skip
     finish(with_gyro(record, result, recording, own), output, report, json=json)
 

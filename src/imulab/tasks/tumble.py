@@ -96,7 +96,7 @@ def _spread(text: str | None, option: str) -> tuple[float, float] | None:
 
 def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     """Read a record that can be a prior for this recording."""
-    from imulab.tumble.checks import check_prior
+    from imulab.tumble.checks import check_prior, made_from
 
     record = access.record(file)
     try:
@@ -106,8 +106,7 @@ def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     unit, needed = recording.triad_unit("accel"), record.model["output_unit"]
     if unit != needed:
         raise RecordError(f"{file}: the prior has outputs in {needed}, {recording.name} in {unit}")
-    own = recording.source
-    if own is not None and own.sha256 in [source.sha256 for source in record.sources]:
+    if made_from(record, recording):
         raise DataError(f"{recording.name}: the prior {file} was made from this recording, which would count twice")
     return record
 

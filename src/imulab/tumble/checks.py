@@ -8,7 +8,7 @@ from imulab.attitudes import Attitudes, Motion
 from imulab.calibration import Calibration
 from imulab.errors import DataError, RecordError
 from imulab.estimate import median
-from imulab.recording import Array
+from imulab.recording import Array, Recording
 from imulab.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
 from imulab.tumble.solve import Solution
 from imulab.units import from_si, parse_unit, to_si
@@ -148,6 +148,17 @@ def check_fresh(residuals: Array, gravity: float, name: str) -> None:
             f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {found:.4g} m/s^2 under the "
             f"record, expected {gravity:.4g} m/s^2: a wrong unit, or a record of another unit?"
         )
+
+
+def made_from(record: Calibration, recording: Recording) -> bool:
+    """Return whether a record was made from samples of this recording, and not from another window of its file."""
+    source, time = recording.source, recording.time
+    if source is None or source.sha256 not in [made.sha256 for made in record.sources]:
+        return False
+    held = record.data.get("attitudes", {})
+    if time is None or not len(time) or not held:
+        return True
+    return any(b >= time[0] and a <= time[-1] for a, b in zip(held["start"], held["stop"], strict=True))
 
 
 def check_prior(record: Calibration) -> None:

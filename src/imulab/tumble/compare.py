@@ -13,7 +13,7 @@ from imulab.estimate import chi_square_probability, median
 from imulab.gravity import Gravity, local_gravity
 from imulab.recording import Array
 from imulab.tumble.apply import output_factor
-from imulab.tumble.checks import check_fresh
+from imulab.tumble.checks import check_fresh, made_from
 from imulab.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of, scatter
 from imulab.tumble.record import Scaling, scaled_parameters
@@ -119,8 +119,7 @@ def check_tumble(
     residuals = g * (norm[0] - 1 if motion is None else seen)
     check_fresh(residuals, g, attitudes.recording.name)
     notes = [*([local.note] if local.note else []), *said]
-    source = attitudes.recording.source
-    if source is not None and source.sha256 in [made.sha256 for made in record.sources]:
+    if made_from(record, attitudes.recording):
         notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
     if not record.covariance.names:
         return Check(residuals, None, None, None, local, limit, tuple(notes))

@@ -24,6 +24,7 @@ from imulab.tumble.checks import check_prior
 from imulab.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.tumble.record import Scaling, scaled_parameters, si_derivative
 from imulab.tumble.solve import Prior, Problem, Solution
+from imulab.verdict import Bad
 
 GROUPS = {"bias": slice(0, 3), "scale_factor": slice(3, 6), "misalignment": slice(6, 9)}
 """What ages, and where it stands among the parameters."""
@@ -36,6 +37,7 @@ _DETERMINED = 1e-6
 SCATTERED = 0.01
 FALSE_ALARM = 0.05
 _FEW = 9
+_IMPOSSIBLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -311,5 +313,14 @@ def findings(record: Calibration, aged: Aged, recording: Recording, count: int) 
             f"prior and attitudes contradict each other (p = {aged.probability:.2g}): the unit has changed since the "
             "prior was made, or attitudes were disturbed; the prior was widened as far as they ask (bias, scale factor"
             f"{', misalignment' if len(sizes) > 2 else ''}: {', '.join(sizes)}){few if count < _FEW else ''}"
+        )
+    residuals, variance = aged.solution.residuals[0], aged.solution.variance[0]
+    rms, times = float(np.sqrt(np.mean(residuals**2))), float(np.sqrt(np.mean(residuals**2 / variance)))
+    if chi_square_probability(float((residuals**2 / variance).sum()), len(residuals)) < _IMPOSSIBLE:
+        found.append(
+            Bad(
+                "no ageing of bias, scale factor and misalignment explains these attitudes: they miss the result by "
+                f"{1e6 * rms:.3g} µg rms, {times:.0f} times their uncertainty; fit without the prior"
+            )
         )
     return found
