@@ -90,3 +90,10 @@ def test_a_plan_for_the_noise_of_a_recording_takes_no_model_error_for_noise(run,
     noise = re.search(r"noise of ([\d.]+) µg in \|f\|", out)
     assert noise is not None
     assert 20 < float(noise[1]) < 60  # 0.7 mg in each of 500 samples; k2 leaves 690 µg at order 1
+
+
+@pytest.mark.parametrize(("option", "words"), [("--gravity=1g", "gravity to 29 %"), ("--gravity=10", "gravity to 3 %")])
+def test_a_gravity_that_is_hardly_known_is_refused(run, option, words):
+    status, _, said = run("tumble", "fit", "a.csv", option)
+    assert status == 2
+    assert words in said

@@ -224,5 +224,7 @@ def test_the_worst_temperature_is_what_the_gap_makes_of_a_bent_law() -> None:
     assert record.value("worst_temperature_error_gyro_x") / HOUR == pytest.approx(
         np.hypot(want, record.value("training_error_gyro_x") / HOUR), rel=0.1
     )
-    assert record.fit["curve_misfit"]["rms"][0][0] / HOUR > 0.01  # a cubic is no exponential, most of all at first
+    misfit = record.fit["curve_misfit"]["rms"]["gyro_x"]
+    assert misfit["unit"] == "rad/s"
+    assert misfit["value"][0] / HOUR > 0.01  # a cubic is no exponential, most of all at first
     assert exhibits_of(record).facts[2][0] == "at worst, near 15 °C"

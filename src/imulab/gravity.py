@@ -184,8 +184,8 @@ def stated_gravity(text: str, option: str) -> Gravity:
     uncertainty = half / math.sqrt(3)
     if uncertainty > _USELESS * value:
         raise OptionError(
-            f"{option} {text!r}: gravity to {100 * uncertainty / value:.0f} % makes no scale factor; expected the local "
-            "value in m/s^2, about 9.78 to 9.83 on Earth"
+            f"{option} {text!r}: gravity to {100 * uncertainty / value:.0f} % makes no scale factor; expected the "
+            "local value in m/s^2, about 9.78 to 9.83 on Earth"
         )
     return Gravity(
         value,

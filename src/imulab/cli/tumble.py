@@ -30,8 +30,6 @@ from imulab.cli.options import (
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
 
-_WORST_CLOCK = 0.05
-
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
@@ -216,14 +214,6 @@ def finish(record: Calibration, output: str | None, report: str | None, *, json:
         (warn if message in record.verdict.reasons else note)(message)
 
 
-def _clock(text: str) -> float:
-    """Return the clock's relative standard uncertainty; no crystal or oscillator is worse than a few percent."""
-    value = quantity(text, "--clock", "number", "ppm")
-    if value > _WORST_CLOCK:
-        raise OptionError(f"--clock {text!r}: expected at most {_WORST_CLOCK * 1e6:g}ppm; a bare number is a fraction")
-    return value
-
-
 def gyro(
     file: RecordingFile,
     accel: Annotated[str, typer.Option("--accel", metavar="RECORD", help="Tumble record of the accelerometers.")],
@@ -263,7 +253,7 @@ def gyro(
     own = recording if accel_file is None else read_recording(accel_file, accel_layout or layout, {})
     result = fit_gyro(
         record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
-        clock=_clock(clock), clock_of=clock_of,
+        clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
     )  # fmt: skip
     finish(with_gyro(record, result, recording, own), output, report, json=json)
 

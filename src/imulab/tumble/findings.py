@@ -73,6 +73,12 @@ def aside_warnings(found: Found, options: Mapping[str, Any]) -> list[str]:
         return []
     if options["method"] != "norm":
         return [Note("method linearised keeps every attitude: only method norm sets knocked ones aside")]
+    if options.get("cross"):
+        return [
+            Note(
+                "with cross terms every attitude is kept: a knocked one is not looked for (fit without --cross to see)"
+            )
+        ]
     aside = found.aside
     named = [
         f"{found.attitudes.label(index)} set aside: {1e3 * found.solution.residuals[0, index]:+.3f} mg "

@@ -182,7 +182,13 @@ def misfit(curves: Curves, table: Table) -> dict[str, Any]:
         white = curves.noise / np.maximum(seconds[k, inside], 1.0)[:, None]
         total += ((mean[k, inside] - z.T) ** 2 - white) * (seconds[k, inside] > 0)[:, None]
     rms = np.sqrt(np.maximum(total / len(curves.temperatures), 0.0))
-    return {"time": _numbers(middle[inside]), "rms": _numbers(rms.T), "unit": "s"}
+    return {
+        "time": {"value": _numbers(middle[inside]), "unit": "s"},
+        "rms": {
+            axis: {"value": _numbers(own), "unit": unit}
+            for axis, own, unit in zip(curves.axes, rms.T, curves.units, strict=True)
+        },
+    }
 
 
 def _numbers(values: Array) -> Any:
