@@ -40,7 +40,7 @@ def trial(seed: int, hand: Hand, word: str) -> Trial:
 
 def row(name: str, hand: Hand, word: str = "scatter less", trials: int = 60, **asked: Any) -> Scenario:
     """One scenario; the error is the mean of the three scale factors'."""
-    return Scenario("tumble, held", name, partial(trial, hand=hand, word=word), trials, unit="ppm", **asked)
+    return Scenario("Tumble: motion in a hold", name, partial(trial, hand=hand, word=word), trials, unit="ppm", **asked)
 
 
 SWAY = {f"sway of {d} degrees rms": Hand(sway=np.radians(d)) for d in (0.3, 0.5, 1.0)}

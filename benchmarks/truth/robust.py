@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from scenario import Scenario, Trial
 
-GROUP = "array fuse, robust"
+GROUP = "Gyro array: robust fusion"
 SIGMA = 0.05  # deg/s, white, of a usual gyro
 
 

@@ -97,25 +97,25 @@ FEW = 30
 SCENARIOS = [
     *(
         Scenario(
-            "tumble, logged", f"every 50th row: {name}", partial(tumble, fault=fault, every=50, step=0.0),
+            "Tumble: lost rows", f"every 50th row: {name}", partial(tumble, fault=fault, every=50, step=0.0),
             FEW, (93.0, 98.5), warned=95.0, largest_error=10.0, unit="ppm",
         )
         for name, fault in FAULTS.items()
     ),
     Scenario(
-        "tumble, logged", "every 10th row: zeros", partial(tumble, fault=zeros, every=10, step=0.0),
+        "Tumble: lost rows", "every 10th row: zeros", partial(tumble, fault=zeros, every=10, step=0.0),
         FEW, None, warned=95.0,
     ),
     *(
         Scenario(
-            "tumble, logged", f"steps of {1e3 * step:g} mg, nothing lost",
+            "Tumble: lost rows", f"steps of {1e3 * step:g} mg, nothing lost",
             partial(tumble, fault=nothing, every=50, step=step * G), FEW, None, false_alarms=5.0, unit="ppm",
         )
         for step in (6e-5, 1e-3, 4e-3)
     ),
     *(
         Scenario(
-            "array, logged", f"{command}: {'every 50th row zeros' if every else 'nothing lost'}",
+            "Arrays, Allan: lost rows", f"{command}: {'every 50th row zeros' if every else 'nothing lost'}",
             partial(array, command=command, every=every), 20, None,
             warned=95.0 if every else None, false_alarms=None if every else 5.0, largest_error=limit,
         )
