@@ -27,7 +27,7 @@ class Check:
     Attributes
     ----------
     residuals
-        |f| - g of each attitude under the record, m/s^2, shape (n,).
+        ``|f| - g`` of each attitude under the record, m/s^2, shape (n,).
     standard_uncertainty
         Of each, from the record's covariance and the attitude's noise, m/s^2, shape (n,); None where the record states
         no uncertainties.
@@ -38,7 +38,7 @@ class Check:
     gravity
         That was used.
     limit
-        Largest | |f| - g | that passes, m/s^2; None: the test alone decides.
+        Largest ``| |f| - g |`` that passes, m/s^2; None: the test alone decides.
     notes
         What a user must know of the test, a sentence each.
     """
@@ -72,8 +72,8 @@ def check_tumble(
 ) -> Check:
     """Test whether fresh attitudes contradict an existing record, without refitting.
 
-    ``r' (J V J' + C)^-1 r`` against chi-square, with r the residuals |f| - g under the record, J their derivatives by
-    its parameters, V its covariance and C the attitudes' noise. A record that holds fails once in twenty tests.
+    ``r' (J V J' + C)^-1 r`` against chi-square, with r the residuals ``|f| - g`` under the record, J their derivatives
+    by its parameters, V its covariance and C the attitudes' noise. A record that holds fails once in twenty tests.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def check_tumble(
     attitudes
         From `find_attitudes`. Where nothing is known of their noise, that of the record's own attitudes counts.
     limit
-        Largest | |f| - g | that passes, m/s^2, beside the test.
+        Largest ``| |f| - g |`` that passes, m/s^2, beside the test.
     gravity
         Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
 
