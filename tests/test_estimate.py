@@ -359,7 +359,7 @@ def test_the_plausible_excess_has_the_mean_precision_of_its_posterior(ratio, cou
     residuals *= np.sqrt(v * chi_square / (residuals**2).sum())
     spare = np.full((1, count), freedom / count)
     excess, effective = plausible_excess(residuals, np.full((1, count), v), spare)
-    b = min(0.25, freedom / 40)
+    b = min(0.25, freedom / 40, (freedom / 19) ** 2)
     # kappa = 1 - y^(1/b) takes the singularity at 1 away: a sum over equal steps of y.
     kappa = 1 - ((np.arange(400_000) + 0.5) / 400_000) ** (1 / b)
     density = stats.gamma.logpdf(kappa, freedom / 2, scale=2 / chi_square)

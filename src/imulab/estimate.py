@@ -31,7 +31,7 @@ _NEAR = 100.0
 """Steps of so many tolerances are taken where the cost changes by no more than rounding."""
 _LEAST_DAMPING = 1e-12
 """Keeps combinations that nothing determines in place; slows no others."""
-_PEAK, _PEAK_FROM = 0.25, 10.0
+_PEAK, _PER_DEGREE, _PER_SQUARE = 0.25, 40.0, 19.0
 """Exponent b of the prior of an excess variance: the smaller, the more is thought of none."""
 _TOLD = 0.5  # degrees of freedom below which nothing is left to tell an excess from
 _EXCESSES = 64
@@ -296,7 +296,8 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     has. No test decides: the result goes from the observations' own variances (and a normal distribution) to their
     scatter (and its degrees of freedom) as the scatter grows. With b = 1/4 intervals of 95 % cover 96 to 97 % where
     there is no excess and 92.5 to 95 % where there is one. Below 10 degrees of freedom b
-    falls as their square, or intervals would be too wide where there is none; at 6 they cover 90 % where there is one.
+    is less, and below 9 it falls as their square, or intervals would be too wide where there is none; at 6 they cover
+    90 % where there is one.
 
     Parameters
     ----------
@@ -312,7 +313,7 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     """
     squares, freedom = residuals**2, spare.sum(axis=1)
     told, freedom = freedom >= _TOLD, np.maximum(freedom, _TOLD)
-    peak = _PEAK * (np.minimum(freedom / _PEAK_FROM, 1.0) ** 2)[:, None]
+    peak = np.minimum(_PEAK, np.minimum(freedom / _PER_DEGREE, (freedom / _PER_SQUARE) ** 2))[:, None]
     reach = _REACH * np.sqrt(2 * freedom)
     typical = np.median(variance, axis=1)[:, None]
     first = np.maximum(excess_variance(residuals, variance, freedom + reach)[:, None], _LEAST_EXCESS * typical)

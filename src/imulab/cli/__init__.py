@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -69,7 +70,15 @@ def _main(arguments: Sequence[str] | None) -> int:
 def run() -> None:
     """Entry point of the installed command; a termination unwinds it, so that no part of a file stays behind."""
     signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(main())
+    status = main()
+    if status == _INTERRUPTED:
+        # Python ends by the signal itself, and not with this status, where an interrupt met the exec() of a text, as
+        # dataclasses have it while they are imported, even though it was handled here.
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def _terminate(number: int, frame: object) -> None:
