@@ -87,7 +87,10 @@ def test_a_tenth_of_a_second_is_no_reason_to_refuse_the_motion():
 
 def test_gaps_do_not_disturb_it():
     late = [0.0123, 0.0, 0.0, 0.0]
-    gaps = lambda time: (time % 5.0) > 0.3  # noqa: E731
+
+    def gaps(time):
+        return (time % 5.0) > 0.3
+
     sensing, (still, moving) = recordings(4, late, keep=gaps)
     record = il.calibrate_array(still, moving).calibration
     assert found_latency(record)[0] == pytest.approx(late, abs=1e-4)

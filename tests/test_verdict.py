@@ -11,7 +11,7 @@ from imulab.calibration import loads
 from imulab.errors import RecordError
 from imulab.jsontext import content_sha256
 from imulab.tumble.simulate import simulate_tumble
-from imulab.verdict import Bad, Note, Verdict, verdict_of, worse
+from imulab.verdict import Bad, Note, Verdict, verdict_of
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +32,6 @@ def record():
 def test_the_gravest_finding_decides(findings, expected):
     assert verdict_of(findings) == expected
     assert verdict_of(iter(findings)) == expected
-
-
-def test_two_results_are_as_good_as_the_worse_of_them():
-    look, bad = Verdict("look", ("a",)), Verdict("bad", ("b", "a"))
-    assert worse(look, bad) == worse(bad, look) == bad
-    assert worse(Verdict("good"), look) == look
 
 
 def test_a_record_keeps_its_verdict(record, tmp_path):

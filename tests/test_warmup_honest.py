@@ -99,7 +99,7 @@ def test_a_late_start_is_allowed_when_it_is_asked_for(folder: Path, capsys: Any)
     options = ["--latest-start", "30 s", "-o", str(out)]
     assert main(["apply", str(folder / "zero.json"), str(folder / "late.csv"), *options]) == 0
     z = evaluate(record_table(il.load(folder / "zero.json")), time, 3.0)
-    want = late.columns["gyro_x"] - z[0] / HOUR  # type: ignore[index]
+    want = late.columns["gyro_x"] - z[0] / HOUR
     np.testing.assert_allclose(il.read(out).column("gyro_x"), want, rtol=1e-9, atol=1e-9)
 
 
@@ -171,7 +171,7 @@ def test_a_stuck_gyro_a_pause_and_rows_of_zeros_are_said() -> None:
     assert [w for w in found.calibration.warnings if "exactly zero were left out" in w]
     clean = fit(model="exponential")
     time = np.linspace(0, 290, 30)
-    off = evaluate(found.table, time, 3.0) - evaluate(clean.table, time, 3.0)  # type: ignore[operator]
+    off = evaluate(found.table, time, 3.0) - evaluate(clean.table, time, 3.0)
     assert np.abs(off).max() < 1.5 * HOUR  # with the zeros in: 3 deg/h
     assert not [w for w in clean.calibration.warnings if "stuck" in w or "never" in w or "zero" in w]
 
@@ -184,7 +184,7 @@ def test_a_knock_that_fills_whole_bins_is_left_out_and_an_odd_cycle_is_named() -
     assert [w for w in found.calibration.warnings if "moved" in w and "cycle_1.csv (4 s, first at 99 s)" in w]
     clean = fit(good, model="exponential")
     time = np.linspace(0, 290, 30)
-    off = evaluate(found.table, time, -20.0) - evaluate(clean.table, time, -20.0)  # type: ignore[operator]
+    off = evaluate(found.table, time, -20.0) - evaluate(clean.table, time, -20.0)
     assert np.abs(off).max() < 0.5 * HOUR
     stepped = good[3].columns["gyro_y"] + 300.0 * (good[3].columns["time"] > 100)
     odd = fit([*good[:3], changed(good[3], gyro_y=stepped), *good[4:]], model="exponential").calibration

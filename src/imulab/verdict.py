@@ -61,10 +61,3 @@ def as_judged(findings: Iterable[str], verdict: Verdict) -> tuple[str, ...]:
         Bad(finding) if finding == worst else finding if finding in verdict.reasons else Note(finding)
         for finding in findings
     )
-
-
-def worse(first: Verdict, second: Verdict) -> Verdict:
-    """Return the verdict on a result that two results make up."""
-    order: tuple[State, ...] = ("good", "look", "bad")
-    graver, other = (first, second) if order.index(first.state) >= order.index(second.state) else (second, first)
-    return Verdict(graver.state, tuple(dict.fromkeys(graver.reasons + other.reasons)))

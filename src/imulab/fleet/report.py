@@ -24,7 +24,6 @@ from imulab.fleet.statistics import (
 from imulab.fleet.store import Store
 from imulab.fleet.work import Summary
 from imulab.report import render_page
-from imulab.verdict import verdict_of
 
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
@@ -61,7 +60,7 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
     ]
     write_text(
         output,
-        render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, verdict=verdict_of(_warnings(state))),
+        render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, notes=_warnings(state)),
     )
 
 
