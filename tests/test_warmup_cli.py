@@ -91,7 +91,7 @@ def test_apply_subtracts_the_curve_and_nothing_else(chamber, model, capsys):
 
 @pytest.mark.parametrize(
     "line",
-    [None, "# power_on_temperature: nan", "# power_on_temperature: 20.01", "# power_on_temperature: -20.01 degC"],
+    [None, "# power_on_temperature: nan", "# power_on_temperature: 21.01", "# power_on_temperature: -21.01 degC"],
 )
 def test_outside_the_table_nothing_is_written_and_one_line_says_why(chamber, tmp_path, line, capsys):
     file = with_head(chamber / "cycle_+0_1.csv", tmp_path / "r.csv", line)
@@ -133,8 +133,8 @@ def test_apply_refuses_what_it_cannot_correct(chamber, tmp_path, capsys):
     )
     untimed = write("untimed.csv", {k: v for k, v in columns.items() if k != "time"}, recording.units)
     assert "no column time" in refused(capsys, "apply", record, untimed)
-    fewer = write("fewer.csv", {k: v for k, v in columns.items() if k != "accel_y"}, recording.units)
-    assert "no column accel_y" in refused(capsys, "apply", record, fewer)
+    none = write("none.csv", {"time": columns["time"], "mag_x": columns["gyro_x"]}, {"time": "s", "mag_x": "uT"})
+    assert "no column gyro_x" in refused(capsys, "apply", record, none)
     bad = with_head(chamber / "cycle_+0_1.csv", tmp_path / "bad.csv", "# power_on_temperature: warm")
     assert "expected a temperature" in refused(capsys, "apply", record, bad, "-o", tmp_path / "o.csv")
     assert not (tmp_path / "o.csv").exists()
@@ -170,12 +170,12 @@ def test_the_table_goes_through_a_spreadsheet_to_the_last_bit(chamber, tmp_path,
         ("model: interval-cubic", "model: cubic", "'# model: cubic': expected one of interval-cubic"),
         ("settling_time: 300.0 s", "settling_time: five minutes", "settling_time"),
         ("exit: zero", "exit: later", "known rules: zero hold taper"),
-        ("gyro_x,rad/s", "gyro_x,mph", "line 7: unknown unit 'mph'"),
-        ("gyro_x,rad/s", "gyro_y,rad/s", "line 8: gyro_y at -20 to 0 degC appears twice"),
+        ("gyro_x,rad/s", "gyro_x,mph", "line 8: unknown unit 'mph'"),
+        ("gyro_x,rad/s", "gyro_y,rad/s", "line 9: gyro_y at -20 to 0 degC appears twice"),
         ("-20.0,0.0,gyro_x", "-20.0,-1.0,gyro_x", "no row for gyro_y"),
-        ("rad/s,", "rad/s,x", "line 7: expected a number, found 'x"),
-        ("-20.0,0.0,gyro_x,", "-20.0,0.0,gyro_x,,", "line 7: expected 8 fields, found 9"),
-        ("unit,c0,c1,c2,c3", "unit,c3,c2,c1,c0", "line 6: expected the titles from [degC],to [degC],axis,unit,c0,c1"),
+        ("rad/s,", "rad/s,x", "line 8: expected a number, found 'x"),
+        ("-20.0,0.0,gyro_x,", "-20.0,0.0,gyro_x,,", "line 8: expected 8 fields, found 9"),
+        ("unit,c0,c1,c2,c3", "unit,c3,c2,c1,c0", "line 7: expected the titles from [degC],to [degC],axis,unit,c0,c1"),
     ],
 )
 def test_a_damaged_spreadsheet_is_refused(chamber, tmp_path, old, new, words, capsys):

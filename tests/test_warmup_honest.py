@@ -60,6 +60,11 @@ def changed(recording: il.Recording, **columns: Any) -> il.Recording:
     return replace(recording, columns={**recording.columns, **columns})
 
 
+def with_temperature(recording: il.Recording, temperature: Any) -> il.Recording:
+    columns = {**recording.columns, "temperature": temperature}
+    return replace(recording, columns=columns, units={**recording.units, "temperature": "degC"})
+
+
 def refused(capsys: Any, folder: Path, recording: il.Recording, *options: str) -> str:
     il.write_csv(recording, folder / "in.csv")
     out = folder / "out.csv"
@@ -103,7 +108,7 @@ def test_a_late_start_is_allowed_when_it_is_asked_for(folder: Path, capsys: Any)
     np.testing.assert_allclose(il.read(out).column("gyro_x"), want, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("temperature", [None, "nan", "20.3", "-20.3"])
+@pytest.mark.parametrize("temperature", [None, "nan", "21.01", "-21.01"])
 def test_nothing_corrected_is_refused_and_says_why(folder: Path, capsys: Any, temperature: str | None) -> None:
     recording = cycle(0.0, 1)
     head = {} if temperature is None else {"power_on_temperature": temperature}
@@ -145,12 +150,106 @@ def test_hold_survives_record_and_spreadsheet(folder: Path, capsys: Any) -> None
         fit(beyond="later")
 
 
-def test_the_share_of_starts_beyond_the_edges_is_said_unless_they_are_held() -> None:
-    scattered = cycles(shift=0.3)
-    said = [w for w in fit(scattered).calibration.warnings if "began outside" in w]
-    assert said[0].startswith("2 of 6 power cycles (50 % of those at the outer temperatures) began outside -20 to 20")
-    assert not [w for w in fit(scattered, beyond="hold").calibration.warnings if "began outside" in w]
-    assert not [w for w in fit().calibration.warnings if "began outside" in w]
+@pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"])
+@pytest.mark.parametrize(("temperature", "edge"), [(-20.371, -20.0), (-21.0, -20.0), (20.9, 20.0), (5.0, 5.0)])
+def test_a_start_within_the_tolerance_of_an_outer_temperature_is_corrected_as_there(
+    tmp_path: Path, model: str, temperature: float, edge: float
+) -> None:
+    record = fit(model=model).calibration
+    start = cycle(temperature, 5)
+    z = evaluate(record_table(record), start.columns["time"], edge)
+    assert z is not None
+    want = start.columns["gyro_y"] - z[1] / HOUR
+    np.testing.assert_allclose(il.apply(record, start).column("gyro_y"), want, atol=1e-9)
+    (blob,) = export("blob", [record], tmp_path)
+    np.testing.assert_allclose(il.apply(load_any(blob), start).column("gyro_y"), want, atol=0.02)
+    np.testing.assert_allclose(evaluate(record_table(record), start.columns["time"], temperature), z)
+
+
+@pytest.mark.parametrize("temperature", [-21.01, 21.01, 60.0])
+def test_a_start_beyond_the_tolerance_is_not_corrected(temperature: float) -> None:
+    record = fit().calibration
+    start = cycle(temperature, 5)
+    np.testing.assert_array_equal(il.apply(record, start).column("gyro_y"), start.column("gyro_y"))
+    assert evaluate(record_table(record), start.columns["time"], temperature) is None
+
+
+def test_a_table_from_before_there_was_a_tolerance_ends_at_its_edges() -> None:
+    record = fit().calibration
+    table = {key: value for key, value in record.sections["table"].items() if key != "tolerance"}
+    old = replace(record, sections={"table": table})
+    start = cycle(-20.01, 5)
+    np.testing.assert_array_equal(il.apply(old, start).column("gyro_y"), start.column("gyro_y"))
+    inside = cycle(-20.0, 5)
+    np.testing.assert_allclose(il.apply(old, inside).column("gyro_y"), il.apply(record, inside).column("gyro_y"))
+
+
+def test_a_power_on_temperature_comes_from_the_column_when_that_is_asked_for(folder: Path, capsys: Any) -> None:
+    recording = cycle(3.0, 1, seconds=30000.0)  # several blocks, of which only the first knows the power-on
+    warming = 3.0 + np.minimum(recording.columns["time"] / 20, 12.0)
+    bare = replace(with_temperature(recording, warming), metadata={})
+    assert "no power_on_temperature" in refused(capsys, folder, bare)
+    out = folder / "column.csv"
+    command = ["apply", str(folder / "zero.json"), str(folder / "in.csv"), "-o", str(out), "--temperature-column"]
+    assert main(command) == 0
+    found, want = il.read(out), il.apply(il.load(folder / "zero.json"), recording)
+    np.testing.assert_allclose(found.column("gyro_x"), want.column("gyro_x"), rtol=1e-12, atol=1e-9)
+    assert found.metadata["power_on_temperature"] == "3.0"
+    assert "no reading in a column temperature" in refused(
+        capsys, folder, replace(cycle(3.0, 1), metadata={}), "--temperature-column"
+    )
+
+
+def test_a_power_on_temperature_of_the_head_counts_before_the_column(folder: Path) -> None:
+    recording = cycle(3.0, 1)
+    both = with_temperature(recording, np.full(len(recording), 19.0))
+    il.write_csv(both, folder / "both.csv")
+    out = folder / "both_out.csv"
+    assert (
+        main(["apply", str(folder / "zero.json"), str(folder / "both.csv"), "-o", str(out), "--temperature-column"])
+        == 0
+    )
+    want = il.apply(il.load(folder / "zero.json"), recording)
+    np.testing.assert_allclose(il.read(out).column("gyro_x"), want.column("gyro_x"), rtol=1e-12, atol=1e-9)
+
+
+def test_axes_that_a_recording_lacks_are_left_and_noted_once(folder: Path, capsys: Any) -> None:
+    recording = cycle(3.0, 1)
+    part = replace(recording, columns={k: v for k, v in recording.columns.items() if k != "gyro_y"})
+    il.write_csv(part, folder / "part.csv")
+    out = folder / "part_out.csv"
+    assert main(["apply", str(folder / "zero.json"), str(folder / "part.csv"), "-o", str(out)]) == 0
+    notes = [line for line in capsys.readouterr().err.splitlines() if "gyro_y" in line]
+    assert len(notes) == 1
+    assert notes[0].startswith("imulab: note: ")
+    assert "no gyro_y in it: " in notes[0]
+    want = il.apply(il.load(folder / "zero.json"), recording)
+    np.testing.assert_allclose(il.read(out).column("gyro_x"), want.column("gyro_x"), rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["interval-cubic", "knot-cubic"])
+def test_a_table_goes_out_and_comes_back_in_powers_of_seconds(tmp_path: Path, model: str) -> None:
+    record = fit(model=model).calibration
+    record.save(tmp_path / "r.json")
+    table, again = str(tmp_path / "t.csv"), str(tmp_path / "again.json")
+    assert main(["warmup", "table", str(tmp_path / "r.json"), "--per-second", "-o", table]) == 0
+    lines = [line for line in Path(table).read_text().splitlines() if not line.startswith("#")]
+    assert lines[0].endswith("axis,unit,c0,c1 [1/s],c2 [1/s^2],c3 [1/s^3]")
+    powers = np.array([float(cell) for cell in lines[1].split(",")[-4:]])  # the coldest row of gyro_x
+    at = 137.0
+    z = evaluate(record_table(record), np.array([at]), -20.0)
+    assert z is not None
+    assert powers @ at ** np.arange(4) == pytest.approx(z[0, 0], rel=1e-12)
+    assert main(["warmup", "table", table, "-o", again]) == 0
+    mine, its = il.load(again).sections["table"], record.sections["table"]
+    np.testing.assert_allclose(mine.pop("coefficients"), its["coefficients"], rtol=1e-14)
+    assert mine == {key: value for key, value in its.items() if key != "coefficients"}
+
+
+def test_only_cubics_in_time_have_powers_of_seconds(folder: Path, capsys: Any) -> None:
+    assert main(["warmup", "table", str(folder / "zero.json"), "--per-second", "-o", str(folder / "p.csv")]) == 2
+    assert "a table of model exponential has no powers of t" in capsys.readouterr().err
+    assert not (folder / "p.csv").exists()
 
 
 def test_a_stuck_gyro_a_pause_and_rows_of_zeros_are_said() -> None:

@@ -20,7 +20,7 @@ from imulab.runtime import Unit
 from imulab.tables import tables_of
 from imulab.tumble.apply import apply_gyro, apply_tumble, beyond_test
 from imulab.units import from_si
-from imulab.verdict import SENTENCES
+from imulab.verdict import SENTENCES, Note
 from imulab.warmup.apply import apply_warmup, record_table, unchanged
 from imulab.warmup.poweron import LATEST_START
 
@@ -195,7 +195,7 @@ def _missing_triad(record: Calibration | Blob, recording: Recording) -> list[str
     if not {"tumble", "gyro"} <= kinds or len(absent) != 1:
         return []
     (there,) = triads.keys() - set(absent)
-    return [f"{recording.name}: no {triads[absent[0]]} in it: its {triads[there]} alone are corrected"]
+    return [Note(f"{recording.name}: no {triads[absent[0]]} in it: its {triads[there]} alone are corrected")]
 
 
 def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
@@ -208,7 +208,18 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     if mine and its and mine != its:
         found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
     found += _missing_triad(record, recording)
-    messages = [message for columns in _warmup_columns(record) if (message := unchanged(columns, recording))]
+    messages = []
+    for columns in _warmup_columns(record):
+        there = [axis for axis in columns["axes"] if axis in recording]
+        if message := unchanged(columns, recording):
+            messages.append(message)
+        elif 0 < len(there) < len(columns["axes"]):
+            absent = [axis for axis in columns["axes"] if axis not in there]
+            messages.append(
+                Note(
+                    f"{recording.name}: no {' '.join(absent)} in it: {' '.join(there)} alone are corrected for warm-up"
+                )
+            )
     if isinstance(record, Blob) or record.procedure == "warmup":
         return [*found, *messages]
     made = record.model.get("temperature")

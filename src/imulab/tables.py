@@ -162,8 +162,13 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
     constants = np.zeros(3)
     if table["model"] == "exponential":
         constants[: len(table["time_constants"])] = table["time_constants"]
+    tolerance = float(table.get("tolerance", 0.0))
     if table.get("beyond", "zero") == "hold":
-        temperatures, coefficients, slopes = _held(table["model"], temperatures, coefficients, slopes)
+        reach = (_COLDEST, _HOTTEST)
+        temperatures, coefficients, slopes = _held(table["model"], temperatures, coefficients, slopes, reach)
+    elif tolerance:
+        reach = (float(temperatures[0]) - tolerance, float(temperatures[-1]) + tolerance)
+        temperatures, coefficients, slopes = _held(table["model"], temperatures, coefficients, slopes, reach)
     axes = list(table["axes"])
     rows = len(temperatures) - (table["model"] == "interval-cubic")
     terms = len(table["time_constants"]) if table["model"] == "exponential" else 4
@@ -193,16 +198,21 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
 
 
 def _held(
-    model: str, temperatures: Array, coefficients: Array, slopes: Array | None
+    model: str, temperatures: Array, coefficients: Array, slopes: Array | None, reach: tuple[float, float]
 ) -> tuple[Array, Array, Array | None]:
-    """Return a table that goes on as at its edges: outer intervals that reach further, or knots of the same value.
+    """Return a table that goes on as at its edges, as far as it is to reach, degC.
+
+    Outer intervals reach further, or there are outer knots of the same value.
 
     A unit needs no rule of its own for that. Slopes of exponential amplitudes end a hair beyond the outer knots.
     """
     low, high = float(temperatures[0]), float(temperatures[-1])
     if model == "interval-cubic":
-        return np.array([_COLDEST, *temperatures[1:-1], _HOTTEST]), coefficients, None
-    outside = ([_COLDEST], [_HOTTEST]) if slopes is None else ([_COLDEST, low - _HAIR], [high + _HAIR, _HOTTEST])
+        return np.array([reach[0], *temperatures[1:-1], reach[1]]), coefficients, None
+    hair = min(_HAIR, (low - reach[0]) / 2)
+    outside = ([reach[0]], [reach[1]])
+    if slopes is not None:
+        outside = ([reach[0], low - hair], [high + hair, reach[1]])
     count = len(outside[0])
     ends = [np.repeat(coefficients[[k]], count, axis=0) for k in (0, -1)]
     level = None if slopes is None else np.zeros_like(ends[0])

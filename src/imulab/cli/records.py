@@ -51,12 +51,20 @@ def apply(
         str,
         typer.Option("--latest-start", help="Refuse a recording that starts later after power-on (warm-up)."),
     ] = "5 s",
+    temperature_column: Annotated[
+        bool,
+        typer.Option(
+            "--temperature-column",
+            help="Take a missing power-on temperature from the first row's column temperature (warm-up).",
+        ),
+    ] = False,
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
     from imulab.applying import apply_blocks, loaded
     from imulab.blob import load_any
     from imulab.readers import read_blocks
+    from imulab.warmup.poweron import with_power_on_temperature
 
     if len(files) < 2:
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
@@ -83,6 +91,8 @@ def apply(
                 )
             )
     blocks = heard(read_blocks(file, layout, **part), notes=False)
+    if temperature_column:
+        blocks = with_power_on_temperature(blocks)
     write_out(apply_blocks(chain, _warned(records, blocks)), output)
 
 

@@ -17,6 +17,7 @@ from imulab.cli.options import (
     Topic,
     Window,
     check_outputs,
+    naming,
     quantity,
     warn,
     whole_number,
@@ -201,6 +202,9 @@ def fit(
 def table(
     file: Annotated[str, typer.Argument(metavar="RECORD|TABLE.csv", help="Record, or table to make a record of.")],
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Table (.csv) or record to write.")],
+    per_second: Annotated[
+        bool, typer.Option("--per-second", help="Write cubics in powers of t in s, not of t / settling time.")
+    ] = False,
 ) -> None:
     """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
     from imulab.blob import is_blob
@@ -211,7 +215,8 @@ def table(
 
     check_outputs([output], [file])
     if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason
-        text = write_table(load(file))
+        with naming(file):
+            text = write_table(load(file), per_second=per_second)
         if not output.lower().endswith(".csv"):
             raise OptionError(f"{output}: expected a name that ends in .csv")
         write_text(output, text)
@@ -219,6 +224,8 @@ def table(
         return
     if output.lower().endswith(".csv"):
         raise OptionError(f"{output}: a table makes a record; expected a name such as unit.json")
+    if per_second:
+        raise OptionError(f"{file}: --per-second writes a table; how a table that is read counts, its titles say")
     record_of_table(read_table(file), file).save(output)
     print(f"record: {output}")
 

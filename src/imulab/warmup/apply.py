@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ _PIECE = 32768  # samples at a time: their ticks stay in the cache
 
 
 def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
-    """Return the recording with ``output - Z(t; T)`` in the axes of the record, their units kept.
+    """Return the recording with ``output - Z(t; T)`` in those axes of the record that it has, their units kept.
 
     `t` is the column time, counted from power-on; `T` is ``power_on_temperature`` of the head of the file. Without it,
     or outside the table, the recording passes unchanged (`unchanged` says why).
@@ -32,12 +32,14 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     UnitError
         A column's unit cannot be converted to the record's.
     DataError
-        The recording lacks time or an axis of the record; its time does not count from power-on, does not rise or is
+        The recording lacks time or every axis of the record; its time does not count from power-on, does not rise or is
         of another unit.
     """
-    factors = []
+    factors, there = [], present_axes(columns, recording)
     for axis, made_in in zip(columns["axes"], columns["units"], strict=True):
-        recording.column(axis)
+        if axis not in there:
+            factors.append(1.0)
+            continue
         try:
             factors.append(conversion_factor(made_in, recording.units[axis]))
         except UnitError:
@@ -52,20 +54,36 @@ def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     if temperature is None or unchanged(columns, recording) is not None:
         return recording
     tick = _TICK if columns["end"] < _LONG else _LONG_TICK
-    axes = list(columns["axes"])
-    given = [recording.columns[axis] for axis in axes]
-    corrected = [np.empty(len(recording)) for _ in axes]
+    given = [recording.columns[axis] if axis in there else None for axis in columns["axes"]]
+    corrected = [None if column is None else np.empty(len(recording)) for column in given]
     buffer = np.empty(min(_PIECE, len(recording)))
     for start in range(0, len(recording), _PIECE):
         piece = slice(start, start + _PIECE)
         ticks = _ticks(time[piece], tick, buffer)
-        into = [column[piece] for column in corrected]
-        _, active = unit.warmup(
-            temperature, tick, ticks, [column[piece] for column in given], factors=factors, into=into
-        )
+        into = _parts(corrected, piece)
+        _, active = unit.warmup(temperature, tick, ticks, _parts(given, piece), factors=factors, into=into)
         if not active:
             return recording
-    return recording.with_columns(dict(zip(axes, corrected, strict=True)), {})
+    found = zip(columns["axes"], corrected, strict=True)
+    return recording.with_columns({axis: column for axis, column in found if column is not None}, {})
+
+
+def present_axes(columns: Mapping[str, Any], recording: Recording) -> list[str]:
+    """Return the axes of a table that a recording has.
+
+    Raises
+    ------
+    DataError
+        It has none of them.
+    """
+    there = [axis for axis in columns["axes"] if axis in recording]
+    if not there:
+        recording.column(columns["axes"][0])  # says what was expected and what was found
+    return there
+
+
+def _parts(columns: Sequence[Array | None], piece: slice) -> list[Array | None]:
+    return [None if column is None else column[piece] for column in columns]
 
 
 def _checked(recording: Recording, latest: float) -> Array:

@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
 from imulab.recording import Array, Recording, Source, check_finite, check_time
-from imulab.units import conversion_factor, parse_unit, to_si
-from imulab.warmup.poweron import LATEST_START, check_clock, check_start, head_temperature, power_on_temperature
+from imulab.units import conversion_factor, parse_unit
+from imulab.warmup.poweron import (
+    LATEST_START,
+    check_clock,
+    check_start,
+    first_reading,
+    head_temperature,
+    power_on_temperature,
+)
 
 BIN = 1.0
 """Width of a bin, s."""
@@ -140,7 +147,7 @@ def find_power_cycle(
     pieces: list[tuple[np.ndarray, Array, Array]] = []
     head: Recording | None = None
     axes: tuple[str, ...] = ()
-    temperature, first, last, first_reading, zeros = np.nan, 0.0, -np.inf, None, 0
+    temperature, first, last, reading, zeros = np.nan, 0.0, -np.inf, None, 0
     for block in blocks:
         time = check_time(block)
         if not time.size:
@@ -148,8 +155,8 @@ def find_power_cycle(
         if head is None:
             head = block
             axes = _axes(block)
-            first, first_reading = float(time[0]), _first_reading(block)
-            temperature = _power_on(block, temperature_from_column, first_reading)
+            first, reading = float(time[0]), first_reading(block)
+            temperature = _power_on(block, temperature_from_column, reading)
             check_start(block, first, latest_start)
             check_clock(block, time)
         elif time[0] <= last:
@@ -180,7 +187,7 @@ def find_power_cycle(
         last=last,
         name=head.name,
         serial=head.metadata.get("serial"),
-        first_reading=first_reading,
+        first_reading=reading,
         chamber=_chamber(head),
         source=source or head.source,
         sensor_model=head.metadata.get("model"),
@@ -206,21 +213,12 @@ def _si_unit(recording: Recording, axis: str) -> str:
     return _SI.get(unit.quantity, unit.symbol)
 
 
-def _first_reading(recording: Recording) -> float | None:
-    """First finite value of the column temperature, degC."""
-    if "temperature" not in recording or parse_unit(recording.units["temperature"]).quantity != "temperature":
-        return None
-    values = recording.column("temperature")
-    finite = values[np.isfinite(values)]
-    return to_si(float(finite[0]), recording.units["temperature"]) if finite.size else None
-
-
-def _power_on(recording: Recording, from_column: bool, first_reading: float | None) -> float:
+def _power_on(recording: Recording, from_column: bool, reading: float | None) -> float:
     stated = power_on_temperature(recording)
     if stated is not None and np.isfinite(stated):
         return stated
-    if from_column and first_reading is not None:
-        return first_reading
+    if from_column and reading is not None:
+        return reading
     found = "no power_on_temperature in the head of the file" if stated is None else "power_on_temperature is nan"
     raise DataError(f"{recording.name}: {found}; expected a line such as '# power_on_temperature: -20'")
 

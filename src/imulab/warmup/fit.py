@@ -135,7 +135,7 @@ def fit_warmup(
     ]
     chosen = choose(curves, rows)
     covariance = _covariance(curves, chosen, by_unit)
-    table = chosen.table.with_rules(exit_rule, taper_time, beyond)
+    table = chosen.table.with_rules(exit_rule, taper_time, beyond, tolerance)
     record = make_record(
         curves=curves,
         rows=rows,

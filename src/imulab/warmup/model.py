@@ -55,6 +55,8 @@ class Table:
         Derivatives of the amplitudes by temperature at the knots, 1/K, shape of `coefficients` (``exponential``).
     beyond
         At power-on temperatures beyond the outer ones: ``zero``, no correction; ``hold``, that of the outer one.
+    tolerance
+        Beyond the outer temperatures by no more than this, K, the correction is that of the outer one in either case.
     """
 
     model: str
@@ -69,6 +71,7 @@ class Table:
     time_constants: tuple[float, ...] = ()
     slopes: Array | None = None
     beyond: str = "zero"
+    tolerance: float = 0.0
 
     @property
     def scales(self) -> tuple[float, ...]:
@@ -95,14 +98,17 @@ class Table:
         section["taper_time"] = self.taper_time
         if self.beyond != "zero":
             section["beyond"] = self.beyond
+        if self.tolerance:
+            section["tolerance"] = self.tolerance
         return section
 
     def coefficients_at(self, temperature: float) -> Array | None:
         """Return the coefficients at a power-on temperature, shape (axes, p); None outside the table or for NaN."""
         edges = self.temperatures
-        if self.beyond == "hold":
-            temperature = float(np.clip(temperature, edges[0], edges[-1]))
-        if not edges[0] <= temperature <= edges[-1]:
+        if self.beyond != "hold" and not edges[0] - self.tolerance <= temperature <= edges[-1] + self.tolerance:
+            return None
+        temperature = float(np.clip(temperature, edges[0], edges[-1]))
+        if np.isnan(temperature):
             return None
         row = min(int(np.searchsorted(edges, temperature, side="right")) - 1, len(edges) - 2)
         c = self.coefficients
@@ -117,9 +123,9 @@ class Table:
         turns = s * (1 - s) ** 2 * self.slopes[row] - s * s * (1 - s) * self.slopes[row + 1]
         return np.asarray(ends + width * turns)
 
-    def with_rules(self, rule: str, taper_time: float, beyond: str) -> Table:
-        """Return the table with another exit rule, and another rule beyond its temperatures."""
-        return replace(self, exit=rule, taper_time=taper_time, beyond=beyond)
+    def with_rules(self, rule: str, taper_time: float, beyond: str, tolerance: float) -> Table:
+        """Return the table with another exit rule, and another rule and tolerance beyond its temperatures."""
+        return replace(self, exit=rule, taper_time=taper_time, beyond=beyond, tolerance=tolerance)
 
 
 def evaluate(table: Table, time: Array, temperature: float) -> Array | None:
@@ -181,6 +187,7 @@ def table_from(section: Mapping[str, Any]) -> Table:
             exit=str(section["exit"]),
             taper_time=float(section.get("taper_time", 60.0)),
             beyond=str(section.get("beyond", "zero")),
+            tolerance=float(section.get("tolerance", 0.0)),
             time_scale=float(section["time_scale"]) if model == "knot-log-cubic" else None,
             time_constants=tuple(map(float, section["time_constants"])) if model == "exponential" else (),
             slopes=np.array(section["slopes"], dtype=np.float64) if model == "exponential" else None,
@@ -221,6 +228,7 @@ def check_table(table: Table) -> None:
         ),
         (not np.isfinite(table.coefficients).all(), "coefficients that are not finite"),
         (not 0 < table.settling_time < np.inf, f"settling_time {table.settling_time:g}; expected more than 0"),
+        (not 0 <= table.tolerance < np.inf, f"tolerance {table.tolerance:g}; expected 0 or more"),
         (not 0 < table.taper_time < np.inf, f"taper_time {table.taper_time:g}; expected more than 0"),
         (
             table.time_scale is not None and not 0 < table.time_scale < np.inf,

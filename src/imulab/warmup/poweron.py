@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -64,6 +66,38 @@ def power_on_temperature(recording: Recording) -> float | None:
         It is there, but no temperature.
     """
     return head_temperature(recording, "power_on_temperature")
+
+
+def first_reading(recording: Recording) -> float | None:
+    """Return the first finite value of the column temperature, degC, or None where there is none."""
+    if "temperature" not in recording or parse_unit(recording.units["temperature"]).quantity != "temperature":
+        return None
+    values = recording.column("temperature")
+    finite = values[np.isfinite(values)]
+    return to_si(float(finite[0]), recording.units["temperature"]) if finite.size else None
+
+
+def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording]:
+    """Pass blocks on; where the head states no power-on temperature, the first reading of the first block stands in.
+
+    Raises
+    ------
+    DataError
+        Neither the head nor the column temperature of the first block holds one.
+    """
+    found: float | None = None
+    for block in blocks:
+        stated = power_on_temperature(block)
+        if stated is not None and math.isfinite(stated):
+            yield block
+            continue
+        found = first_reading(block) if found is None else found
+        if found is None:
+            raise DataError(
+                f"{block.name}: no power_on_temperature in the head of the file, and no reading in a column "
+                "temperature to take its place"
+            )
+        yield replace(block, metadata={**block.metadata, "power_on_temperature": f"{found!r}"})
 
 
 def head_temperature(recording: Recording, key: str) -> float | None:

@@ -46,7 +46,7 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
     ]
 
 
-def expectations(curves: Curves, chosen: Judged, worst: Worst | None, beyond: str) -> list[str]:
+def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[str]:
     """Return what a unit in use has to expect of a table, beyond what the tests show of it."""
     found: list[str] = []
     stated = chosen.left_temperature
@@ -59,18 +59,6 @@ def expectations(curves: Curves, chosen: Judged, worst: Worst | None, beyond: st
             Note(
                 f"at the worst power-on temperature, near {worst.temperature:.3g} degC, expect {' and '.join(said)} "
                 "rms, more than the temperatures left out of the fit show: measure there"
-            )
-        )
-    low, high = curves.temperatures[[0, -1]]
-    outside = (curves.power_on < low) | (curves.power_on > high)
-    if beyond == "zero" and outside.any():
-        edge = np.isin(curves.group, (0, len(curves.temperatures) - 1))
-        share = 100 * outside.sum() / edge.sum()
-        found.append(
-            Note(
-                f"{int(outside.sum())} of {len(outside)} power cycles ({share:.0f} % of those at the outer "
-                f"temperatures) began outside {low:g} to {high:g} degC: such starts get no correction in use, unless "
-                "--beyond hold goes on as at the edges"
             )
         )
     return found

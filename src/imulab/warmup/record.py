@@ -76,7 +76,7 @@ def make_record(
         data=_data(curves),
         sensor=sensor,
         sources=tuple(cycle.source for cycle in curves.cycles if cycle.source is not None),
-        warnings=(*quality_warnings(curves, chosen, settled), *expectations(curves, chosen, worst, table.beyond)),
+        warnings=(*quality_warnings(curves, chosen, settled), *expectations(curves, chosen, worst)),
         sections={"table": table.to_section()},
     )
 

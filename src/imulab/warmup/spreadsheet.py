@@ -11,23 +11,27 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import ReadError, RecordError, UnitError
+from imulab.errors import OptionError, ReadError, RecordError, UnitError
 from imulab.units import conversion_factor, parse_unit
 from imulab.warmup.apply import record_table
 from imulab.warmup.model import MODELS, Table, check_table
 from imulab.warmup.solve import amplitude_slopes
 
-_KEYS = ("model", "settling_time", "exit", "taper_time", "time_scale", "time_constants", "beyond", "serial")
+_CUBIC = ("interval-cubic", "knot-cubic")
 _SI = {"rate": "rad/s", "acceleration": "m/s^2"}
 
 
-def write_table(record: Calibration) -> str:
+def write_table(record: Calibration, *, per_second: bool = False) -> str:
     """Return the table of a record as CSV: settings as ``# key: value``, then a row per interval or knot and axis.
+
+    Coefficients of cubics are of powers of ``t / T_M``; `per_second`: of powers of t in s, which the titles say.
 
     Raises
     ------
     RecordError
         The record is no warm-up record.
+    OptionError
+        The table is no cubic in t, which has no powers of t.
     """
     if record.procedure != "warmup":
         raise RecordError(f"a {record.procedure} record has no warm-up table")
@@ -41,30 +45,41 @@ def write_table(record: Calibration) -> str:
     }
     if table.beyond != "zero":
         settings["beyond"] = table.beyond
+    if table.tolerance:
+        settings["tolerance"] = f"{table.tolerance!r} K"
     if table.time_scale is not None:
         settings["time_scale"] = f"{table.time_scale!r} s"
     if table.time_constants:
         settings["time_constants"] = " ".join(map(repr, table.time_constants)) + " s"
     if "serial" in record.sensor:
         settings["serial"] = record.sensor["serial"]
-    titles = _titles(table.model, table.coefficients.shape[2])
+    coefficients = table.coefficients
+    if per_second:
+        if table.model not in _CUBIC:
+            raise OptionError(
+                f"per-second: a table of model {table.model} has no powers of t; expected one of {' '.join(_CUBIC)}"
+            )
+        coefficients = coefficients / table.settling_time ** np.arange(4)
+    titles = _titles(table.model, table.coefficients.shape[2], per_second)
     lines = [f"# {key}: {value}" for key, value in settings.items()] + [",".join(titles)]
     edges = table.temperatures.tolist()
-    for r, block in enumerate(table.coefficients.tolist()):
+    for r, block in enumerate(coefficients.tolist()):
         place = edges[r : r + 2] if interval else edges[r : r + 1]
         for axis, unit, row in zip(table.axes, table.units, block, strict=True):
             lines.append(",".join([*map(repr, place), axis, unit, *map(repr, row)]))
     return "\n".join(lines) + "\n"
 
 
-def _titles(model: str, size: int) -> list[str]:
+def _titles(model: str, size: int, per_second: bool = False) -> list[str]:
     places = ["from [degC]", "to [degC]"] if model == "interval-cubic" else ["temperature [degC]"]
     terms = [f"A{j + 1}" if model == "exponential" else f"c{j}" for j in range(size)]
+    if per_second:
+        terms = ["c0", "c1 [1/s]", "c2 [1/s^2]", "c3 [1/s^3]"]
     return [*places, "axis", "unit", *terms]
 
 
 def read_table(path: str | Path) -> tuple[Table, str | None]:
-    """Read a table from CSV as `write_table` makes it, and the serial number in its head.
+    """Read a table from CSV as `write_table` makes it in either form, and the serial number in its head.
 
     The unit of a row may be any of its kind (deg/h for a rate); it is converted. Slopes of exponential amplitudes
     are computed anew.
@@ -110,7 +125,8 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     lead = 2 if interval else 1
     number, titles = rows[0]
     expected = _titles(model, size)
-    if titles != expected:
+    per_second = model in _CUBIC and titles == _titles(model, size, True)
+    if titles != expected and not per_second:
         raise ReadError(f"{path}: line {number}: expected the titles {','.join(expected)}, found {','.join(titles)}")
     units: dict[str, str] = {}
     found: dict[tuple[float, ...], dict[str, list[float]]] = {}
@@ -145,6 +161,9 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     else:
         temperatures = np.array([at[0] for at in order])
     values = np.array([[found[at][axis] for axis in units] for at in order])
+    settling_time = _seconds(path, settings, "settling_time")[0]
+    if per_second:
+        values = values * settling_time ** np.arange(4)
     slopes = None
     if model == "exponential" and len(temperatures) > 1:
         slopes = amplitude_slopes(temperatures, values, constants)
@@ -154,9 +173,10 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
         axes=tuple(units),
         units=tuple(units.values()),
         coefficients=values,
-        settling_time=_seconds(path, settings, "settling_time")[0],
+        settling_time=settling_time,
         exit=settings.get("exit", "zero"),
         beyond=settings.get("beyond", "zero"),
+        tolerance=_numbers(path, settings, "tolerance", "K")[0] if "tolerance" in settings else 0.0,
         taper_time=_seconds(path, settings, "taper_time")[0] if "taper_time" in settings else 60.0,
         time_scale=_seconds(path, settings, "time_scale")[0] if model == "knot-log-cubic" else None,
         time_constants=constants,
@@ -165,13 +185,17 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
 
 
 def _seconds(path: str, settings: dict[str, str], key: str) -> list[float]:
+    return _numbers(path, settings, key, "s")
+
+
+def _numbers(path: str, settings: dict[str, str], key: str, unit: str) -> list[float]:
     text = settings.get(key, "")
     try:
-        values = [float(part) for part in text.removesuffix("s").split()]
+        values = [float(part) for part in text.removesuffix(unit).split()]
     except ValueError:
         values = []
     if not values:
-        raise ReadError(f"{path}: '# {key}: {text}': expected a number of seconds")
+        raise ReadError(f"{path}: '# {key}: {text}': expected a number of {'seconds' if unit == 's' else unit}")
     return values
 
 
