@@ -358,7 +358,7 @@ FOG = '[columns]\nfog = { from = 0, unit = "V" }\n'
 LAYOUTS = {
     "unknown key": (
         'delimeter = ","\n' + COLUMNS,
-        "unknown key 'delimeter'; known keys: columns delimiter header",
+        "unknown key 'delimeter' (did you mean 'delimiter'?); known keys: columns delimiter header",
     ),
     "delimiter": ('delimiter = "|"\n' + COLUMNS, "delimiter '|'; expected 'whitespace' ',' ';' or a tab"),
     "delimiters": ('delimiter = [","]\n' + COLUMNS, "delimiter [',']; expected 'whitespace' ',' ';' or a tab"),
@@ -369,7 +369,10 @@ LAYOUTS = {
     "metadata": ("metadata = 3\n" + COLUMNS, "metadata = 3; expected a table"),
     "two times": ("sample_rate = 100\n" + COLUMNS, "both a time column and sample_rate; expected one of them"),
     "no unit": ("[columns]\naccel_x = { from = 1 }\n", "column accel_x: expected accel_x = { from = 1, unit ="),
-    "column key": ('[columns]\nfog = { from = 0, unit = "V", scale = 2 }\n', "column fog: unknown key 'scale'"),
+    "column key": (
+        '[columns]\nfog = { from = 0, unit = "V", scal = 2 }\n',
+        "column fog: unknown key 'scal' (did you mean 'scale'?); known keys: from unit scale zero scale_factor",
+    ),
     "from": ('[columns]\nfog = { from = -1, unit = "V" }\n', "column fog: from = -1; expected a column number from 0"),
     "rate unit": ('sample_rate = { value = 1, unit = "kHz" }\n' + FOG, "sample_rate: expected { value = 100, unit ="),
     "rate 0": ("sample_rate = 0\n" + FOG, "sample_rate: expected a positive number of Hz, found 0"),

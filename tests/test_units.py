@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imulab.errors import UnitError
-from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_scale_factor, parse_unit, to_si
 
 # What one of each unit is in SI (SI brochure, 9th edition, tables 1, 4, 7 and 8; IAU: 1 arcsec = pi/648000 rad; gravity
 # 3rd CGPM 1901; 0 degC = 273.15 K). The digits of pi/180 and pi/648000 are OEIS A019685 and A209538.
@@ -16,6 +16,9 @@ ONE = {
     "s": 1.0,
     "ms": 0.001,
     "us": 0.000001,
+    "ns": 0.000000001,
+    "min": 60.0,
+    "h": 3600.0,
     "m/s^2": 1.0,
     "g": 9.80665,
     "mg": 0.00980665,
@@ -28,9 +31,14 @@ ONE = {
     "rad/s": 1.0,
     "deg/s": 0.017453292519943295769,
     "deg/h": 0.0000048481368110953599359,
+    "mrad/s": 0.001,
+    "mdeg/s": 0.000017453292519943295769,
+    "deg/min": 0.00029088820866572159616,
     "degC": 1.0,
     "count": 1.0,
     "V": 1.0,
+    "mV": 1.0,
+    "pulse/s": 1.0,
     "count/(deg/s)": 57.295779513082320877,
     "V/(deg/s)": 57.295779513082320877,
     "m": 1.0,
@@ -39,10 +47,10 @@ ONE = {
     "ppm": 0.000001,
 }
 QUANTITIES = {
-    "time": ["s", "ms", "us"],
+    "time": ["s", "ms", "us", "ns", "min", "h"],
     "acceleration": ["m/s^2", "g", "mg", "ug"],
     "angle": ["rad", "mrad", "urad", "deg", "arcsec"],
-    "rate": ["rad/s", "deg/s", "deg/h"],
+    "rate": ["rad/s", "mrad/s", "deg/s", "mdeg/s", "deg/min", "deg/h"],
     "temperature": ["degC", "K"],
     "length": ["m"],
     "frequency": ["Hz"],
@@ -78,7 +86,7 @@ def test_arrays_are_converted_as_their_elements():
     assert from_si(values, "mg").tolist() == [from_si(value, "mg") for value in values.tolist()]
 
 
-@pytest.mark.parametrize("symbol", ["count", "V", "m/s^2", "rad/s", "degC", "s"])
+@pytest.mark.parametrize("symbol", ["count", "V", "mV", "pulse/s", "m/s^2", "rad/s", "degC", "s"])
 def test_counts_volts_and_si_keep_every_bit(symbol):
     values = np.random.default_rng(1).standard_normal(100)
     assert to_si(values, symbol).tobytes() == values.tobytes()
@@ -104,6 +112,8 @@ def test_a_unit_converts_to_itself_by_exactly_one(symbol):
         ("g", "count"),
         ("V", "g"),
         ("count", "V"),
+        ("mV", "count"),
+        ("pulse/s", "count"),
         ("count/(deg/s)", "V/(deg/s)"),
         ("deg", "deg/s"),
         ("s", "Hz"),
@@ -131,6 +141,11 @@ def test_a_conversion_between_quantities_is_refused_naming_both(source, target):
         ("°/s", "deg/s"),
         ("°", "deg"),
         ("counts", "count"),
+        ("℃", "degC"),
+        ("dps", "deg/s"),
+        ("mdps", "mdeg/s"),
+        ("°/min", "deg/min"),
+        ("pulses/s", "pulse/s"),
     ],
 )
 def test_usual_spellings_are_understood(spelling, symbol):
@@ -154,3 +169,29 @@ def test_conversion_in_an_unknown_unit_is_refused(convert):
 
 def test_standard_gravity_is_that_of_the_cgpm():
     assert STANDARD_GRAVITY == 9.80665
+
+
+def test_millivolts_and_volts_convert_to_each_other():
+    assert conversion_factor("mV", "V") == 0.001
+    assert conversion_factor("V", "mV") == 1000.0
+
+
+@pytest.mark.parametrize(
+    ("text", "output", "measured"),
+    [
+        ("V/(deg/s)", "V", "deg/s"),
+        ("mV/g", "mV", "g"),
+        ("LSB/dps", "count", "deg/s"),
+        ("count/(m/s^2)", "count", "m/s^2"),
+        ("pulse/s/(deg/h)", "pulse/s", "deg/h"),
+        ("mV/°C", "mV", "degC"),
+    ],
+)
+def test_a_scale_factor_is_an_output_per_unit_of_what_is_measured(text, output, measured):
+    assert [unit.symbol for unit in parse_scale_factor(text)] == [output, measured]
+
+
+@pytest.mark.parametrize("text", ["V", "g/V", "V/count", "deg/s", "V/(furlong)", "", "/"])
+def test_what_is_no_scale_factor_is_refused_with_an_example(text):
+    with pytest.raises(UnitError, match="expected an output per unit of what is measured, such as V/"):
+        parse_scale_factor(text)

@@ -27,7 +27,7 @@ _QUANTITIES = {
     "temperature": ("temperature", "output"),
     "table_angle": ("angle", "output"),
 }
-_CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|min)\)?)?")
+_CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
 """What loggers call the time, and the unit in it."""
 
 

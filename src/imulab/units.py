@@ -2,7 +2,7 @@
 
 Inside imulab every number is in SI (s, m/s^2, rad, rad/s; temperature in degC). This module is the one place
 that knows other units. What a sensor puts out before calibration (counts, volts) has no SI value of its own:
-such units are kept as they are, with the quantity ``"output"``.
+such units are kept as they are, with the quantity ``"output"``; only `conversion_factor` turns mV into V.
 
 Source: SI brochure, 9th edition; standard gravity: 3rd CGPM (1901), 9.80665 m/s^2 exactly.
 """
@@ -41,7 +41,9 @@ _UNITS = {
         Unit("s", "time"),
         Unit("ms", "time", 1e-3),
         Unit("us", "time", 1e-6),
+        Unit("ns", "time", 1e-9),
         Unit("min", "time", 60.0),
+        Unit("h", "time", 3600.0),
         Unit("m/s^2", "acceleration"),
         Unit("g", "acceleration", STANDARD_GRAVITY),
         Unit("mg", "acceleration", 1e-3 * STANDARD_GRAVITY),
@@ -52,14 +54,21 @@ _UNITS = {
         Unit("deg", "angle", _DEGREE),
         Unit("arcsec", "angle", _DEGREE / 3600.0),
         Unit("rad/s", "rate"),
+        Unit("mrad/s", "rate", 1e-3),
         Unit("deg/s", "rate", _DEGREE),
+        Unit("mdeg/s", "rate", 1e-3 * _DEGREE),
+        Unit("deg/min", "rate", _DEGREE / 60.0),
         Unit("deg/h", "rate", _DEGREE / 3600.0),
         Unit("degC", "temperature"),
         Unit("K", "temperature", 1.0, -273.15),
         Unit("count", "output"),
         Unit("V", "output"),
+        Unit("mV", "output"),
+        Unit("pulse/s", "output"),
         Unit("count/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("V/(deg/s)", "output per rate", 1.0 / _DEGREE),
+        Unit("mV/(deg/s)", "output per rate", 1.0 / _DEGREE),
+        Unit("pulse/s/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("m", "length"),
         Unit("Hz", "frequency"),
         Unit("kHz", "frequency", 1e3),
@@ -77,18 +86,24 @@ _SPELLINGS = {
     "m/s2": "m/s^2",
     "m/s**2": "m/s^2",
     "°C": "degC",
+    "℃": "degC",
     "°/s": "deg/s",
     "°": "deg",
     "°/h": "deg/h",
     "°/hr": "deg/h",
     "deg/hr": "deg/h",
+    "°/min": "deg/min",
     "dps": "deg/s",
+    "mdps": "mdeg/s",
+    "m°/s": "mdeg/s",
     "µrad": "urad",
     "μrad": "urad",
     "counts": "count",
     "LSB": "count",
     "lsb": "count",
+    "pulses/s": "pulse/s",
 }
+_IN_VOLTS = {"V": 1.0, "mV": 1e-3}
 
 
 def parse_unit(text: str) -> Unit:
@@ -109,6 +124,27 @@ def parse_unit(text: str) -> Unit:
     if unit is None:
         raise UnitError(f"unknown unit {text!r}; known units: {' '.join(_UNITS)}")
     return unit
+
+
+def parse_scale_factor(text: str) -> tuple[Unit, Unit]:
+    """Return the two units of a scale factor such as ``V/(deg/s)``: that of the output, and that of what is measured.
+
+    Raises
+    ------
+    UnitError
+        It is no output (count, V, mV, pulse/s) per unit of something else.
+    """
+    for place in (i for i, sign in enumerate(text) if sign == "/"):
+        output, measured = text[:place], text[place + 1 :].strip()
+        if measured.startswith("(") and measured.endswith(")"):
+            measured = measured[1:-1]
+        try:
+            pair = parse_unit(output), parse_unit(measured)
+        except UnitError:
+            continue
+        if pair[0].quantity == "output" and not pair[1].quantity.startswith("output"):
+            return pair
+    raise UnitError(f"unit {text!r}: expected an output per unit of what is measured, such as V/(deg/s) or count/g")
 
 
 @overload
@@ -153,9 +189,11 @@ def conversion_factor(source: str, target: str) -> float:
     Raises
     ------
     UnitError
-        The two do not measure the same quantity; counts and volts convert only to themselves.
+        The two do not measure the same quantity; of the outputs only V and mV convert to each other.
     """
     a, b = parse_unit(source), parse_unit(target)
+    if a.symbol in _IN_VOLTS and b.symbol in _IN_VOLTS:
+        return _IN_VOLTS[a.symbol] / _IN_VOLTS[b.symbol]
     if a.quantity != b.quantity or (a.quantity.startswith("output") and a.symbol != b.symbol):
         raise UnitError(f"cannot convert {a.symbol} ({a.quantity}) to {b.symbol} ({b.quantity})")
     return a.factor / b.factor if a.symbol != b.symbol else 1.0

@@ -1,13 +1,13 @@
-"""Entries of a manifest: numbers, units and keys, each refused with its place where it cannot be."""
+"""Entries of a manifest: quantities and windows, each refused with its place where it cannot be."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
-from imulab.errors import ReadError, UnitError
-from imulab.units import parse_unit, to_si
+from imulab.entries import check_keys, number_of, unit_of
+from imulab.errors import ReadError
+from imulab.units import to_si
 
 Window = tuple[float | None, float | None]
 """First and last time of a part of a file, s, either None for no bound."""
@@ -27,31 +27,6 @@ def quantity_of(entry: Any, key: str, kind: str, name: str) -> tuple[float, floa
     if uncertainty < 0:
         raise ReadError(f"{place}: standard_uncertainty {entry['standard_uncertainty']!r}: expected 0 or more")
     return value, uncertainty
-
-
-def check_keys(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> None:
-    """Refuse a key that is none of `keys`: a misspelt one must not pass."""
-    for key in table:
-        if key not in keys:
-            raise ReadError(f"{place}: unknown key {key!r}; known keys: {' '.join(keys)}")
-
-
-def number_of(value: Any, place: str) -> float:
-    """Return a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ReadError(f"{place}: expected a number, found {value!r}")
-    return float(value)
-
-
-def unit_of(text: Any, kind: str, place: str) -> str:
-    """Return the symbol of a unit of one kind."""
-    try:
-        unit = parse_unit(str(text))
-    except UnitError as error:
-        raise UnitError(f"{place}: {error}") from None
-    if unit.quantity != kind:
-        raise UnitError(f"{place}: expected a unit of {kind}, found {text!r} ({unit.quantity})")
-    return unit.symbol
 
 
 def example(key: str) -> str:

@@ -12,19 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from imulab.centrifuge.entries import (
-    Window,
-    check_keys,
-    example,
-    number_of,
-    overlap,
-    quantity_of,
-    unit_of,
-    window_of,
-    window_text,
-)
+from imulab.centrifuge.entries import Window, example, overlap, quantity_of, window_of, window_text
 from imulab.centrifuge.model import specific_force
-from imulab.errors import ReadError
+from imulab.entries import check_keys, number_of, scale_factor_of, unit_of
+from imulab.errors import ReadError, UnitError
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
 
 COLUMNS = ("dtg_x", "dtg_y", "fog")
@@ -289,13 +280,10 @@ def _scale_factors(table: Any, name: str) -> dict[str, tuple[float, str]]:
     found = {}
     for key, entry in table.items():
         place = f"{name}: scale_factor: {key}"
-        if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
-            raise ReadError(f"{place}: expected {example('scale_factor')}, found {entry!r}")
-        value = number_of(entry["value"], place)
-        if value == 0:
-            raise ReadError(f"{place}: expected a value other than 0")
-        unit = unit_of(entry["unit"], "output per rate", place)
-        found[key] = (to_si(value, unit), unit.partition("/")[0])
+        known = scale_factor_of(entry, place, example("scale_factor"))
+        if known.measured.quantity != "rate":
+            raise UnitError(f"{place}: expected a unit of output per rate, found {entry['unit']!r}")
+        found[key] = (known.value * (1.0 / known.measured.factor), known.output.symbol)
     return found
 
 

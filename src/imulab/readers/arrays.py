@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import ReadError
-from imulab.readers.layout import Layout
+from imulab.readers.layout import Layout, Readings
 from imulab.recording import Array, Recording
 
 ROWS = 1 << 16
@@ -111,15 +111,13 @@ def recordings(
     total = next(iter(lengths.values()), 0)
     if total == 0:
         raise ReadError(f"{name}: no rows of data")
-    units = {column: entry.unit for column, entry in layout.columns.items()}
+    readings = Readings(layout)
     for start in range(0, total, ROWS):
         stop = min(start + ROWS, total)
         columns = {column: function(start, stop) for column, function in take.items()}
-        if layout.sample_rate is not None:
-            columns = {"time": np.arange(start, stop) / layout.sample_rate, **columns}
         yield Recording(
-            columns=columns,
-            units={"time": "s", **units} if layout.sample_rate is not None else units,
+            columns=readings.of(columns, start + 1),
+            units=layout.units,
             metadata=dict(layout.metadata or {}),
             name=name,
             first_row=start + 1,

@@ -8,34 +8,76 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from imulab.entries import check_keys, meant, number_of, scale_factor_of
 from imulab.errors import ReadError, UnitError
-from imulab.recording import check_unit
-from imulab.units import parse_unit, to_si
+from imulab.recording import Array, check_unit
+from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
 EXAMPLE = """\
 delimiter = "whitespace"                        # or "," ";" "\\t"
 decimal = "."                                   # or "," where numbers are written 9,81
 header = false                                  # true: the first line names the columns
 skip_lines = 0                                  # lines above the header or the data
+# encoding = "gbk"                              # of the names in the header, where they are not UTF-8
 # sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
 [columns]
 time = { from = 0, unit = "s" }                 # 0-based number, or a name in the header
 accel_x = { from = 1, unit = "count" }
 accel_y = { from = 2, unit = "count" }
 accel_z = { from = 3, unit = "count" }
+gyro_x = { from = 4, unit = "deg/s", scale = 0.0625 } # what is read, times 0.0625, is in deg/s
+temperature = { from = 5, unit = "V" }          # by the two tables below: less zero, divided by scale factor
+[zero]
+temperature = { value = 0.5, unit = "V" }
+[scale_factor]
+temperature = { value = 10, unit = "mV/degC" }
 [metadata]
 serial = "SN42"
 """
 _DELIMITERS = {"whitespace": " ", " ": " ", ",": ",", ";": ";", "\t": "\t"}
-_KEYS = ("columns", "delimiter", "header", "metadata", "sample_rate", "skip_lines", "decimal")
+_KEYS = (
+    "columns",
+    "delimiter",
+    "header",
+    "metadata",
+    "sample_rate",
+    "skip_lines",
+    "decimal",
+    "encoding",
+    "scale_factor",
+    "zero",
+)
+_COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
+_COUNTERS = [2.0**8, 2.0**16, 2.0**32]
+_BY_COLUMN = {
+    "scale_factor": '{ value = 0.02, unit = "V/(deg/s)" }',
+    "zero": '{ value = 2.5, unit = "V" }',
+}
 
 
 @dataclass(frozen=True, slots=True)
 class LayoutColumn:
-    """Where a column comes from (0-based number, or name in the header) and its unit."""
+    """Where a column comes from (0-based number, or name in the header), and how it becomes a reading.
+
+    A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`.
+    """
 
     origin: int | str
     unit: str
+    scale: float = 1.0
+    zero: float = 0.0
+    scale_factor: float = 1.0
+
+    def convert(self, values: Array) -> None:
+        """Turn what was read into readings, in place."""
+        if self.scale != 1.0:
+            values *= self.scale
+        if self.zero != 0.0:
+            values -= self.zero
+        if self.scale_factor != 1.0:
+            values /= self.scale_factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +85,8 @@ class Layout:
     """Where the columns of a foreign file are.
 
     ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
-    in Hz or None; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter).
+    in Hz or None; ``encoding`` that of the header's names; ``text`` says that the file is delimited text whatever it
+    looks like (it names a delimiter).
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -55,6 +98,46 @@ class Layout:
     name: str = "layout"
     text: bool = False
     decimal: str = "."
+    encoding: str = "utf-8"
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Name to unit of the columns as `Readings` makes them."""
+        known = {name: column.unit for name, column in self.columns.items()}
+        return (
+            known if self.sample_rate is None else {**({} if "time" in known else {"time": "s"}), **known, "time": "s"}
+        )
+
+
+class Readings:
+    """The columns of a file as its layout describes them, block by block: converted, and with their time."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._last = np.nan
+        self._carried = 0.0
+
+    def of(self, columns: Mapping[str, Array], first_row: int) -> dict[str, Array]:
+        """Return the readings of a block that begins at row `first_row`; the arrays are changed in place."""
+        for name, values in columns.items():
+            self._layout.columns[name].convert(values)
+        rate = self._layout.sample_rate
+        if rate is None:
+            return dict(columns)
+        if "time" in columns:
+            return {**columns, "time": self._unwrapped(columns["time"]) / rate}
+        count = len(next(iter(columns.values())))
+        return {"time": np.arange(first_row - 1, first_row - 1 + count) / rate, **columns}
+
+    def _unwrapped(self, numbers: Array) -> Array:
+        """Carry a counter on where it begins again, having come near to 2^8, 2^16 or 2^32."""
+        before = np.concatenate([[self._last], numbers[:-1]])
+        fall = before - numbers
+        size = np.select([before < limit for limit in _COUNTERS], _COUNTERS, np.inf)
+        carried = self._carried + np.cumsum(np.where(fall > size / 2, size, 0.0))
+        if len(numbers):
+            self._last, self._carried = float(numbers[-1]), float(carried[-1])
+        return numbers + carried
 
 
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
@@ -82,9 +165,7 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
 
 
 def _layout(table: dict[str, Any], path: str) -> Layout:
-    unknown = sorted(set(table) - set(_KEYS))
-    if unknown:
-        raise ReadError(f"{path}: unknown key {unknown[0]!r}; known keys: {' '.join(_KEYS)}")
+    check_keys(table, _KEYS, path)
     delimiter = table.get("delimiter", "whitespace")
     if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:
         raise ReadError(f"{path}: delimiter {delimiter!r}; expected 'whitespace' ',' ';' or a tab")
@@ -99,13 +180,17 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
         raise ReadError(f"{path}: skip_lines = {skip_lines!r}; expected a number of lines")
     if not isinstance(table.get("header", False), bool):
         raise ReadError(f"{path}: header = {table['header']!r}; expected true or false")
-    parsed = {name: _column(name, entry, path) for name, entry in columns.items()}
+    sample_rate = _sample_rate(table.get("sample_rate"), path)
+    columns = _with_tables(columns, table, path)
+    parsed = {name: _column(name, entry, path, counted=sample_rate is not None) for name, entry in columns.items()}
     metadata = table.get("metadata", {})
     if not isinstance(metadata, dict):
         raise ReadError(f"{path}: metadata = {metadata!r}; expected a table of keys and texts")
-    sample_rate = _sample_rate(table.get("sample_rate"), path)
-    if sample_rate is not None and "time" in parsed:
-        raise ReadError(f"{path}: both a time column and sample_rate; expected one of them")
+    if sample_rate is not None and "time" in parsed and parsed["time"].unit != "count":
+        raise ReadError(
+            f"{path}: both a time column and sample_rate; expected one of them, or a time of unit count, which numbers "
+            "the samples"
+        )
     return Layout(
         columns=parsed,
         delimiter=_DELIMITERS[delimiter],
@@ -116,25 +201,88 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
         name=path,
         text="delimiter" in table,
         decimal=decimal,
+        encoding=_encoding(table.get("encoding", "utf-8"), path),
     )
 
 
-def _column(name: str, entry: Any, path: str) -> LayoutColumn:
-    example = f'{name} = {{ from = 1, unit = "count" }}'
+def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> dict[str, Any]:
+    """Return the columns with what the tables [scale_factor] and [zero] say of them."""
+    found = dict(columns)
+    for key, example in _BY_COLUMN.items():
+        entries = table.get(key, {})
+        if not isinstance(entries, dict):
+            raise ReadError(f"{path}: {key}: expected lines such as gyro_x = {example}, found {entries!r}")
+        for name, entry in entries.items():
+            if name not in columns:
+                raise ReadError(
+                    f"{path}: {key}: no column {name!r}{meant(name, columns)}; columns: {' '.join(columns)}"
+                )
+            if isinstance(found[name], dict):
+                if key in found[name]:
+                    raise ReadError(f"{path}: column {name}: {key} is given twice, here and under [{key}]")
+                found[name] = {**found[name], key: entry}
+    return found
+
+
+def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
+    place = f"{path}: column {name}"
     if not isinstance(entry, dict) or "from" not in entry or "unit" not in entry:
-        raise ReadError(f"{path}: column {name}: expected {example}, found {entry!r}")
-    if set(entry) != {"from", "unit"}:
-        extra = sorted(set(entry) - {"from", "unit"})[0]
-        raise ReadError(f"{path}: column {name}: unknown key {extra!r}; known keys: from unit")
+        raise ReadError(f'{place}: expected {name} = {{ from = 1, unit = "count" }}, found {entry!r}')
+    check_keys(entry, _COLUMN_KEYS, place)
     origin = entry["from"]
     if not (isinstance(origin, str) or (type(origin) is int and origin >= 0)):
-        raise ReadError(f"{path}: column {name}: from = {origin!r}; expected a column number from 0, or a name")
+        raise ReadError(f"{place}: from = {origin!r}; expected a column number from 0, or a name")
+    scale = number_of(entry.get("scale", 1.0), f"{place}: scale")
+    if scale == 0:
+        raise ReadError(f"{place}: scale = {entry['scale']!r}; expected a number other than 0")
     try:
-        unit = parse_unit(str(entry["unit"])).symbol
+        unit = parse_unit(str(entry["unit"]))
     except UnitError as error:
-        raise UnitError(f"{path}: column {name}: {error}") from None
-    check_unit(name, unit, path)
-    return LayoutColumn(origin, unit)
+        raise UnitError(f"{place}: {error}") from None
+    zero = _zero(entry.get("zero"), unit, f"{place}: zero")
+    if "scale_factor" not in entry:
+        if not (counted and name == "time" and unit.symbol == "count"):
+            check_unit(name, unit.symbol, path)
+        return LayoutColumn(origin, unit.symbol, scale, zero)
+    known = scale_factor_of(
+        entry["scale_factor"], f"{place}: scale_factor", f"scale_factor = {_BY_COLUMN['scale_factor']}"
+    )
+    try:
+        factor = known.value * conversion_factor(known.output.symbol, unit.symbol)
+    except UnitError:
+        raise UnitError(
+            f"{place}: unit = {entry['unit']!r}; expected {known.output.symbol}, the output in the scale factor's unit "
+            f"{entry['scale_factor']['unit']}"
+        ) from None
+    check_unit(name, known.measured.symbol, path)
+    return LayoutColumn(origin, known.measured.symbol, scale, zero, factor)
+
+
+def _zero(entry: Any, unit: Unit, place: str) -> float:
+    """Return the zero of a column in its unit."""
+    if entry is None:
+        return 0.0
+    if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
+        raise ReadError(f"{place}: expected zero = {_BY_COLUMN['zero']}, found {entry!r}")
+    try:
+        factor = conversion_factor(str(entry["unit"]), unit.symbol)
+    except UnitError as error:
+        raise UnitError(f"{place}: {error}") from None
+    return number_of(entry["value"], place) * factor
+
+
+def _encoding(name: Any, path: str) -> str:
+    try:
+        digits = "0,\n".encode(name)
+    except (LookupError, TypeError, UnicodeError, ValueError):
+        raise ReadError(
+            f"{path}: encoding = {name!r}; expected the name of an encoding such as gbk, shift_jis or latin-1"
+        ) from None
+    if digits != b"0,\n":
+        raise ReadError(
+            f"{path}: encoding = {name!r}; expected one that writes digits as ASCII does: save the file as UTF-8"
+        )
+    return str(name)
 
 
 def _sample_rate(entry: Any, path: str) -> float | None:

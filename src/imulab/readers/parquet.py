@@ -6,12 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
-from imulab.readers.layout import Layout
+from imulab.readers.layout import Layout, Readings
 from imulab.recording import CORRECTED_BY, Array, Recording, parse_column_title
 
 _NOT_OURS = ("ARROW:", "org.apache.")
@@ -37,6 +35,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout)
             stored = file.schema_arrow.metadata or {}
+            readings = Readings(layout) if layout else None
             metadata = {**_metadata(stored), **((layout and layout.metadata) or {})}
             corrected = tuple(stored.get(CORRECTED_BY.encode(), b"").decode("utf-8", "replace").splitlines())
             for batch in file.iter_batches(
@@ -45,9 +44,8 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
                 if batch.num_rows == 0:
                     continue
                 values = {key: _floats(arrow, batch.column(title), title, name) for key, title in columns.items()}
-                if layout is not None and layout.sample_rate is not None:
-                    stamps = np.arange(row - 1, row - 1 + batch.num_rows) / layout.sample_rate
-                    values = {"time": stamps, **values}
+                if readings is not None:
+                    values = readings.of(values, row)
                 yield Recording(
                     columns=values, units=units, metadata=metadata, name=name, first_row=row, corrected_by=corrected
                 )
@@ -69,14 +67,12 @@ def _columns(there: list[str], name: str, layout: Layout | None) -> tuple[dict[s
                 raise ReadError(f"{name}: column {key} appears twice")
             columns[key], units[key] = title, unit
         return columns, units
-    if layout.sample_rate is not None:
-        units["time"] = "s"
     for key, (title, number) in origins(layout, name, "Parquet").items():
         title = title if number is None else f"{title}[{number}]"
         if there.count(title) != 1:
             raise ReadError(f"{name}: {layout.name} takes {key} from a column named {title!r}, found {' '.join(there)}")
-        columns[key], units[key] = title, layout.columns[key].unit
-    return columns, units
+        columns[key] = title
+    return columns, layout.units
 
 
 def _metadata(pairs: dict[bytes, bytes]) -> dict[str, str]:

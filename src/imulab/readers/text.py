@@ -22,7 +22,7 @@ import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers import _text
-from imulab.readers.layout import Layout
+from imulab.readers.layout import Layout, Readings
 from imulab.recording import CORRECTED_BY, Recording, parse_column_title
 from imulab.tens import powers_of_five
 from imulab.verdict import Note
@@ -95,6 +95,7 @@ class TextFile:
         self._read = getattr(stream, "read1", stream.read) if self._live else stream.read
         self._name = name
         self._layout = layout
+        self._readings = Readings(layout) if layout else None
         self._hash = _Hash() if hashed else None
         self._rest = b""
         self._ended = self._unended = False
@@ -201,8 +202,8 @@ class TextFile:
         while b"\n" not in self._rest and not self._ended and len(self._rest) < _LONGEST_LINE:
             self._read_more()
 
-    def _line(self) -> str | None:
-        """Take one line of the head."""
+    def _line(self, encoding: str = "utf-8", errors: str = "strict") -> str | None:
+        """Take one line of the head; comments may be of any encoding."""
         self._fill_line()
         if not self._rest:
             return None
@@ -212,11 +213,13 @@ class TextFile:
             place = f"{self._name}: line {self._lines_before}"
             raise ReadError(f"{place}: expected a line of text, found more than {_LONGEST_LINE} bytes without an end")
         try:
-            return line.decode("utf-8").rstrip("\r")
+            return line.decode(encoding, errors).rstrip("\r")
         except UnicodeDecodeError:
             if line.startswith(b"#"):
                 return line.decode("latin-1").rstrip("\r")
-            raise ReadError(f"{self._name}: line {self._lines_before}: expected UTF-8 text") from None
+            hint = '; the layout says otherwise with encoding = "gbk", or another' if self._layout else ""
+            shown = "UTF-8" if encoding == "utf-8" else encoding
+            raise ReadError(f"{self._name}: line {self._lines_before}: expected {shown} text{hint}") from None
 
     # --- head --------------------------------------------------------------------------------------------------
 
@@ -265,7 +268,7 @@ class TextFile:
 
     def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
         for _ in range(layout.skip_lines):
-            line = self._line()
+            line = self._line(layout.encoding, "replace")
             if line is None:
                 break
             if line.startswith("#"):
@@ -297,13 +300,13 @@ class TextFile:
                 other = list(layout.columns)[slots[index]]
                 raise ReadError(f"{self._name}: {layout.name} takes both {other} and {name} from column {origin}")
             slots[index] = slot
-        return list(layout.columns), {name: c.unit for name, c in layout.columns.items()}, slots
+        return list(layout.columns), layout.units, slots
 
     def _layout_titles(self, layout: Layout) -> list[str]:
         """Take the line of titles, which may itself begin with #; comments above it are kept."""
         wanted = {column.origin for column in layout.columns.values() if isinstance(column.origin, str)}
         while True:
-            line = self._line() or ""
+            line = self._line(layout.encoding) or ""
             titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), layout.delimiter)]
             if not (wanted and line.startswith("#") and wanted.isdisjoint(titles)):
                 return titles
@@ -340,14 +343,11 @@ class TextFile:
         if problem:
             self._refuse(block, row, rows, problem, field)
         columns = dict(zip(self._titles, out[:, :rows], strict=True))
-        units = dict(self._units)
-        layout = self._layout
-        if layout is not None and layout.sample_rate is not None:
-            columns = {"time": np.arange(row - 1, row - 1 + rows) / layout.sample_rate, **columns}
-            units = {"time": "s", **units}
+        if self._readings is not None:
+            columns = self._readings.of(columns, row)
         return Recording(
             columns=columns,
-            units=units,
+            units=self._units,
             metadata=self._metadata,
             name=self._name,
             first_row=row,

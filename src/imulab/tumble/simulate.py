@@ -162,7 +162,7 @@ def _nominal_scale(unit: str, scale: float | None) -> float:
         return conversion_factor("m/s^2", known.symbol)
     if known.quantity != "output":
         raise OptionError(f"unit {unit}: expected m/s^2 g mg count V")
-    return scale if scale is not None else {"count": 4096.0, "V": 1.0}[known.symbol] / STANDARD_GRAVITY
+    return scale if scale is not None else {"V": 1.0, "mV": 1000.0}.get(known.symbol, 4096.0) / STANDARD_GRAVITY
 
 
 def _random_sensor(rng: np.random.Generator, order: int, nominal: float) -> dict[str, float]:
