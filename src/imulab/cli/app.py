@@ -29,6 +29,7 @@ _SUMMARIES = {
     "tumble gyro": "Calibrate the gyroscope triad on top of that.",
     "tumble check": "Hold fresh attitudes against a record.",
     "array simulate": "Simulate a recording of an array.",
+    "array merge": "Join files of one gyro each to an array.",
     "array calibrate": "Find bias, noise and alignment of every element.",
     "array fuse": "Fuse a file or a live stream into one rate.",
     "array compare": "Run every method over one recording.",

@@ -1,4 +1,4 @@
-"""``imulab array``: simulate, calibrate, fuse and compare."""
+"""``imulab array``: simulate, merge, calibrate, fuse and compare."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CalibrationFile = Annotated[
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    for function in (simulate, calibrate, fuse, compare):
+    for function in (simulate, merge, calibrate, fuse, compare):
         group.command(function.__name__)(function)
     return group
 
@@ -120,6 +120,34 @@ def _fault(text: str) -> Fault:
         if part
     }
     return Fault(kind, **found, **values)  # type: ignore[arg-type]
+
+
+def merge(
+    files: Annotated[list[str], typer.Argument(metavar="FILE FILE...", help="Recordings, a gyroscope each.")],
+    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Recording of the array to write.")],
+    axis: Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis of each.")] = None,
+    column: Annotated[str | None, typer.Option(metavar="NAME", help="Take this column of each.")] = None,
+    align: Annotated[bool, typer.Option("--align", help="Move the clocks to where the motion fits the first.")] = False,
+    layout: LayoutFile = None,
+) -> None:
+    """Join files of one gyroscope each to the recording of an array, by time, at the times of the first file."""
+    from imulab.cli.options import note, read_recording
+    from imulab.gyro_array.merge import merge_recordings
+    from imulab.writers import check_writable, write
+
+    if axis is not None and axis not in ("x", "y", "z"):
+        raise OptionError(f"--axis {axis!r}: expected x, y or z")
+    if axis is not None and column is not None:
+        raise OptionError("array merge: --axis and --column both say which column to take; expected one of them")
+    check_outputs([output], [*files, *([layout] if layout else [])])
+    check_writable(output)
+    merged = merge_recordings(
+        [read_recording(file, layout, {}) for file in files], axis=axis, column=column, align=align
+    )
+    write(merged.recording, output)
+    for message in merged.notes:
+        note(message)
+    print(f"{output}: {len(merged.recording)} samples, {len(files)} gyros")
 
 
 def calibrate(
