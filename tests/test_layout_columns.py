@@ -153,7 +153,7 @@ REFUSED = {
     "zero inf": (FOG % 'zero = { value = inf, unit = "V" }', "column fog: zero: expected a number, found inf"),
     "table of another column": (
         FOG % "scale = 1" + '[zero]\nfogg = { value = 1, unit = "V" }\n',
-        "zero: no column 'fogg' (did you mean 'fog'?); columns: fog",
+        "zero: no column 'fogg'; columns: fog; did you mean 'fog'?",
     ),
     "table": ("zero = 1\n" + FOG % "scale = 1", "zero: expected lines such as gyro_x = { value = 2.5"),
     "twice": (

@@ -358,7 +358,7 @@ FOG = '[columns]\nfog = { from = 0, unit = "V" }\n'
 LAYOUTS = {
     "unknown key": (
         'delimeter = ","\n' + COLUMNS,
-        "unknown key 'delimeter' (did you mean 'delimiter'?); known keys: columns delimiter header",
+        "unknown key 'delimeter'; known keys: columns delimiter header",
     ),
     "delimiter": ('delimiter = "|"\n' + COLUMNS, "delimiter '|'; expected 'whitespace' ',' ';' or a tab"),
     "delimiters": ('delimiter = [","]\n' + COLUMNS, "delimiter [',']; expected 'whitespace' ',' ';' or a tab"),
@@ -371,7 +371,7 @@ LAYOUTS = {
     "no unit": ("[columns]\naccel_x = { from = 1 }\n", "column accel_x: expected accel_x = { from = 1, unit ="),
     "column key": (
         '[columns]\nfog = { from = 0, unit = "V", scal = 2 }\n',
-        "column fog: unknown key 'scal' (did you mean 'scale'?); known keys: from unit scale zero scale_factor",
+        "column fog: unknown key 'scal'; known keys: from unit scale zero scale_factor; did you mean 'scale'?",
     ),
     "from": ('[columns]\nfog = { from = -1, unit = "V" }\n', "column fog: from = -1; expected a column number from 0"),
     "rate unit": ('sample_rate = { value = 1, unit = "kHz" }\n' + FOG, "sample_rate: expected { value = 100, unit ="),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.packing import Field, Table
 from imulab.recording import Array
 
@@ -80,9 +80,11 @@ def array_table(settings: ArraySettings) -> Table:
     """
     s, n, axes = settings, settings.elements, settings.axes
     if s.method not in METHODS:
-        raise OptionError(f"unknown method {s.method!r}; known methods: {' '.join(METHODS)}")
+        raise OptionError(f"unknown method {s.method!r}; known methods: {listed(METHODS, s.method)}")
     if s.kernel not in ("gaussian", "exponential"):
-        raise OptionError(f"unknown kernel {s.kernel!r}; known kernels: gaussian exponential")
+        raise OptionError(
+            f"unknown kernel {s.kernel!r}; known kernels: {listed(('gaussian', 'exponential'), s.kernel)}"
+        )
     if axes not in (1, 3):
         raise OptionError(f"{axes} axes: expected 1 or 3")
     least = 3 if s.method == "robust" else 1

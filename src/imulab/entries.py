@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from imulab.errors import ReadError, UnitError
+from imulab.errors import ReadError, UnitError, listed
 from imulab.units import Unit, parse_scale_factor, parse_unit
 
 
@@ -34,19 +34,11 @@ def scale_factor_of(entry: Any, place: str, example: str) -> ScaleFactor:
     return ScaleFactor(value, output, measured)
 
 
-def meant(key: str, known: Iterable[str]) -> str:
-    """Return ``(did you mean 'delimiter'?)``, a blank before it, where a key resembles a known one, or else nothing."""
-    from difflib import get_close_matches
-
-    close = get_close_matches(key, list(known), 1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
-
-
 def check_keys(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> None:
     """Refuse a key that is none of `keys`: a misspelt one must not pass."""
     for key in table:
         if key not in keys:
-            raise ReadError(f"{place}: unknown key {key!r}{meant(key, keys)}; known keys: {' '.join(keys)}")
+            raise ReadError(f"{place}: unknown key {key!r}; known keys: {listed(keys, key)}")
 
 
 def number_of(value: Any, place: str) -> float:

@@ -4,6 +4,25 @@ Every message is one line that names the place (file, column, row or time), what
 found. The command line prints the message alone and exits with 2.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+def listed(known: Iterable[str], found: object) -> str:
+    """Return the known words for a message, and which of them was meant: ``square huber; did you mean 'huber'?``."""
+    names = list(known)
+    return " ".join(names) + meant(names, found)
+
+
+def meant(known: Iterable[str], found: object) -> str:
+    """Return ``; did you mean 'huber'?`` where a word nearly is one of those known, else nothing."""
+    from difflib import get_close_matches
+
+    names = {name.lower(): name for name in known}
+    close = get_close_matches(str(found).lower(), names, n=1)
+    return f"; did you mean {names[close[0]]!r}?" if close else ""
+
 
 class ImulabError(Exception):
     """Base of all errors that name a mistake in the input rather than in imulab; the message is one line."""

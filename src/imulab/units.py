@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
 
-from imulab.errors import UnitError
+from imulab.errors import UnitError, listed
 
 if TYPE_CHECKING:  # the command line parses units before it needs NumPy
     import numpy as np
@@ -122,7 +122,7 @@ def parse_unit(text: str) -> Unit:
     symbol = text.strip()
     unit = _UNITS.get(_SPELLINGS.get(symbol, symbol))
     if unit is None:
-        raise UnitError(f"unknown unit {text!r}; known units: {' '.join(_UNITS)}")
+        raise UnitError(f"unknown unit {text!r}; known units: {listed(_UNITS, symbol)}")
     return unit
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.blend import blend
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.estimate import chi_square_limit, chi_square_probability
 from imulab.recording import Array
 
@@ -74,7 +74,7 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
         The model is unknown, or has more coefficients than there are levels.
     """
     if model != "auto" and model not in MODELS:
-        raise OptionError(f"curve {model!r}: expected one of auto {' '.join(MODELS)}")
+        raise OptionError(f"curve {model!r}: expected one of {listed(('auto', *MODELS), model)}")
     if model != "auto" and len(MODELS[model]) + 1 > len(K):
         raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(MODELS[model]) + 1}")
     names = [name for name, terms in MODELS.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]

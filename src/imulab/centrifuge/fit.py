@@ -17,7 +17,7 @@ from imulab.centrifuge.parameters import Estimates, estimate
 from imulab.centrifuge.record import make_record
 from imulab.centrifuge.run import LoadedRun, reduce_run
 from imulab.centrifuge.static import StaticRun, reduce_static
-from imulab.errors import DataError, OptionError
+from imulab.errors import DataError, OptionError, listed
 from imulab.recording import Array, Recording, Source
 
 METHODS = ("least-squares", "fourier")
@@ -125,9 +125,9 @@ def check_options(method: str, curve: str) -> None:
         Unknown method or curve.
     """
     if method not in METHODS:
-        raise OptionError(f"method {method!r}: expected one of {' '.join(METHODS)}")
+        raise OptionError(f"method {method!r}: expected one of {listed(METHODS, method)}")
     if curve != "auto" and curve not in MODELS:
-        raise OptionError(f"curve {curve!r}: expected one of auto {' '.join(MODELS)}")
+        raise OptionError(f"curve {curve!r}: expected one of {listed(('auto', *MODELS), curve)}")
 
 
 @dataclass

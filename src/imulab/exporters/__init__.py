@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from imulab.calibration import Calibration
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 
 EXPORTERS = {
     "c": "c",
@@ -79,7 +79,7 @@ def export(
         A record lacks what is needed.
     """
     if target not in EXPORTERS:
-        raise OptionError(f"unknown target {target!r}; known targets: {' '.join(EXPORTERS)}")
+        raise OptionError(f"unknown target {target!r}; known targets: {listed(EXPORTERS, target)}")
     module = f"imulab.exporters.{EXPORTERS[target]}"
     try:
         exporter = import_module(module)

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Protocol
 
 from imulab._version import VERSION
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.fleet import processes
 from imulab.fleet.manifest import Unit
 from imulab.fleet.work import Job, Outcome, work
@@ -173,7 +173,7 @@ def open_engine(
         Unknown engine, options that do not go together, or a cluster that cannot be reached or used.
     """
     if kind not in ENGINES:
-        raise OptionError(f"engine {kind!r}: unknown engine; known engines: {' '.join(ENGINES)}")
+        raise OptionError(f"engine {kind!r}: unknown engine; known engines: {listed(ENGINES, kind)}")
     if scheduler is not None and kind != "dask":
         raise OptionError(f"--scheduler {scheduler!r} needs --engine dask")
     if scheduler is not None and workers is not None:

@@ -15,7 +15,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from imulab.errors import ReadError, UnitError
+from imulab.errors import ReadError, UnitError, listed
 from imulab.fleet.display import to_parameter_unit
 from imulab.tasks import TASKS
 
@@ -56,14 +56,14 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
     found: dict[tuple[str, str], Limits] = {}
     for procedure, entries in table.items():
         if procedure not in TASKS:
-            raise ReadError(f"{path}: unknown procedure {procedure!r}; known procedures: {' '.join(TASKS)}")
+            raise ReadError(f"{path}: unknown procedure {procedure!r}; known procedures: {listed(TASKS, procedure)}")
         if not isinstance(entries, dict):
             raise ReadError(f'{path}: {procedure}: expected lines such as bias_x = {{ upper = 20, unit = "mg" }}')
         known = [name for owner, name in units if owner == procedure]
         for pattern, entry in entries.items():
             names = [name for name in known if fnmatchcase(name, pattern)]
             if not names:
-                shown = " ".join(known) or "none, there is no record of this procedure"
+                shown = listed(known, pattern) or "none, there is no record of this procedure"
                 raise ReadError(f"{path}: {procedure}: no parameter {pattern!r}; parameters: {shown}")
             for name in names:
                 key = procedure, name

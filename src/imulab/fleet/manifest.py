@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from imulab.errors import OptionError, ReadError
+from imulab.errors import OptionError, ReadError, listed
 from imulab.fleet.sources import local_file, parent_of
 from imulab.tasks import TASKS
 
@@ -136,7 +136,7 @@ def _check_columns(titles: Sequence[str], name: str) -> None:
     known = [*COLUMNS, *dict.fromkeys(option for task in TASKS.values() for option in task.options)]
     for index, title in enumerate(titles):
         if title.replace("-", "_") not in known:
-            raise OptionError(f"{name}: unknown column {title!r}; known columns: {' '.join(known)}")
+            raise OptionError(f"{name}: unknown column {title!r}; known columns: {listed(known, title)}")
         if title in titles[:index]:
             raise OptionError(f"{name}: column {title} appears twice")
 
@@ -146,7 +146,7 @@ def _unit(place: str, cells: Mapping[str, str]) -> Unit:
     _check_serial(serial, place)
     if procedure not in TASKS:
         raise OptionError(
-            f"{place}, column procedure: unknown procedure {procedure!r}; known procedures: {' '.join(TASKS)}"
+            f"{place}, column procedure: unknown procedure {procedure!r}; known procedures: {listed(TASKS, procedure)}"
         )
     task = TASKS[procedure]
     files = tuple(file.strip() for file in cells["file"].split(";"))
@@ -159,7 +159,7 @@ def _unit(place: str, cells: Mapping[str, str]) -> Unit:
     for name in options:
         if name not in task.options:
             raise OptionError(
-                f"{place}, column {name}: not an option of {procedure}; its options: {' '.join(task.options)}"
+                f"{place}, column {name}: not an option of {procedure}; its options: {listed(task.options, name)}"
             )
     try:
         task.values(options, "column {}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.gyro_array.compare import rate_figures
 from imulab.gyro_array.fit import calibrate_array
 from imulab.gyro_array.fuse import FuseOptions, open_stream
@@ -48,7 +48,7 @@ def run_experiment(
         The experiment is unknown, or there is no seed.
     """
     if experiment not in ("static", "dynamic"):
-        raise OptionError(f"experiment {experiment!r}: expected static or dynamic")
+        raise OptionError(f"experiment {experiment!r}: expected one of {listed(('static', 'dynamic'), experiment)}")
     if not 1 <= seeds <= 10_000:
         raise OptionError(f"seeds {seeds}: expected 1 to 10000")
     rate = EXPERIMENTS[experiment][0]

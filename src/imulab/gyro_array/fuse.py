@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.blob import Blob
 from imulab.calibration import Calibration
-from imulab.errors import DataError, OptionError, RecordError, UnitError
+from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
 from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import Clock, to_one_clock
 from imulab.gyro_array.health import Health
@@ -71,7 +71,7 @@ class FuseOptions:
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            raise OptionError(f"method {self.method!r}: expected one of {' '.join(METHODS)}")
+            raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
         if isinstance(self.memory, str):
             if self.memory != "growing":
                 raise OptionError(f"memory {self.memory!r}: expected growing, growing:COUNT, or a gain between 0 and 1")

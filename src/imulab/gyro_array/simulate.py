@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit
 
@@ -96,7 +96,7 @@ def simulate_array(
     """
     noise = noise or NoiseModel()
     if experiment not in EXPERIMENTS:
-        raise OptionError(f"experiment {experiment!r}: expected one of {' '.join(EXPERIMENTS)}")
+        raise OptionError(f"experiment {experiment!r}: expected one of {listed(EXPERIMENTS, experiment)}")
     rate = sample_rate if sample_rate is not None else EXPERIMENTS[experiment][0]
     length = duration if duration is not None else EXPERIMENTS[experiment][1]
     _check(elements, axes, rate, length, mounting, unit)
@@ -146,7 +146,7 @@ def _check(elements: int, axes: int, rate: float, length: float, mounting: str, 
     if axes not in (1, 3):
         raise OptionError(f"axes {axes}: expected 1 or 3")
     if mounting not in ("same", "alternate"):
-        raise OptionError(f"mounting {mounting!r}: expected same or alternate")
+        raise OptionError(f"mounting {mounting!r}: expected one of {listed(('same', 'alternate'), mounting)}")
     if parse_unit(unit).quantity != "rate":
         raise OptionError(f"unit {unit}: expected rad/s deg/s deg/h")
 
@@ -174,7 +174,7 @@ def _check_numbers(noise: NoiseModel, scale_spread: float, misalignment: float, 
 def _check_faults(faults: tuple[Fault, ...], elements: int) -> None:
     for fault in faults:
         if fault.kind not in FAULTS:
-            raise OptionError(f"fault {fault.kind!r}: expected one of {' '.join(FAULTS)}")
+            raise OptionError(f"fault {fault.kind!r}: expected one of {listed(FAULTS, fault.kind)}")
         if not 1 <= fault.gyro <= elements:
             raise OptionError(f"fault of gyro {fault.gyro}: expected 1 to {elements}")
         if not (fault.start >= 0 and fault.duration > 0):

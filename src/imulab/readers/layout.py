@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from imulab.entries import check_keys, meant, number_of, scale_factor_of
-from imulab.errors import ReadError, UnitError
+from imulab.entries import check_keys, number_of, scale_factor_of
+from imulab.errors import ReadError, UnitError, listed
 from imulab.recording import Array, check_unit
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
@@ -214,9 +214,7 @@ def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> d
             raise ReadError(f"{path}: {key}: expected lines such as gyro_x = {example}, found {entries!r}")
         for name, entry in entries.items():
             if name not in columns:
-                raise ReadError(
-                    f"{path}: {key}: no column {name!r}{meant(name, columns)}; columns: {' '.join(columns)}"
-                )
+                raise ReadError(f"{path}: {key}: no column {name!r}; columns: {listed(columns, name)}")
             if isinstance(found[name], dict):
                 if key in found[name]:
                     raise ReadError(f"{path}: column {name}: {key} is given twice, here and under [{key}]")

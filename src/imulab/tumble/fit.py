@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
-from imulab.errors import DataError, ObservabilityError, OptionError
+from imulab.errors import DataError, ObservabilityError, OptionError, listed
 from imulab.estimate import (
     Observability,
     covariance,
@@ -225,11 +225,11 @@ def check_options(
     """
     known = ("auto", *range(HIGHEST_ORDER + 1), "blend")
     if order not in known or isinstance(order, bool):
-        raise OptionError(f"order {order!r}: expected one of {' '.join(map(str, known))}")
+        raise OptionError(f"order {order!r}: expected one of {listed(map(str, known), order)}")
     if method not in METHODS:
-        raise OptionError(f"method {method!r}: expected one of {' '.join(METHODS)}")
+        raise OptionError(f"method {method!r}: expected one of {listed(METHODS, method)}")
     if loss not in LOSSES:
-        raise OptionError(f"loss {loss!r}: expected one of {' '.join(LOSSES)}")
+        raise OptionError(f"loss {loss!r}: expected one of {listed(LOSSES, loss)}")
     if loss == "huber" and method == "linearised":
         raise OptionError("loss huber needs method norm, found method linearised")
     if order == 0 and method == "linearised":

@@ -19,7 +19,7 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
-from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError
+from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimate import Observability, covariance, observability
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.rows import leave_out
@@ -147,9 +147,9 @@ def fit_gyro(
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
     if sensitivity not in SENSITIVITIES:
-        raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {' '.join(SENSITIVITIES)}")
+        raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
     if clock_of not in CLOCKS:
-        raise OptionError(f"clock of {clock_of!r}: expected one of {' '.join(CLOCKS)}")
+        raise OptionError(f"clock of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
     if not 0 <= clock < 1:
         raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
     if attitudes.trace is None:

@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from imulab.errors import ObservabilityError, OptionError
+from imulab.errors import ObservabilityError, OptionError, listed
 from imulab.estimate import observability
 from imulab.recording import Array
 from imulab.tumble.advice import sphere_points
@@ -103,7 +103,7 @@ def plan_tumble(
     if not size:
         raise OptionError(f"order {order}: expected 0 to {HIGHEST_ORDER}")
     if criterion not in CRITERIA:
-        raise OptionError(f"criterion {criterion!r}: expected one of {' '.join(CRITERIA)}")
+        raise OptionError(f"criterion {criterion!r}: expected one of {listed(CRITERIA, criterion)}")
     before = np.empty((0, 3)) if already is None else already
     if not 1 <= attitudes <= MOST_ATTITUDES:
         raise OptionError(f"{attitudes} attitudes: expected 1 to {MOST_ATTITUDES}")

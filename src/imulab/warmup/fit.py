@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.errors import DataError, OptionError
+from imulab.errors import DataError, OptionError, listed
 from imulab.recording import Array, Recording
 from imulab.warmup.curves import Curves, make_curves
 from imulab.warmup.cycles import Cycle, common_axes, find_power_cycle, with_axes
@@ -193,7 +193,7 @@ def check_options(
         ("beyond", beyond, BEYOND),
     ):
         if value not in known:
-            raise OptionError(f"{name} {value!r}: expected one of {' '.join(known)}")
+            raise OptionError(f"{name} {value!r}: expected one of {listed(known, value)}")
     at = np.array(temperatures, dtype=np.float64)
     if at.ndim != 1 or len(at) < 2 or not np.isfinite(at).all() or not (np.diff(at) > 0).all():
         raise OptionError(

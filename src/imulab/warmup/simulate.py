@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY
 
@@ -158,7 +158,7 @@ def _check(
     temperature: float, law: str, duration: float, sample_rate: float, repeatability: float, scatter: float
 ) -> None:
     if law not in LAWS:
-        raise OptionError(f"law {law!r}: expected one of {' '.join(LAWS)}")
+        raise OptionError(f"law {law!r}: expected one of {listed(LAWS, law)}")
     for name, value, low, high in (
         ("temperature", temperature, -100.0, 200.0),
         ("duration", duration, 60.0, 1e5),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.errors import OptionError, ReadError, RecordError, UnitError
+from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
 from imulab.units import conversion_factor, parse_unit
 from imulab.warmup.apply import record_table
 from imulab.warmup.model import MODELS, Table, check_table
@@ -116,7 +116,7 @@ def read_table(path: str | Path) -> tuple[Table, str | None]:
 def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]]) -> Table:
     model = settings.get("model", "")
     if model not in MODELS:
-        raise ReadError(f"{path}: '# model: {model}': expected one of {' '.join(MODELS)}")
+        raise ReadError(f"{path}: '# model: {model}': expected one of {listed(MODELS, model)}")
     if len(rows) < 2:
         raise ReadError(f"{path}: expected a line of titles and rows of coefficients")
     interval = model == "interval-cubic"
