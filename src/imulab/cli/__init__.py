@@ -17,12 +17,18 @@ class _TerminatedError(BaseException):
     """The process was asked to end."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``imulab`` with the given arguments (those of the process by default) and return the exit status."""
+def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int:
+    """Run ``imulab`` with the given arguments (those of the process by default) and return the exit status.
+
+    `project` says whether a project file counts.
+    """
     # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        return _main(arguments)
+        from imulab.cli.speech import begin
+
+        with begin(project=project):
+            return _main(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
     except _TerminatedError:
@@ -33,13 +39,13 @@ def _main(arguments: Sequence[str] | None) -> int:
     from typer.exceptions import TyperException
 
     from imulab.cli.app import command
-    from imulab.cli.options import explained, forget, release
+    from imulab.cli.common import usage
+    from imulab.cli.speech import explained, release
     from imulab.errors import ImulabError
 
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a terminal without µ gets a question mark, not a fault
             stream.reconfigure(errors="replace")
-    forget()
     try:
         status = command().main(args=arguments, prog_name="imulab", standalone_mode=False)
         sys.stdout.flush()
@@ -47,8 +53,13 @@ def _main(arguments: Sequence[str] | None) -> int:
     except ImulabError as error:
         return _refuse(explained(str(error)))
     except TyperException as error:
-        return _refuse(_usage(error))
-    except (BrokenPipeError, SystemExit):
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(error.format_message())
+            return 0
+        return _refuse(usage(error))
+    except (BrokenPipeError, SystemExit) as error:
+        if isinstance(error, SystemExit) and (not error.code or "_IMULAB_COMPLETE" in os.environ):
+            return int(error.code or 0)  # a shell was told what completes a word, or how to ask
         # The reader of the output has gone; nothing more can be said there.
         sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115
         return _INTERRUPTED_PIPE
@@ -92,15 +103,3 @@ def _refuse(message: str) -> int:
 
 def _one_line(text: str) -> str:
     return printable(" ".join(text.split()))
-
-
-def _usage(error: object) -> str:
-    """Return a usage error as one line that says what there is instead."""
-    message = _one_line(str(error.format_message()))  # type: ignore[attr-defined]
-    context = getattr(error, "ctx", None)
-    if context is None:
-        return message
-    known = getattr(context.command, "commands", None)
-    if known and "command" in message.lower():
-        return f"{message.rstrip('.')}; known commands: {' '.join(known)}"
-    return f"{message.rstrip('.')}; see '{context.command_path} --help'"

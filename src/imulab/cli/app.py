@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from copy import copy
 from typing import Annotated, Any
 
 import typer
 
 from imulab._version import VERSION
 from imulab.cli import allan, array, centrifuge, convert, export, fleet, records, tumble, warmup
+from imulab.cli.common import offer
 
 _SETTINGS: dict[str, Any] = {
-    "add_completion": False,
+    "no_args_is_help": True,
     "rich_markup_mode": None,
     "context_settings": {"help_option_names": ["-h", "--help"], "max_content_width": 100},
 }
+_EXAMPLES = """
+\b
+Examples:
+  imulab show recording.csv
+  imulab tumble fit recording.csv --gravity 9.81362 -o sn42.json --report sn42.html
+  imulab apply sn42.json flight.csv -o corrected.csv
+\b
+'imulab COMMAND --help' says more; 'imulab demo' runs everything on simulated instruments.
+"""
 _SUMMARIES = {
     "apply": "Correct a recording by records.",
     "show": "Say what is in a record or recording, or what changed.",
@@ -49,7 +58,9 @@ _SUMMARIES = {
 
 def command() -> Any:
     """Return the root command."""
-    app = typer.Typer(help="From recordings of inertial sensors to calibration records and reports.", **_SETTINGS)
+    app = typer.Typer(
+        help="From recordings of inertial sensors to calibration records and reports.", epilog=_EXAMPLES, **_SETTINGS
+    )
     app.callback()(_root)
     app.add_typer(
         tumble.commands(_SETTINGS), name="tumble", help="Calibrate an accelerometer triad with gravity alone."
@@ -72,30 +83,8 @@ def command() -> Any:
         for name in path.split():
             found = found.commands[name]
         found.short_help = summary
-    _offer_unpack_limit(root)
+    offer(root)
     return root
-
-
-def _offer_unpack_limit(group: Any) -> None:
-    """Give every command that reads recordings the option ``--unpack-limit``, which none of them needs to know of."""
-    for command in group.commands.values():
-        if hasattr(command, "commands"):
-            _offer_unpack_limit(command)
-            continue
-        layout = next((parameter for parameter in command.params if parameter.name == "layout"), None)
-        if layout is not None:
-            option = copy(layout)
-            option.name, option.opts, option.metavar = "unpack_limit", ["--unpack-limit"], "SIZE"
-            option.help = "How much a compressed file may unpack to, such as 20GB."
-            option.callback, option.expose_value = _set_unpack_limit, False
-            command.params.append(option)
-
-
-def _set_unpack_limit(context: Any, parameter: Any, value: str | None) -> None:
-    from imulab.readers.unpacking import raise_limit
-    from imulab.texts import size
-
-    raise_limit(None if value is None else size(value, "--unpack-limit"))
 
 
 def _version(wanted: bool) -> None:

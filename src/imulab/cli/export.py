@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab.cli.options import naming, warn, whole_number
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 
 _DEVICE_IDS = 2**32
 
@@ -34,7 +34,7 @@ def export(
     from imulab.verdict import SENTENCES
 
     if to not in EXPORTERS:
-        raise OptionError(f"--to {to!r}: unknown target; known targets: {' '.join(EXPORTERS)}")
+        raise OptionError(f"--to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")
     number = whole_number(device_id, "--device-id")
     if not 0 <= number < _DEVICE_IDS:
         raise OptionError(f"--device-id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")

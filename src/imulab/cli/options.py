@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imulab.cli.speech import hold, speech
+from imulab.cli.speech import note as note
+from imulab.cli.speech import warn as warn
 from imulab.errors import ImulabError, OptionError, ReadError
-from imulab.printable import printable
 from imulab.texts import chosen as chosen
 from imulab.texts import quantity as quantity
 from imulab.texts import whole_number as whole_number
-from imulab.verdict import Note
 
 if TYPE_CHECKING:
     from imulab.calibration import Calibration
@@ -42,11 +43,6 @@ _PAPER = (".pdf", ".png", ".svg", ".docx")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
-_held: dict[str, str] = {}
-"""Warnings that wait for what becomes of their file: its name to the warning."""
-_released: set[str] = set()
-
-
 def heard(
     blocks: Iterable[Recording], *, notes: bool = True, tell: Callable[[str, str], object] | None = None
 ) -> Iterator[Recording]:
@@ -57,13 +53,13 @@ def heard(
     said: set[str] = set()
     for block in blocks:
         yield block  # first: where the data are refused, the refusal is the one line there is
-        for note in block.notes:
-            kind = note.partition(":")[0]
-            if kind not in said and note.startswith("truncated"):
-                tell(block.name, note) if tell else warn(f"{block.name}: {note}")
-            elif note not in said and notes and not note.startswith("truncated"):
-                print(printable(f"imulab: note: {block.name}: {note}"), file=sys.stderr)
-            said |= {kind, note}
+        for said_of in block.notes:
+            kind = said_of.partition(":")[0]
+            if kind not in said and said_of.startswith("truncated"):
+                tell(block.name, said_of) if tell else warn(f"{block.name}: {said_of}")
+            elif said_of not in said and notes and not said_of.startswith("truncated"):
+                note(f"{block.name}: {said_of}")
+            said |= {kind, said_of}
 
 
 def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recording:
@@ -71,7 +67,7 @@ def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recor
     from imulab.readers import read
 
     recording = read(file, layout, **part)
-    list(heard([recording], notes=False, tell=_held.setdefault))
+    list(heard([recording], notes=False, tell=hold))
     return recording
 
 
@@ -92,7 +88,7 @@ class GivenFiles:
         """Read a recording in blocks, and warn where it was cut."""
         from imulab.readers import read_blocks
 
-        return heard(read_blocks(name, layout, **part), notes=False, tell=_held.setdefault)
+        return heard(read_blocks(name, layout, **part), notes=False, tell=hold)
 
     def path(self, name: str) -> Path:
         """Return the path of a file."""
@@ -153,7 +149,7 @@ def naming(file: str) -> Iterator[None]:
 @contextmanager
 def progress_bar(title: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Show how far long work has come, on standard error and only where that is a terminal."""
-    if total is None or not sys.stderr.isatty():
+    if total is None or speech().quiet or not sys.stderr.isatty():
         yield lambda _: None
         return
     from rich.console import Console
@@ -162,39 +158,3 @@ def progress_bar(title: str, total: int | None) -> Iterator[Callable[[int], None
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
-
-
-def warn(message: str) -> None:
-    """Print one line on standard error, after what was held; a `Note` is called one."""
-    release()
-    if message not in _released:
-        kind = "note" if isinstance(message, Note) else "warning"
-        print(printable(f"imulab: {kind}: {message}"), file=sys.stderr)
-
-
-def note(message: str) -> None:
-    """Print one line on standard error that is worth knowing and no warning."""
-    release()
-    print(printable(f"imulab: note: {message}"), file=sys.stderr)
-
-
-def release() -> None:
-    """Print the warnings held so far: the work went on."""
-    for name in list(_held):
-        message = f"{name}: {_held.pop(name)}"
-        _released.add(message)
-        print(printable(f"imulab: warning: {message}"), file=sys.stderr)
-
-
-def forget() -> None:
-    """Begin a command: nothing has been said."""
-    _held.clear()
-    _released.clear()
-
-
-def explained(message: str) -> str:
-    """Return a refusal with what is held about the file that it speaks of, so that one mistake makes one line."""
-    about = [name for name in _held if name in message] or (list(_held) if len(_held) == 1 else [])
-    found = "; ".join(_held[name] if name in message else f"{name}: {_held[name]}" for name in about)
-    forget()
-    return f"{message} ({found})" if found else message

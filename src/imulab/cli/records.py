@@ -199,7 +199,9 @@ def demo(
     folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Folder to write to.")] = "demo",
 ) -> None:
     """Run the procedures on simulated rigs and write recordings, records, corrected data and reports."""
+    from functools import partial
+
     from imulab.cli import main
     from imulab.demo import run
 
-    print(run(folder, main))
+    print(run(folder, partial(main, project=False)))

@@ -10,6 +10,7 @@ import numpy as np
 from imulab.blob import Blob
 from imulab.calibration import Calibration
 from imulab.changes import Comparison
+from imulab.cli.speech import coloured
 from imulab.errors import ReadError
 from imulab.exhibit import Table, format_uncertain, plain_number
 from imulab.present import change_unit, exhibits_of
@@ -42,10 +43,10 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
 def verdict_line(verdict: Verdict) -> str:
     """Return a verdict in one line: its state, the gravest reason, and how many more there are."""
     if not verdict.reasons:
-        return f"{verdict.state}: {SENTENCES[verdict.state]}"
+        return f"{coloured(verdict.state)}: {SENTENCES[verdict.state]}"
     more = len(verdict.reasons) - 1
     others = f" (and {more} more: see the warnings)" if more else ""
-    return f"{verdict.state}: {SENTENCES[verdict.state]}: {verdict.reasons[0]}{others}"
+    return f"{coloured(verdict.state)}: {SENTENCES[verdict.state]}: {verdict.reasons[0]}{others}"
 
 
 def describe_blob(blob: Blob) -> str:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
+from time import perf_counter
 from typing import BinaryIO
 
 import numpy as np
@@ -21,6 +23,9 @@ from imulab.readers.text import TextFile
 from imulab.recording import Array, Recording, Source
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
+
+_LOG = logging.getLogger(__name__)
+"""Says of each file what it is, and how many rows of which times were read in how long."""
 
 
 def read(
@@ -64,7 +69,7 @@ def read(
     selection = Selection(topic, instance, window)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
-    blocks = list(windowed(_blocks(file, name, known, selection, hashed), window, name))
+    blocks = list(_told(windowed(_blocks(file, name, known, selection, hashed), window, name)))
     source = Source(name, hashed.of(file))
     first = blocks[0]
     joined = {key: _joined([block.columns[key] for block in blocks]) for key in first.columns}
@@ -96,7 +101,25 @@ def read_blocks(
     """
     selection = Selection(topic, instance, window)
     name = name or _name(file)
-    yield from windowed(_blocks(file, name, _layout(layout), selection, None), window, name)
+    yield from _told(windowed(_blocks(file, name, _layout(layout), selection, None), window, name))
+
+
+def _told(blocks: Iterator[Recording]) -> Iterator[Recording]:
+    """Pass blocks on, and log at the end what there was and the time that reading took."""
+    rows, seconds, name, columns, ends = 0, 0.0, "", "", list[float]()
+    while True:
+        begun = perf_counter()
+        block = next(blocks, None)
+        seconds += perf_counter() - begun
+        if block is None:
+            break
+        rows, name, columns = rows + len(block), block.name, " ".join(block.columns)
+        if block.time is not None and len(block):
+            ends = [*ends[:1], float(block.time[0]), float(block.time[-1])]
+        yield block
+    times = f", {ends[0]:.6g} to {ends[-1]:.6g} s" if ends else ""
+    if name:
+        _LOG.info("%s: %d rows%s, columns %s; read in %.2f s", name, rows, times, columns, seconds)
 
 
 def _joined(parts: list[Array]) -> Array:
@@ -147,6 +170,9 @@ def _blocks(
         if not is_pipe(file) and not (layout is not None and layout.text):
             with _open(file, name) as stream:
                 kind = recognised(stream.read(1024))
+    chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
+    said = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
+    _LOG.info("%s: a %s file%s", name, kind.name, said)
     if kind.layout == "none" and layout is not None:
         raise ReadError(f"{name}: a {kind.name} file says itself what its columns are; leave out {layout.name}")
     if kind is not TEXT:

@@ -8,13 +8,14 @@ place, or a reading of NaN, says that a quantity is not reported.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from imulab.errors import OptionError, ReadError
+from imulab.errors import OptionError, ReadError, listed
 from imulab.readers import logs
 from imulab.readers.rosfiles import Container, Topic, files_of, open_container
 from imulab.readers.selection import Selection
@@ -96,11 +97,12 @@ def _choose(topics: list[Topic], wanted: str | None, name: str) -> list[str]:
     if wanted is None:
         if len(there) > 1:
             raise OptionError(f"{name}: several Imu topics, choose one with --topic: {' '.join(there)}")
+        logging.getLogger(__name__).info("%s: topic %s, the only one of an Imu", name, there[0])
         return there
     chosen = [entry if entry.startswith("/") or entry in there else f"/{entry}" for entry in wanted.split(",")]
     for entry in chosen:
         if entry not in there:
-            raise OptionError(f"{name}: no Imu topic {entry}; Imu topics found: {' '.join(there)}")
+            raise OptionError(f"{name}: no Imu topic {entry}; Imu topics found: {listed(there, entry)}")
     if len(chosen) > 2 or len(set(chosen)) < len(chosen):
         raise OptionError(f"{name}: topic {wanted!r}: expected one, or the accelerometer's and the gyroscope's: A,G")
     return chosen

@@ -1,0 +1,160 @@
+"""What every command has: how much it says, the project file, the size of what it unpacks, and what a shell offers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+
+from imulab.cli import project
+from imulab.cli.speech import choose, note, speech, tell
+from imulab.errors import OptionError, listed, meant
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "tumble plan --criterion": ("imulab.tumble.optimal:CRITERIA",),
+    "tumble plan --from": ("sphere", "fixture:15", "head:15"),
+    "tumble fit --order": ("auto", "0", "1", "2", "3", "4", "5", "blend"),
+    "tumble fit --method": ("imulab.tumble.fit:METHODS",),
+    "tumble fit --loss": ("imulab.tumble.fit:LOSSES",),
+    "tumble gyro --g-sensitivity": ("auto", "yes", "no"),
+    "tumble gyro --clock-of": ("gyro", "accel"),
+    "array simulate --experiment": ("imulab.gyro_array.simulate:EXPERIMENTS",),
+    "array simulate --mounting": ("same", "alternate"),
+    "array simulate --fault": ("imulab.gyro_array.simulate:FAULTS",),
+    "array simulate --unit": ("rad/s", "deg/s", "deg/h"),
+    "array fuse --method": ("imulab.arraytable:METHODS",),
+    "array fuse --memory": ("growing",),
+    "array fuse --initial-bias": ("first", "zero"),
+    "array compare --experiment": ("static", "dynamic"),
+    "allan --taus": ("octave", "dense"),
+    "warmup simulate --law": ("imulab.warmup.simulate:LAWS",),
+    "warmup fit --model": ("auto", "imulab.warmup.model:MODELS"),
+    "warmup fit --exit": ("imulab.warmup.model:EXITS",),
+    "warmup fit --pool": ("imulab.warmup.fit:POOLS",),
+    "warmup fit --beyond": ("imulab.warmup.model:BEYOND",),
+    "centrifuge reduce --method": ("imulab.centrifuge.fit:METHODS",),
+    "centrifuge reduce --curve": ("auto", "imulab.centrifuge.curve:MODELS"),
+    "export --to": ("imulab.exporters:EXPORTERS",),
+    "fleet run --engine": ("imulab.fleet.engine:ENGINES",),
+}
+"""The values that a shell offers for an option: words, or where a module lists them."""
+
+
+def offer(root: Any) -> None:
+    """Give every command the options that all have, and every option of few values those to complete it by."""
+    app = typer.Typer()
+    app.command()(_common)
+    quiet, verbose, no_project, unpack_limit = typer.main.get_command(app).params[:4]
+    for path, command in _commands(root):
+        names = {parameter.name for parameter in command.params}
+        given = sorted(names & set(project.KEYS))
+        command.params += [quiet, verbose, *([no_project] if given else [])]
+        command.params += [unpack_limit] if "layout" in names else []
+        files = [parameter.name for parameter in command.params if parameter.param_type_name == "argument"]
+        command.callback = partial(_run, command.callback, path, files)
+        for parameter in command.params:
+            for option in parameter.opts:
+                if values := _CHOICES.get(f"{path} {option}"):
+                    parameter._custom_shell_complete = partial(_complete, values)
+
+
+def _commands(group: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from _commands(command, f"{path}{name} ")
+        else:
+            yield f"{path}{name}", command
+
+
+def _common(
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="No progress and no notes; warnings stay.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="Say what was read and chosen, and how long it took.")
+    ] = False,
+    no_project: Annotated[bool, typer.Option("--no-project", help=f"Do without {project.NAME}.")] = False,
+    unpack_limit: Annotated[
+        str | None,
+        typer.Option("--unpack-limit", metavar="SIZE", help="How much a compressed file may unpack to, such as 20GB."),
+    ] = None,
+) -> None:
+    """Stand for the options that every command has."""
+
+
+def _run(
+    command: Callable[..., Any],
+    path: str,
+    files: list[str],
+    /,
+    *,
+    quiet: bool,
+    verbose: bool,
+    no_project: bool = False,
+    unpack_limit: str | None = None,
+    **values: Any,
+) -> Any:
+    """Run a command, with what a project file says put where nothing was typed."""
+    if quiet and verbose:
+        raise OptionError("--quiet together with --verbose: expected one or the other")
+    choose(quiet=quiet, verbose=verbose, project=not no_project)
+    if "layout" in values:
+        from imulab.readers.unpacking import raise_limit
+        from imulab.texts import size
+
+        raise_limit(None if unpack_limit is None else size(unpack_limit, "--unpack-limit"))
+    values |= _from_project(values, files)
+    begun = perf_counter()
+    result = command(**values)
+    tell(f"{path} took {perf_counter() - begun:.2f} s")
+    return result
+
+
+def _from_project(values: dict[str, Any], files: list[str]) -> dict[str, str]:
+    if not speech().project or all(values.get(key, "") is not None for key in project.KEYS):
+        return {}
+    here = Path.cwd()
+    path = project.find(here)
+    if path is None:
+        tell(f"no project file {project.NAME} here or above")
+        return {}
+    shown = os.path.relpath(path, here)
+    read = [name for key in files for name in _names(values[key])]
+    added = project.additions(project.load(path, shown), values, read)
+    tell(f"project file {shown}{'' if added else ', which says nothing for this command'}")
+    if added:
+        note(f"{', '.join(f'--{key} {text}' for key, text in added.items())} from {shown}")
+    return added
+
+
+def _names(value: Any) -> list[str]:
+    return [value] if isinstance(value, str) else list(value or [])
+
+
+def _complete(values: tuple[str, ...], context: Any, parameter: Any, incomplete: str) -> list[str]:
+    words: list[str] = []
+    for value in values:
+        module, colon, name = value.partition(":")
+        words += getattr(import_module(module), name) if colon and "." in module else [value]
+    return [word for word in words if word.startswith(incomplete)]
+
+
+def usage(error: Any) -> str:
+    """Return a mistake in the way a command was typed, as one line that says what there is instead."""
+    context = getattr(error, "ctx", None)
+    message = str(error.format_message())
+    if context is None:
+        return message
+    known = getattr(context.command, "commands", None)
+    if known and "command" in message.lower():
+        typed = message.partition("'")[2].partition("'")[0]
+        return f"{message.partition('. ')[0].rstrip('.')}; known commands: {listed(known, typed)}"
+    close = ""
+    if hasattr(error, "possibilities"):  # typer names the options that it finds like it, in its own words
+        options = [name for parameter in context.command.params for name in parameter.opts]
+        message, close = f"No such option: {error.option_name}", meant(options, error.option_name)
+    return f"{message.rstrip('.')}; see '{context.command_path} --help'{close}"

@@ -1,0 +1,183 @@
+"""What every command has: help where nothing is asked, suggestions, completion, how much is said, and colours."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from imulab.cli import main, speech
+from imulab.errors import listed, meant
+
+
+@pytest.fixture
+def recording(imulab):
+    done = imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
+    assert done.returncode == 0
+    return "t.csv"
+
+
+def test_alone_it_prints_help_with_three_examples(imulab):
+    done = imulab()
+    assert done.returncode == 0
+    assert done.stderr == ""
+    assert done.stdout == imulab("--help").stdout
+    examples = done.stdout.partition("Examples:\n")[2].split("\n\n")[0].splitlines()
+    assert sum(line.startswith("    imulab ") for line in examples) == 3
+
+
+@pytest.mark.parametrize("group", ["tumble", "array", "warmup", "centrifuge", "fleet"])
+def test_a_group_alone_prints_its_help(capsys, group):
+    assert main([group]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"Usage: imulab {group} ")
+    assert err == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "end"),
+    [
+        (["tumbel"], "; did you mean 'tumble'?"),
+        (["tumble", "fitt"], "; did you mean 'fit'?"),
+        (["tumble", "fit", "x.csv", "--gravty", "9.8"], "'imulab tumble fit --help'; did you mean '--gravity'?"),
+        (["tumble", "fit", "x.csv", "--zzz"], "No such option: --zzz; see 'imulab tumble fit --help'"),
+        (["tumble", "fit", "x.csv", "--loss", "Huber"], "square huber auto; did you mean 'huber'?"),
+        (["tumble", "fit", "x.csv", "--method", "linearized"], "did you mean 'linearised'?"),
+        (["tumble", "simulate", "-o", "x.csv", "--unit", "m/s^3"], "; did you mean 'm/s^2'?"),
+        (["tumble", "plan", "--attitudes", "12", "--noise", "20 ugg"], "; did you mean 'ug'?"),
+        (["export", "--to", "Kalibra", "-o", "d", "x.json"], "did you mean 'kalibr'?"),
+        (["warmup", "simulate", "-o", "d", "--law", "smoth"], "did you mean 'smooth'?"),
+        (["array", "simulate", "-o", "x.csv", "--experiment", "dynamical"], "did you mean 'dynamic'?"),
+    ],
+)
+def test_a_slip_of_the_pen_is_told_what_was_meant(capsys, tmp_path, monkeypatch, arguments, end):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.endswith(f"{end}\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_what_is_near_is_suggested():
+    assert meant(["huber", "square"], "HUBER") == "; did you mean 'huber'?"
+    assert meant(["huber", "square"], "median") == ""
+    assert listed(iter(["auto", "0"]), 7) == "auto 0"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("tumble fit --loss s", ["square"]),
+        ("export --to k", ["kalibr"]),
+        ("warmup fit --model ", ["auto", "interval-cubic", "knot-cubic", "knot-log-cubic", "exponential"]),
+        ("centrifuge reduce --curve c", ["constant", "c1", "c2", "c1+c2"]),
+        ("array fuse --method k", ["kalman"]),
+        ("tumble c", ["check"]),
+        ("tumble gyro --clock", ["--clock", "--clock-of"]),
+    ],
+)
+def test_a_shell_completes_commands_options_and_values(words, expected):
+    words = f"imulab {words}"
+    environment = os.environ | {
+        "_IMULAB_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split(" ")) - 1),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", "from imulab.cli import run; run()"], env=environment, capture_output=True, text=True
+    )
+    assert done.stdout.split() == expected
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_every_choice_for_completion_is_an_option_that_takes_it():
+    """The table is apart from the commands: each of its options is there, and each of its lists is one of words."""
+    from imulab.cli import common
+    from imulab.cli.app import command
+
+    options = {
+        f"{path} {option}": parameter
+        for path, found in common._commands(command())
+        for parameter in found.params
+        for option in parameter.opts
+    }
+    for option, values in common._CHOICES.items():
+        words = options[option].shell_complete(None, "")
+        assert len(words) >= len(values)
+        assert all(word.value for word in words)
+
+
+def test_quiet_leaves_out_notes_and_keeps_the_result_and_warnings(imulab, recording, tmp_path):
+    said = imulab("tumble", "fit", recording, "--gravity", "9.81", "--order", "1")
+    assert "imulab: note: gravity 9.81 m/s^2 counts as rounded" in said.stderr
+    quiet = imulab("tumble", "fit", recording, "--gravity", "9.81", "--order", "1", "-q")
+    assert quiet.stdout == said.stdout
+    assert quiet.stderr == ""
+    text = (tmp_path / recording).read_text()
+    (tmp_path / "bare.csv").write_text("".join(x for x in text.splitlines(True) if not x.startswith("# gravity")))
+    assert imulab("tumble", "fit", "bare.csv", "--quiet").stderr.startswith("imulab: warning: no local gravity")
+
+
+def test_verbose_says_what_was_read_and_how_long_it_took(imulab, recording):
+    plain = imulab("tumble", "fit", recording, "--gravity", "9.80665")
+    done = imulab("tumble", "fit", recording, "--gravity", "9.80665", "--window", "1:60", "-v")
+    assert done.returncode == 0
+    assert done.stdout.splitlines()[1] == plain.stdout.splitlines()[1]
+    assert f"imulab: {recording}: a text file\n" in done.stderr
+    assert f"imulab: {recording}: 5901 rows, 1 to 60 s, columns time accel_x accel_y accel_z " in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("imulab: tumble fit took ")
+    assert imulab("show", recording, "-q", "-v").stderr == (
+        "imulab: --quiet together with --verbose: expected one or the other\n"
+    )
+
+
+def test_json_stays_alone_on_standard_output_when_much_is_said(imulab, recording):
+    done = imulab("tumble", "fit", recording, "--json", "-v")
+    assert json.loads(done.stdout)["procedure"] == "tumble"
+    assert "rows" in done.stderr
+
+
+def test_every_command_takes_both(capsys):
+    from imulab.cli import common
+    from imulab.cli.app import command
+
+    for path, found in common._commands(command()):
+        options = [option for parameter in found.params for option in parameter.opts]
+        assert {"-q", "--quiet", "-v", "--verbose"} <= set(options), path
+        assert len(options) == len(set(options)), path
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_colours_are_for_terminals_that_want_them(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert speech.coloured("good", Terminal()) == "\x1b[32mgood\x1b[0m"
+    assert speech.coloured("look", Terminal()) == "\x1b[33mlook\x1b[0m"
+    assert speech.coloured("bad", Terminal()) == "\x1b[31mbad\x1b[0m"
+    assert speech.coloured("good", io.StringIO()) == "good"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert speech.coloured("good", Terminal()) == "good"
+    monkeypatch.delenv("NO_COLOR")
+    monkeypatch.setenv("TERM", "dumb")
+    assert speech.coloured("bad", Terminal()) == "bad"
+
+
+def test_what_one_command_said_is_not_said_by_the_next(capsys):
+    with speech.begin(project=True):
+        speech.hold("f.csv", "truncated")
+        with speech.begin(project=False):
+            assert speech.explained("g.csv: no") == "g.csv: no"
+            speech.choose(quiet=True, verbose=False, project=True)
+            assert not speech.speech().project
+            speech.note("nothing")
+        assert speech.explained("f.csv: no") == "f.csv: no (truncated)"
+        speech.note("something")
+    assert capsys.readouterr().err == "imulab: note: something\n"
