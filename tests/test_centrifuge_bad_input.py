@@ -116,7 +116,7 @@ MANIFEST_CASES = {
         "arm_rate = 126.8726", 'arm_rate = "fast"',
         ["run 2 (c1_1g.csv): arm_rate", "expected a number"],
     ),
-    "not TOML": ("radius =", "radius ==", ["m.toml: the manifest is not TOML"]),
+    "not TOML": ("radius =", "radius ==", ["m.toml: the manifest file is not TOML"]),
     "rates that do not match": (
         "arm_rate = 283.6958", "arm_rate = 287.6958",
         [f"run 3 ({LOADED})", "rates do not match", "Earth-rate line is at 39.98", "net rate 44 deg/s"],

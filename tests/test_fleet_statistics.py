@@ -237,7 +237,7 @@ def test_limits_by_name_and_pattern(tmp_path):
 
 
 BAD_LIMITS = {
-    "no toml": ("[tumble", "the limits are not TOML"),
+    "no toml": ("[tumble", "the limits file is not TOML"),
     "unknown procedure": ("[tumbel]\n", "unknown procedure 'tumbel'; known procedures: tumble array"),
     "no table": ("tumble = 3\n", "tumble: expected lines such as bias_x"),
     "unknown parameter": (

@@ -380,7 +380,7 @@ LAYOUTS = {
         'sample_rate = { value = true, unit = "Hz" }\n' + FOG,
         "sample_rate: expected a positive number of Hz",
     ),
-    "not TOML": ("columns = [", "the layout is not TOML"),
+    "not TOML": ("columns = [", "the layout file is not TOML"),
     "unit unknown": (
         '[columns]\nfog = { from = 0, unit = "vo" }\n',
         "column fog: unknown unit 'vo'; known units: s ms",
@@ -404,7 +404,7 @@ def test_a_layout_that_is_none_is_refused(file, case):
 def test_a_layout_that_cannot_be_read_is_refused(tmp_path, file):
     with pytest.raises(ReadError, match=r"absent\.toml: no such layout file"):
         load_layout(tmp_path / "absent.toml")
-    with pytest.raises(ReadError, match="the layout cannot be read"):
+    with pytest.raises(ReadError, match="the layout file cannot be read"):
         load_layout(file(b"\xff\xfe", "latin.toml"))
 
 

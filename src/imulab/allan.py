@@ -23,6 +23,7 @@ _SENSORS = ("gyro", "dtg", "fog", "accel")
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
 _NOISE_REACH = 20.0
+_LARGEST = 1e140
 _MOST_NAMED, _MOST_COLUMNS = 3, 6
 
 
@@ -63,8 +64,11 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         left_out.check(0, len(recording), "the recording")
         more += [type(note)(f"{recording.name}: {note}") for note in left_out.notes()]
         recording = left_out.recording
+    _check_squares(recording, names)
     recording, trimmed = steady_part(recording)
     rate, timing = sampling_rate(recording)
+    if not 1 / _LARGEST < rate < _LARGEST:
+        raise DataError(f"{recording.name}: column time: {rate:.3g} samples in a second; expected a rate of sensors")
     notes += [*more, *trimmed, *timing]
     moved = _moved(recording, names, rate)
     columns: dict[str, Any] = {}
@@ -96,6 +100,18 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         "warnings": notes,
         "columns": columns,
     }
+
+
+def _check_squares(recording: Recording, names: list[str]) -> None:
+    """Refuse samples whose squares, summed over a recording, are no numbers of this machine."""
+    for name in names:
+        size = np.abs(recording.si(name))
+        index = int(np.argmax(size))
+        if size[index] > _LARGEST:
+            raise DataError(
+                f"{recording.name}: {recording.place(index)}, column {name}: expected a reading, found "
+                f"{recording.column(name)[index]:.6g}, which is too large to be squared"
+            )
 
 
 def column_noise(samples: Array, rate: float, moved: str = "") -> ColumnNoise:
@@ -158,7 +174,7 @@ def _columns(names: list[str]) -> str:
 
 def _moved(recording: Recording, names: list[str], rate: float) -> dict[str, str]:
     """Columns whose means over a second range farther than any zero drifts and than noise explains, and why."""
-    size = max(1, round(rate))
+    size = max(1, min(round(rate), len(recording)))
     moved: dict[str, float] = {}
     for name in names:
         quantity = parse_unit(recording.units[name]).quantity

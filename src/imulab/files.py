@@ -15,6 +15,20 @@ from imulab.errors import OptionError
 _UMASK = threading.Lock()
 
 
+def real_path(path: str | Path) -> Path:
+    """Return the absolute path of the file that a name leads to, through links.
+
+    Raises
+    ------
+    OptionError
+        The links go round in a circle.
+    """
+    found = Path(os.path.realpath(path))
+    if found.is_symlink():
+        raise OptionError(f"{path}: cannot be written: too many levels of symbolic links")
+    return found
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
     """Open a new file beside `path` that takes its place when the block ends well, and vanishes otherwise.
@@ -24,7 +38,7 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     OptionError
         The file cannot be written there.
     """
-    target = Path(path).resolve()  # through a link to the file that it names
+    target = real_path(path)  # through a link to the file that it names
     if target.is_dir():
         raise OptionError(f"{path}: expected the name of a file to write, found a folder")
     if target.exists() and not target.is_file():  # a device or a pipe is written to, not replaced

@@ -6,7 +6,6 @@ TOML; the keys are those of docs/centrifuge.md. An unknown key is refused by nam
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from imulab.centrifuge.entries import Window, example, overlap, quantity_of, win
 from imulab.centrifuge.model import specific_force
 from imulab.entries import check_keys, number_of, scale_factor_of, unit_of
 from imulab.errors import ReadError, UnitError
+from imulab.toml import load_toml
 from imulab.units import STANDARD_GRAVITY, from_si, to_si
 
 COLUMNS = ("dtg_x", "dtg_y", "fog")
@@ -110,16 +110,7 @@ def load_manifest(path: str | Path, name: str | None = None) -> Manifest:
         A unit is unknown or of another quantity.
     """
     name = name or str(path)
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ReadError(f"{name}: no such manifest") from None
-    except IsADirectoryError:
-        raise ReadError(f"{name}: expected a manifest, found a folder") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ReadError(f"{name}: the manifest cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ReadError(f"{name}: the manifest is not TOML: {error}") from None
+    table = load_toml(path, name, "manifest")
     return parse_manifest(table, name)
 
 

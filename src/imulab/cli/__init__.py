@@ -81,7 +81,10 @@ def _main(arguments: Sequence[str] | None) -> int:
 def run() -> None:
     """Entry point of the installed command; a termination unwinds it, so that no part of a file stays behind."""
     signal.signal(signal.SIGTERM, _terminate)
+    closed = _open_closed()
     status = main()
+    if "stdout" in closed:  # what could not be written is not tried again at the end, with a traceback
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     if status == _INTERRUPTED:
         # Python ends by the signal itself, and not with this status, where an interrupt met the exec() of a text, as
         # dataclasses have it while they are imported, even though it was handled here.
@@ -90,6 +93,22 @@ def run() -> None:
         sys.stderr.flush()
         os._exit(status)
     sys.exit(status)
+
+
+def _open_closed() -> set[str]:
+    """Put something in the place of standard streams that are closed, which files opened later would get; return which.
+
+    Input and output still refuse to be used, as closed ones do; what is said on standard error is lost.
+    """
+    closed = {name for name in ("stdin", "stdout", "stderr") if getattr(sys, name) is None}
+    for number, name, flags in ((0, "stdin", os.O_WRONLY), (1, "stdout", os.O_RDONLY), (2, "stderr", os.O_WRONLY)):
+        if name in closed:
+            taken = os.open(os.devnull, flags)
+            if taken != number:
+                os.dup2(taken, number)
+                os.close(taken)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
+    return closed
 
 
 def _terminate(number: int, frame: object) -> None:

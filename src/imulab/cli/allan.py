@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab.cli.options import AsJson, LayoutFile, RecordingFile, warn
+from imulab.printable import printable
 
 _HOUR = 3600.0
 _DEGREE = math.pi / 180
@@ -59,7 +60,7 @@ def describe(found: dict[str, Any]) -> str:
                 else title.replace("angle", "velocity").replace("rate", "acceleration")
             )
             rows.append([name, label, *texts, unit])
-    lines = [f"{found['file']}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
+    lines = [f"{printable(found['file'])}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
     lines += aligned(["column", "coefficient", "value", "u", "unit"], rows)
     names = list(found["columns"])
     units = {name: _shown(found["columns"][name]["unit"], "bias_instability") for name in names}

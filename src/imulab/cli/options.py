@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -107,7 +108,9 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
     OptionError
         An output cannot be written, or would overwrite another file of this command.
     """
-    taken = {Path(name).resolve(): name for name in inputs if name != "-"}
+    from imulab.files import real_path
+
+    taken = {Path(os.path.realpath(name)): name for name in inputs if name != "-"}
     for name in outputs:
         if name is None:
             continue
@@ -115,11 +118,12 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
             raise OptionError(f"output {name!r}: expected the name of a file to write")
         if Path(name).suffix.lower() in _PAPER:
             raise OptionError(f"{name}: no such file is written; reports are HTML (.html), which any browser prints")
-        if Path(name).resolve() in taken:
-            raise OptionError(f"{name}: would overwrite {taken[Path(name).resolve()]}; expected another name")
-        if not Path(name).resolve().parent.is_dir():
+        target = real_path(name)
+        if target in taken:
+            raise OptionError(f"{name}: would overwrite {taken[target]}; expected another name")
+        if not target.parent.is_dir():
             raise OptionError(f"{name}: cannot be written: no such folder")
-        taken[Path(name).resolve()] = name
+        taken[target] = name
 
 
 def is_json(file: str) -> bool:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from imulab.errors import OptionError, listed
+from imulab.toml import load_toml
 
 NAME = "imulab.toml"
 OFF = "IMULAB_NO_PROJECT"
@@ -36,15 +36,10 @@ def load(path: Path, shown: str) -> dict[str, str]:
 
     Raises
     ------
-    OptionError
+    ReadError, OptionError
         It cannot be read, or has a key or value that it cannot have.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise OptionError(f"{shown}: the project file cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise OptionError(f"{shown}: the project file is not TOML: {error}") from None
+    table = load_toml(path, shown, "project")
     found: dict[str, str] = {}
     for key, value in table.items():
         if key not in KEYS:

@@ -14,6 +14,7 @@ from imulab.cli.speech import coloured
 from imulab.errors import ReadError
 from imulab.exhibit import Table, format_uncertain, plain_number
 from imulab.present import change_unit, exhibits_of
+from imulab.printable import printable
 from imulab.recording import Array, Recording
 from imulab.verdict import SENTENCES, Verdict
 
@@ -33,7 +34,7 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
             lines += [f"{item.title}{chosen}", *aligned(["", *item.columns], mark), ""]
     if provenance:
         lines += [f"created {record.created} by {record.software}"]
-        lines += [f"source {source.file} SHA-256 {source.sha256}" for source in record.sources]
+        lines += [f"source {printable(source.file)} SHA-256 {source.sha256}" for source in record.sources]
         lines += [
             f"{'warning' if message in record.verdict.reasons else 'note'}: {message}" for message in record.warnings
         ]
@@ -166,7 +167,7 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
             columns.setdefault(name, _Column()).add(values)
     if block is None:
         raise ReadError("the recording is empty")
-    lines = [f"{block.name}: {samples} samples"]
+    lines = [f"{printable(block.name)}: {samples} samples"]
     lines += clock.text() if "time" in block else ["no time column: a table of attitudes, a row each"]
     rows = [[name, block.units[name], *column.texts()] for name, column in columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]

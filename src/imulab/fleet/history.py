@@ -12,6 +12,7 @@ from typing import Any
 
 from imulab.calibration import Parameter
 from imulab.errors import OptionError
+from imulab.fleet.sources import masked
 from imulab.fleet.work import Summary
 
 _MANY = 500
@@ -176,8 +177,8 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
     expected = "expected a URL such as sqlite:///history.sqlite or postgresql://user@host/database"
     try:
         address = sa.make_url(url)
-    except SQLAlchemyError:
-        raise OptionError(f"history {url!r}: {expected}") from None
+    except (SQLAlchemyError, ValueError):  # a port that is no number
+        raise OptionError(f"history {masked(url)!r}: {expected}") from None
     name = address.render_as_string(hide_password=True)
     kind = address.get_backend_name()
     if kind not in ("sqlite", "postgresql"):

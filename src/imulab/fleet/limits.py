@@ -8,16 +8,15 @@ misalignment_yx = { upper = 3, unit = "mrad" }
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from pathlib import Path
 from typing import Any
 
 from imulab.errors import ReadError, UnitError, listed
 from imulab.fleet.display import to_parameter_unit
 from imulab.tasks import TASKS
+from imulab.toml import load_toml
 
 
 @dataclass(frozen=True)
@@ -45,14 +44,7 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
     UnitError
         A unit is not one of the parameter's.
     """
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ReadError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ReadError(f"{path}: the limits cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ReadError(f"{path}: the limits are not TOML: {error}") from None
+    table = load_toml(path, str(path), "limits")
     found: dict[tuple[str, str], Limits] = {}
     for procedure, entries in table.items():
         if procedure not in TASKS:

@@ -132,7 +132,8 @@ def _parquet(data: bytes, name: str) -> list[tuple[str, list[str]]]:
 def _check_columns(titles: Sequence[str], name: str) -> None:
     for title in COLUMNS:
         if title not in titles:
-            raise OptionError(f"{name}: no column {title}; found {' '.join(titles)}")
+            found = " ".join(titles)
+            raise OptionError(f"{name}: no column {title}; found {found if len(found) < 300 else found[:300] + ' ...'}")
     known = [*COLUMNS, *dict.fromkeys(option for task in TASKS.values() for option in task.options)]
     for index, title in enumerate(titles):
         if title.replace("-", "_") not in known:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from imulab._version import VERSION
 from imulab.errors import OptionError
-from imulab.files import write_text
+from imulab.files import real_path, write_text
 from imulab.fleet.engine import Engine, WorkersLostError, open_engine
 from imulab.fleet.history import History, open_history
 from imulab.fleet.manifest import FleetManifest, Unit, load_fleet, modules_of
@@ -68,7 +68,7 @@ class FleetState:
 
 def default_history(folder: str | Path) -> str:
     """Return the URL of the history that a fleet has where no other is named."""
-    return f"sqlite:///{Path(folder).resolve() / HISTORY}"
+    return f"sqlite:///{real_path(folder) / HISTORY}"
 
 
 def run_fleet(
@@ -111,7 +111,7 @@ def run_fleet(
     """
     begin = time.monotonic()
     fleet = load_fleet(manifest) if isinstance(manifest, str) else manifest
-    store = Store(Path(folder).resolve())
+    store = Store(real_path(folder))
     if not folder:
         raise OptionError("output '': expected the name of a folder to write to")
     if store.folder.exists() and not store.folder.is_dir():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -10,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from imulab.errors import ImulabError, ReadError
 
@@ -39,7 +41,7 @@ def masked(text: str) -> str:
 
 def parent_of(path: str) -> str:
     """Return the folder or URL that a manifest's paths are relative to."""
-    return path.rpartition("/")[0] if is_url(path) else str(Path(path).resolve().parent)
+    return path.rpartition("/")[0] if is_url(path) else str(Path(os.path.realpath(path)).parent)
 
 
 @contextmanager
@@ -68,6 +70,10 @@ def local_file(address: str, name: str) -> Iterator[Path]:
         raise ReadError(
             f"{name}: a login in the address would end up in records and reports; expected it in the environment"
         )
+    try:
+        _ = urlsplit(address).port
+    except ValueError as error:
+        raise ReadError(f"{name}: no address: {' '.join(str(error).split())}") from None
     with tempfile.TemporaryDirectory(prefix="imulab-", ignore_cleanup_errors=True) as folder:
         yield _fetched(address, name, Path(folder))
 

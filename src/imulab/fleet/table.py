@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from imulab.errors import OptionError
-from imulab.files import replacing
+from imulab.files import real_path, replacing
 from imulab.fleet.manifest import Unit
 from imulab.fleet.work import Summary
 
@@ -71,7 +71,7 @@ def check_table(path: str) -> None:
             import polars  # noqa: F401
         except ImportError:
             raise OptionError(f"{path}: Parquet needs polars: pip install 'imulab[tables]'") from None
-    if not Path(path).resolve().parent.is_dir():
+    if not real_path(path).parent.is_dir():
         raise OptionError(f"{path}: cannot be written: no such folder")
 
 

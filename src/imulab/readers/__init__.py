@@ -169,7 +169,10 @@ def _blocks(
         # A pipe can be read once: it is text, or is refused as none.
         if not is_pipe(file) and not (layout is not None and layout.text):
             with _open(file, name) as stream:
-                kind = recognised(stream.read(1024))
+                try:
+                    kind = recognised(stream.read(1024))
+                except OSError as error:
+                    raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
     chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
     said = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
     _LOG.info("%s: a %s file%s", name, kind.name, said)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from imulab.entries import check_keys, number_of, scale_factor_of
 from imulab.errors import ReadError, UnitError, listed
 from imulab.recording import Array, check_unit
+from imulab.toml import load_toml
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
 EXAMPLE = """\
@@ -151,16 +151,7 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
         A unit is unknown or does not belong to its column.
     """
     name = name or str(path)
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ReadError(f"{name}: no such layout file") from None
-    except IsADirectoryError:
-        raise ReadError(f"{name}: expected a layout file, found a folder") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ReadError(f"{name}: the layout cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ReadError(f"{name}: the layout is not TOML: {error}") from None
+    table = load_toml(path, name, "layout")
     return _layout(table, name)
 
 
