@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -154,7 +155,12 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
         p.name for p in (tmp_path / "here" / "firmware").iterdir()
     }
     assert {"line", "fleet.html"} <= names
-    assert 'href="fleet.html"' in (tmp_path / "here" / "index.html").read_text()
+    index = (tmp_path / "here" / "index.html").read_text()
+    assert 'href="fleet.html"' in index
+    for name in ("tumble", "array", "warmup", "centrifuge"):
+        verdict = il.load(tmp_path / "here" / f"{name}.json").verdict
+        assert f'class="state {verdict.state}"' in index
+        assert all(reason in unescape(index) for reason in verdict.reasons[:1])
     assert "12 of 12 units have their record; LINE-0005 stands out; bias_z drifts over the date" in done.stdout
     assert "LINE-0007 changed since the last calibration" in done.stdout
     assert il.load(tmp_path / "here" / "tumble.json").model["order"] == 2

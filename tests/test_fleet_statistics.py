@@ -13,11 +13,11 @@ from imulab.calibration import Parameter
 from imulab.cli import main
 from imulab.errors import ImulabError
 from imulab.fleet.display import display_of, to_parameter_unit
-from imulab.fleet.figures import summary_table
 from imulab.fleet.history import Past
 from imulab.fleet.limits import Limits, load_limits
 from imulab.fleet.manifest import FleetManifest
 from imulab.fleet.report import fleet_exhibits
+from imulab.fleet.reporttables import summary_table
 from imulab.fleet.run import FleetState, run_fleet
 from imulab.fleet.statistics import (
     capability,

@@ -3,6 +3,7 @@
 import re
 import subprocess
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from imulab.errors import RecordError
 from imulab.exhibit import Exhibits, Figure, Table, format_uncertain
 from imulab.present import exhibits_of
 from imulab.report import render_page
+from imulab.report.narrow import narrow
 from reference import tumble as reference
 
 G = 9.80665
@@ -140,3 +142,85 @@ def test_words_stand_at_the_left():
     shown = Table("T", "", ["run", "file", "p", "reason", "none"], rows)
     page = re.sub(r"<script>.*?</script>", "", render_page("T", "", Exhibits("", [], [shown])), flags=re.DOTALL)
     assert re.findall("<td(.*?)>", page)[:5] == ["", ' class="text"', "", ' class="text"', ""]
+
+
+def test_every_figure_has_a_text_alternative_and_a_tied_caption(record):
+    exhibits = exhibits_of(record)
+    page = re.sub(r"<script>.*?</script>", "", render_page("T", "", exhibits), flags=re.DOTALL)
+    figures = [item for item in exhibits.items if isinstance(item, Figure)]
+    found = re.findall(r'id="plot-(\d+)" role="img" aria-label="([^"]+)" aria-describedby="([^"]+)"', page)
+    assert [int(number) for number, *_ in found] == list(range(len(figures)))
+    for figure, (_, label, caption) in zip(figures, found, strict=True):
+        assert unescape(label).startswith(figure.title)
+        assert figure.message in unescape(label)
+        assert page.count(f'id="{caption}"') == 1
+
+
+def test_a_knocked_attitude_stands_at_the_edge_of_the_residuals_with_its_value(record):
+    figure = next(f for f in exhibits_of(record).items if isinstance(f, Figure))
+    low, high = figure.layout["yaxis"]["range"]
+    residual = 1e6 * np.array(record.data["attitudes"]["residual"]) / G
+    beyond = np.flatnonzero((residual < low) | (residual > high))
+    mark = figure.traces[-1]
+    assert beyond.tolist() == [7]
+    assert mark["x"] == [8]
+    assert float(mark["text"][0].split()[0]) == pytest.approx(residual[7] / 1e3, abs=0.01)  # mg
+    assert figure.traces[1]["marker"]["symbol"][7] != figure.traces[1]["marker"]["symbol"][0]
+    assert "1 point beyond the axis" in figure.caption
+
+
+@pytest.mark.parametrize(("widths", "dark"), [((390, 768, 1280), False), ((390,), True)])
+def test_nothing_overflows_sideways(record, chromium, tmp_path, widths, dark):
+    side = {f"xaxis{k}": {"domain": d, "anchor": f"y{k}"} for k, d in (("", [0, 0.45]), ("2", [0.55, 1]))}
+    side |= {"yaxis": {"domain": [0, 1]}, "yaxis2": {"domain": [0, 1], "anchor": "x2"}}
+    exhibits = exhibits_of(record)
+    pair = Figure("Pair", "", [{"type": "scatter", "x": [1, 2], "y": [1, 2]}], side)
+    wide = Table("Wide", "", [f"a long title {n}" for n in range(12)], [["0.123456789 ± 0.000001"] * 12])
+    (tmp_path / "r.html").write_text(
+        render_page("T", "S" * 60, replace(exhibits, items=[*exhibits.items, pair, wide])), encoding="utf-8"
+    )
+    frame = tmp_path / "frame.html"
+    frame.write_text(
+        "".join(f"<iframe src=r.html style='border:0;width:{width}px;height:900px'></iframe>" for width in widths)
+        + "<p id=found></p><script>setTimeout(() => {"
+        "found.textContent = [...document.querySelectorAll('iframe')].map(frame => {"
+        "const page = frame.contentDocument;"
+        "const plots = [...page.querySelectorAll('svg.main-svg')].map(plot => plot.getBoundingClientRect().right);"
+        "return [page.documentElement.scrollWidth, Math.max(...plots), getComputedStyle(page.body).backgroundColor]"
+        ".join(' ') }).join(';') }, 4000)</script>"
+    )
+    options = ["--allow-file-access-from-files", *(["--blink-settings=preferredColorScheme=0"] if dark else [])]
+    said = re.search(r'id="found">([^<]+)<', browse(chromium, tmp_path, frame, "--dump-dom", *options))[1].split(";")
+    for width, found in zip(widths, said, strict=True):
+        scroll, right, background = re.fullmatch(r"(\d+) ([\d.]+) (rgb.+)", found).groups()
+        assert int(scroll) <= width
+        assert width / 2 < float(right) <= width
+        assert (background == "rgb(17, 23, 27)") == dark
+
+
+def test_panels_side_by_side_go_beneath_one_another_on_a_phone():
+    layout = {
+        "xaxis": {"domain": [0, 0.45], "anchor": "y"}, "yaxis": {"domain": [0, 1], "title": {"text": "mg"}},
+        "xaxis2": {"domain": [0.55, 1], "anchor": "y2"},
+        "yaxis2": {"domain": [0, 1], "anchor": "x2", "showticklabels": False},
+        "annotations": [{"text": "right", "x": 0.55, "y": 1, "xref": "paper", "yref": "paper"}],
+    }  # fmt: skip
+    found = narrow(Figure("", "", [], layout))
+    first, second = (found["layout"][f"yaxis{k}"] for k in ("", "2"))
+    assert found["layout"]["xaxis"]["domain"] == found["layout"]["xaxis2"]["domain"] == [0, 1]
+    assert first["domain"][0] > second["domain"][1]
+    assert second["showticklabels"]
+    assert second["title"] == {"text": "mg"}
+    assert found["layout"]["annotations"][0]["y"] == second["domain"][1]
+    assert narrow(Figure("", "", [], {"xaxis": {}, "yaxis": {}})) is None
+
+
+def test_a_print_hides_buttons_and_is_a4(record, chromium, tmp_path):
+    il.write_report(record, tmp_path / "r.html")
+    style = (tmp_path / "r.html").read_text()
+    assert "size: A4" in style
+    browse(chromium, tmp_path, tmp_path / "r.html", "--no-pdf-header-footer", f"--print-to-pdf={tmp_path / 'r.pdf'}")
+    pdf = (tmp_path / "r.pdf").read_bytes()
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
+    assert {(round(float(w)), round(float(h))) for w, h in boxes} == {(595, 842)}
+    assert 3 <= len(boxes) <= 5

@@ -157,7 +157,7 @@ def test_turns_with_a_knock_or_with_lost_samples_are_named_and_do_not_count(chan
         assert len(both.fit["gyro"]["set_aside"]) == len(fit.aside)
         figure = next(f for f in exhibits_of(both).items if f.title.startswith("What the gyroscopes miss"))
         assert len(figure.traces[0]["y"]) == len(fit.residuals) + len(fit.aside)
-        assert ("Red: set aside." in figure.caption) == (len(fit.aside) > 0)
+        assert ("Hatched and red: set aside." in figure.caption) == (len(fit.aside) > 0)
 
 
 def test_nothing_is_set_aside_without_reason():

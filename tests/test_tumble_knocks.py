@@ -129,7 +129,7 @@ def test_the_report_marks_what_was_set_aside():
     residuals = exhibits.items[0]
     colours = residuals.traces[1]["marker"]["color"]
     assert [i for i, colour in enumerate(colours) if colour != colours[0]] == [7]
-    assert "1 attitude set aside in red" in residuals.caption
+    assert "1 set aside in red, as diamonds" in residuals.caption
 
 
 def test_a_prior_is_updated_without_the_knocked_attitude():

@@ -18,6 +18,7 @@ from imulab.exhibit import Figure
 from imulab.files import write_text
 from imulab.present import exhibits_of
 from imulab.report import Card, render_index
+from imulab.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -131,9 +132,9 @@ def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
             for line in scenario.lines:
                 lines.append(f"  $ {line}")
                 said = _done(line, main)
-            answer, figure = (said, None) if not scenario.record else _found(scenario)
+            answer, figure, verdict = (said, None, None) if not scenario.record else _found(scenario)
             lines += [f"  {answer}", ""]
-            cards.append(Card(scenario.question, answer, scenario.lines, figure, scenario.report))
+            cards.append(Card(scenario.question, answer, scenario.lines, figure, scenario.report, verdict))
         lead = (
             "Four procedures and a production line on simulated instruments: the question, the answer, and the "
             "commands that found it."
@@ -177,12 +178,13 @@ def _done(line: str, main: Callable[[list[str]], int]) -> str:
     return next((text for text in reversed(printed.getvalue().splitlines()) if text.strip()), "")
 
 
-def _found(scenario: Scenario) -> tuple[str, Figure | None]:
+def _found(scenario: Scenario) -> tuple[str, Figure | None, Verdict | None]:
     if Path(scenario.record).is_dir():
         from imulab.fleet.report import exhibits_of_folder
 
-        exhibits = exhibits_of_folder(scenario.record, limits="line/limits.toml")
+        exhibits, verdict = exhibits_of_folder(scenario.record, limits="line/limits.toml"), None
     else:
-        exhibits = exhibits_of(load(scenario.record))
+        record = load(scenario.record)
+        exhibits, verdict = exhibits_of(record), record.verdict
     figures = [item for item in exhibits.items if isinstance(item, Figure)]
-    return exhibits.headline, figures[0] if figures else None
+    return exhibits.headline, figures[0] if figures else None, verdict

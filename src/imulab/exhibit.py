@@ -8,30 +8,34 @@ from typing import Any
 
 GOOD, BAD, QUIET, INK = "#1f6f8b", "#c8553d", "#9aa5ad", "#22303a"
 """Colours: what holds, what stands out, what is background, text."""
+LEGEND = {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}
+"""The key of a figure: above the plot, where a second line of it pushes the plot down."""
 ALARM = 0.5
 """An observation with less than this share of its weight is drawn as standing out."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A Plotly figure (traces and layout as plain JSON values), a title and a sentence on how to read it."""
+    """A Plotly figure (traces and layout as plain JSON values), a title, how to read it, and what it shows."""
 
     title: str
     caption: str
     traces: list[dict[str, Any]]
     layout: dict[str, Any] = field(default_factory=dict)
     height: int = 380
+    message: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table: column titles, rows of text, a sentence on how to read it, and the row to highlight."""
+    """A table: column titles, rows of text, how to read it, the row to highlight, and what it shows."""
 
     title: str
     caption: str
     columns: list[str]
     rows: list[list[str]]
     highlight: int | None = None
+    message: str = ""
 
 
 @dataclass(frozen=True)

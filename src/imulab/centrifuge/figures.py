@@ -18,7 +18,7 @@ from imulab.centrifuge.tables import (
     run_table,
 )
 from imulab.estimate import coverage_factor
-from imulab.exhibit import BAD, GOOD, INK, QUIET, Exhibits, Figure, Table, format_uncertain
+from imulab.exhibit import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, format_uncertain
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY, from_si
 
@@ -31,6 +31,7 @@ _SPECTRUM_CAPTION = (
     "are vibration."
 )
 _MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "x", "triangle-down")
+_SPECTRA = (("dtg_x", "X"), ("fog", "FOG"), ("residual_x", "X − FOG"))
 _CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
 
 
@@ -234,7 +235,7 @@ def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
     count = len(titles)
     width = (1 - gap * (count - 1)) / count
     layout: dict[str, Any] = {
-        "legend": {"orientation": "h", "y": 1.14, "x": 0},
+        "legend": dict(LEGEND),
         "margin": {"l": 70, "r": 20, "t": 50, "b": 55},
     }
     for number, title in enumerate(titles):
@@ -363,12 +364,12 @@ def _spectra(record: Calibration) -> list[Figure]:
         spectrum = found[index]
         mark = "" if number == 0 else str(number + 1)
         rate = from_si(np.array(spectrum["rate"]), "deg/s")
-        names = (("dtg_x", "X", QUIET), ("fog", "FOG", "#b8860b"), ("residual_x", "X − FOG", GOOD))
-        for name, label, colour in names:
+        lines = zip(_SPECTRA, (QUIET, "#b8860b", GOOD), ("solid", "dot", "dash"), strict=True)
+        for (name, label), colour, dash in lines:
             height = np.maximum(from_si(np.array(spectrum["height"][name]), "deg/h"), 1e-6)
             width = 2.4 if name == "residual_x" else 1.6
             traces.append(
-                _scatter(rate, height, label, mode="lines", line={"color": colour, "width": width},
+                _scatter(rate, height, label, mode="lines", line={"color": colour, "width": width, "dash": dash},
                          xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0)
             )  # fmt: skip
         row = by_level[spectrum["level"]]
@@ -389,7 +390,7 @@ def _spectra(record: Calibration) -> list[Figure]:
         )  # fmt: skip
     layout = _panels(titles, "rate, deg/s", gap=0.07)
     layout["annotations"] = annotations
-    layout["legend"]["y"] = 1.24
+    layout["legend"]["y"] = 1.09
     layout["margin"]["t"] = 75
     for number in range(len(picked)):
         mark = "" if number == 0 else str(number + 1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imulab.jsontext import json_text
-from imulab.tumble.figures import small_g
+from imulab.tumble.engineering import small_g
 from imulab.tumble.prior import FALSE_ALARM
 
 if TYPE_CHECKING:

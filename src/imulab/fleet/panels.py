@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.fleet.display import Display
 from imulab.fleet.statistics import ParameterStatistics
@@ -16,6 +17,7 @@ from imulab.recording import Array
 COLUMNS = 3
 _GAP_ACROSS = 0.075
 _ROW_HEIGHT = 215
+_ROWS = 4
 _DAYS = 4.0
 """Dates that span no more than so many days are told apart by their time."""
 
@@ -33,6 +35,18 @@ def axis_key(name: str) -> str:
 def height(count: int) -> int:
     """Return the height of so many panels, pixels."""
     return 62 + _ROW_HEIGHT * math.ceil(count / COLUMNS)
+
+
+def pages(panels: Sequence[ParameterStatistics]) -> list[Sequence[ParameterStatistics]]:
+    """Return the panels in figures of even size, none too high for a page."""
+    count = math.ceil(len(panels) / (COLUMNS * _ROWS))
+    size = COLUMNS * math.ceil(len(panels) / max(count, 1) / COLUMNS)
+    return [panels[first : first + size] for first in range(0, len(panels), size)]
+
+
+def paged(title: str, index: int, count: int) -> str:
+    """Return a title with its number, where several figures share it."""
+    return title if count == 1 else f"{title}, {index + 1} of {count}"
 
 
 def grid() -> dict[str, Any]:
@@ -74,6 +88,12 @@ def panel(layout: dict[str, Any], index: int, count: int, title: str) -> None:
     )
 
 
+def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
+    """Return heights for marks at the side of a histogram, one below the other from the highest bar down."""
+    order = np.cumsum(marked) - 1
+    return [round(top * (1 - 0.15 * (k % 7)), 3) for k in order.tolist()]
+
+
 def line(x: str, y: str, place: float, colour: str, dash: str) -> dict[str, Any]:
     """Return an upright line through a panel."""
     return {
@@ -88,18 +108,17 @@ def line(x: str, y: str, place: float, colour: str, dash: str) -> dict[str, Any]
     }
 
 
-def ends(item: ParameterStatistics, shown: Display) -> list[float]:
-    """Limits of a parameter that lie near enough to its values to be drawn."""
+def ends(item: ParameterStatistics, shown: Display, values: Array) -> list[float]:
+    """Limits of a parameter that lie near enough to the values that are shown to be drawn."""
     if item.capability is None:
         return []
     limits = item.capability.limits
     ends = sorted(shown.of(end) for end in (limits.lower, limits.upper) if math.isfinite(end))
-    values = np.asarray(shown.of(item.values))
     span = max(float(np.ptp(values)), 1e-300)
     return [end for end in ends if values.min() - 2 * span <= end <= values.max() + 2 * span]
 
 
-def edges(values: Array, item: ParameterStatistics) -> Array:
+def edges(values: Array) -> Array:
     """Edges of bins by Freedman and Diaconis over the bulk, at most 60 over all."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
@@ -124,7 +143,7 @@ def date_axis(days: Array) -> dict[str, Any]:
     """Return an axis of dates with three ticks, whatever it spans: the first date, the middle and the last."""
     first, last = float(np.nanmin(days)), float(np.nanmax(days))
     margin = 0.04 * max(last - first, 1 / 24)
-    form = "%Y-%m-%d" if last - first > _DAYS else "%m-%d %H:%M"
+    form = "%m-%d<br>%Y" if last - first > _DAYS else "%H:%M<br>%m-%d"
     ticks = [datetime.fromtimestamp(86400.0 * day, UTC) for day in (first, (first + last) / 2, last)]
     return {
         "type": "date",

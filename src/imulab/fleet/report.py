@@ -9,7 +9,7 @@ from pathlib import Path
 from imulab.errors import OptionError
 from imulab.exhibit import Exhibits, Figure, Table
 from imulab.files import write_text
-from imulab.fleet import figures
+from imulab.fleet import figures, reporttables
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
 from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_state, own_files, read_by, refuse_overwriting
@@ -112,18 +112,18 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
         facts.append(("changed since last", str(len(moved))))
     if moved:
         said.append(f"{_named(sorted(moved))} changed since the last calibration")
-    items: list[Figure | Table | None] = [figures.failure_table(state.failures)]
+    items: list[Figure | Table | None] = [reporttables.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = _TITLES.get(procedure, procedure)
         mine = [item for item in statistics if item.procedure == procedure]
         enough = max(len(item.values) for item in mine) >= _FEWEST_TO_DRAW
         items += [
-            figures.distributions(title, mine) if enough else None,
-            figures.summary_table(title, mine),
-            figures.over_date(title, mine) if enough else None,
+            *(figures.distributions(title, mine) if enough else []),
+            reporttables.summary_table(title, mine),
+            *(figures.over_date(title, mine) if enough else []),
             figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
         ]
-    items += [figures.outlier_table(statistics), figures.change_table(changes)]
+    items += [reporttables.outlier_table(statistics), reporttables.change_table(changes)]
     return Exhibits("; ".join(said) + ".", facts, [item for item in items if item is not None])
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.exhibit import BAD, GOOD, INK, Exhibits, Figure, Table, plain_number
+from imulab.exhibit import BAD, GOOD, INK, LEGEND, Exhibits, Figure, Table, plain_number
 from imulab.gyro_array.health import JUMPED, NON_FINITE, STUCK
 from imulab.gyro_array.model import unit_of_angle
-from imulab.gyro_array.traces import LEGEND, MARGIN, allan_trace, axis, log_axis, of_axis
+from imulab.gyro_array.traces import DASHES, MARGIN, allan_trace, axis, log_axis, of_axis
 
 _MOST_NAMED = 4
 _PALETTE = {
@@ -23,6 +23,8 @@ _PALETTE = {
     "kalman": "#2e4057",
     "single gyro": "#b9c2c8",
 }
+_NUMBER = {method: number for number, method in enumerate(_PALETTE)}
+"""By which each method has its dashes and marks in every figure."""
 
 
 def exhibits_of_comparison(record: Calibration) -> Exhibits:
@@ -124,7 +126,9 @@ def _allan_methods(record: Calibration, a: int) -> Figure:
     unit = record.model["units"][a]
     curves = record.data["allan"]
     order = ["single gyro", *[m for m in curves if m not in ("single gyro", "robust")], "robust"]
-    traces = [allan_trace(curves[m][a], m, _PALETTE[m], 1.0, _width(m)) for m in order if m in curves]
+    traces = [
+        allan_trace(curves[m][a], m, _PALETTE[m], 1.0, _width(m), number=_NUMBER[m]) for m in order if m in curves
+    ]
     return Figure(
         title=f"Allan deviation of each method{of_axis(record.model['axes'][a])}",
         caption="On the left, how quiet a sample is: a curve that bends down there is low-pass filtered. On the "
@@ -149,7 +153,7 @@ def _angles(record: Calibration, a: int) -> Figure:
             "mode": "lines",
             "x": time,
             "y": [factor * value for value in rows[a]],
-            "line": {"color": _PALETTE[method], "width": _width(method)},
+            "line": {"color": _PALETTE[method], "width": _width(method), "dash": DASHES[_NUMBER[method]]},
             "name": method,
             "hovertemplate": f"{method}<br>%{{x:.4g}} s: %{{y:.4g}} {angle}<extra></extra>",
         }

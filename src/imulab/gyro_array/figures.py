@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.exhibit import BAD, GOOD, Exhibits, Figure, Table, format_uncertain, plain_number
+from imulab.exhibit import BAD, GOOD, LEGEND, Exhibits, Figure, Table, format_uncertain, plain_number
 from imulab.gyro_array.compare_figures import exhibits_of_comparison
-from imulab.gyro_array.traces import LEGEND, MARGIN, allan_trace, log_axis, of_axis
+from imulab.gyro_array.traces import MARGIN, allan_trace, log_axis, of_axis
 from imulab.units import from_si
 
 _ELEMENT_SHADES = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#2e4057", "#d081a5", "#6f7f3f")
@@ -126,7 +126,9 @@ def _allan_elements(record: Calibration, a: int) -> Figure:
     traces = []
     for i, curve in enumerate(record.data["allan"][a]):
         traces.append(
-            allan_trace(curve, record.sections["elements"][i]["name"], _ELEMENT_SHADES[i % 8], math.degrees(1))
+            allan_trace(
+                curve, record.sections["elements"][i]["name"], _ELEMENT_SHADES[i % 8], math.degrees(1), number=i
+            )
         )
     return Figure(
         title=f"Allan deviation of each gyro{of_axis(record.model['axes'][a])}",

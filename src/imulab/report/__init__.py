@@ -16,6 +16,7 @@ from typing import Any
 from imulab.calibration import Calibration
 from imulab.exhibit import Exhibits, Figure, Table
 from imulab.files import write_text
+from imulab.report.narrow import narrow
 from imulab.verdict import SENTENCES, Verdict
 
 _TITLES = {
@@ -24,6 +25,7 @@ _TITLES = {
     "warmup": "Warm-up table",
     "centrifuge": "Centrifuge test",
 }
+_HEADS = {"good": "Good", "look": "Look first", "bad": "Stop"}
 _LINK = re.compile(r"<(?=\s*/?\s*a\b)", re.IGNORECASE)
 _NUMBER = re.compile(r"[<>±+−-]?\s?\d[\d.,]*(?:e[-+]?\d+)?(?![\w.-])|nan\b")
 
@@ -56,12 +58,11 @@ def render_page(
             title=title,
             subject=subject,
             verdict=verdict,
-            sentence=None if verdict is None else SENTENCES[verdict.state],
             notes=notes,
             exhibits=exhibits,
             is_figure=lambda item: isinstance(item, Figure),
             column_kinds=_column_kinds,
-            plots=_json_for_script([{"data": p.traces, "layout": p.layout, "height": p.height} for p in plots]),
+            draw=_draw(plots),
             plotly=_plotly(),
             provenance=provenance,
         )
@@ -88,22 +89,21 @@ def render_plan(title: str, lead: str, attitudes: list[dict[str, Any]], predicte
 
 @dataclass(frozen=True)
 class Card:
-    """What an index shows of one piece of work: question, answer, commands, a figure and the report to open."""
+    """What an index shows of one piece of work: question, answer, commands, a figure, the report, the verdict."""
 
     question: str
     answer: str
     commands: list[str]
     figure: Figure | None = None
     link: str = ""
+    verdict: Verdict | None = None
 
 
 def render_index(title: str, lead: str, cards: list[Card]) -> str:
     """Return a page that leads to several reports as HTML text."""
-    figures = [card.figure for card in cards]
-    plots = [None if f is None else {"data": f.traces, "layout": f.layout, "height": f.height} for f in figures]
     return str(
         _template("index.html.j2").render(
-            title=title, lead=lead, cards=cards, plots=_json_for_script(plots), plotly=_plotly()
+            title=title, lead=lead, cards=cards, draw=_draw([card.figure for card in cards]), plotly=_plotly()
         )
     )
 
@@ -121,11 +121,33 @@ def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:
 
 @cache
 def _template(name: str) -> Any:
-    from jinja2 import Environment, StrictUndefined
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+    from markupsafe import Markup
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.globals["policy"] = _policy
-    return environment.from_string((files("imulab.report") / name).read_text(encoding="utf-8"))
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(_file)
+    )
+    environment.globals |= {
+        "policy": _policy, "style": Markup(_file("style.css")), "sentences": SENTENCES, "heads": _HEADS,
+    }  # fmt: skip
+    return environment.get_template(name)
+
+
+@cache
+def _file(*name: str) -> str:
+    return files("imulab.report").joinpath(*name).read_text(encoding="utf-8")
+
+
+def _draw(figures: Sequence[Figure | None]) -> Any:
+    """Return the script that draws figures, with their data; None leaves a place empty."""
+    from markupsafe import Markup
+
+    plots = [None if f is None else {**_screen(f), "narrow": narrow(f)} for f in figures]
+    return Markup("const plots = {};\n").format(_json_for_script(plots)) + Markup(_file("draw.js"))
+
+
+def _screen(figure: Figure) -> dict[str, Any]:
+    return {"data": figure.traces, "layout": figure.layout, "height": figure.height}
 
 
 def _policy(*scripts: str) -> str:
@@ -139,8 +161,7 @@ def _policy(*scripts: str) -> str:
 def _plotly() -> Any:
     from markupsafe import Markup
 
-    code = (files("imulab.report") / "vendor" / "plotly-cartesian.min.js").read_text(encoding="utf-8")
-    return Markup(code.replace("</script", "<\\/script"))
+    return Markup(_file("vendor", "plotly-cartesian.min.js").replace("</script", "<\\/script"))
 
 
 def _json_for_script(value: Any) -> Any:

@@ -130,3 +130,20 @@ def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, 
     power = int(stem[1:] or "2")  # a cross term is k_xy: of the second degree, as k2
     superscript = "⁰¹²³⁴⁵"[power]
     return 1e6 * STANDARD_GRAVITY ** (power - 1), 0.0, f"µg/g{superscript}"
+
+
+def small_g(value: float) -> str:
+    """Return an acceleration in µg or mg, three significant digits."""
+    micro = micro_g(value)
+    return (
+        f"{micro:.3g} µg"
+        if abs(micro) < 999.5
+        else f"{micro / 1e3:.4g} mg"
+        if abs(micro) < 1e6
+        else f"{micro / 1e6:.3g} g"
+    )
+
+
+def micro_g(value: float) -> float:
+    """Return an acceleration in µg."""
+    return float(from_si(value, "ug"))

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from imulab.bulk import bulk, edge_marks, edge_note
 from imulab.calibration import Calibration
-from imulab.exhibit import ALARM, BAD, GOOD, QUIET, Exhibits, Figure, Table, format_uncertain, plain_number
-from imulab.tumble.engineering import engineering_rows, propagated_rows
+from imulab.exhibit import ALARM, BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, Table, plain_number
+from imulab.tumble.engineering import micro_g, small_g
 from imulab.tumble.model import AXES
 from imulab.tumble.sphere import sphere_figure
+from imulab.tumble.tables import orders_table, parameters_table, propagated_table, shares_table
 from imulab.units import from_si
 
 
@@ -30,13 +32,13 @@ def exhibits(record: Calibration) -> Exhibits:
         ("worst u(scale factor)", f"{plain_number(worst, 2)} ppm" if worst is not None else "not stated"),
         ("condition number", plain_number(fit["condition_number"], 3)),
     ]
-    items: list[Figure | Table] = [_residuals(record), _parameters(record)]
+    items: list[Figure | Table] = [_residuals(record), parameters_table(record)]
     if "monte_carlo" in fit:
-        items.append(_propagated(record))
+        items.append(propagated_table(record))
     if "prior" in fit:
-        items.append(_shares(record))
+        items.append(shares_table(record))
     if fit["orders"]:
-        items.append(_orders(record))
+        items.append(orders_table(record))
     items.append(sphere_figure(record))
     if "trace" in record.data:
         items.append(_trace(record))
@@ -62,22 +64,6 @@ def _held_back(record: Calibration) -> str:
     return "set aside" if record.fit.get("set_aside") else "down-weighted"
 
 
-def small_g(value: float) -> str:
-    """Return an acceleration in µg or mg, three significant digits."""
-    micro = _micro_g(value)
-    return (
-        f"{micro:.3g} µg"
-        if abs(micro) < 999.5
-        else f"{micro / 1e3:.4g} mg"
-        if abs(micro) < 1e6
-        else f"{micro / 1e6:.3g} g"
-    )
-
-
-def _micro_g(value: float) -> float:
-    return float(from_si(value, "ug"))
-
-
 def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -95,12 +81,13 @@ def _axis(title: str, **more: Any) -> dict[str, Any]:
 def _residuals(record: Calibration) -> Figure:
     data = record.data["attitudes"]
     number = list(range(1, len(data["residual"]) + 1))
-    after = [_micro_g(value) for value in data["residual"]]
+    after = [micro_g(value) for value in data["residual"]]
     sigma = data["standard_uncertainty"]
     excess = record.fit["excess"]["value"]
-    bars = None if sigma is None else [_micro_g(float(np.hypot(value, excess))) for value in sigma]
+    bars = None if sigma is None else [micro_g(float(np.hypot(value, excess))) for value in sigma]
     colours = [BAD if weight < ALARM else GOOD for weight in data["down_weight"]]
-    marker = {"color": colours, "size": 8}
+    shapes = ["diamond" if weight < ALARM else "circle" for weight in data["down_weight"]]
+    marker = {"color": colours, "size": 8, "symbol": shapes}
     trace: dict[str, Any] = {
         "type": "scatter",
         "mode": "markers",
@@ -115,15 +102,25 @@ def _residuals(record: Calibration) -> Figure:
     }
     if bars is not None:
         trace["error_y"] = {"type": "data", "array": bars, "thickness": 1, "width": 2, "color": QUIET}
-    before = [_micro_g(value) / 1e3 for value in data["residual_before"]]
-    bad = sum(weight < ALARM for weight in data["down_weight"])
-    span = _span([value for value, colour in zip(after, colours, strict=True) if colour == GOOD] or after, bars)
+    before = [micro_g(value) / 1e3 for value in data["residual_before"]]
+    usual = np.array(data["down_weight"]) >= ALARM
+    bad = len(number) - int(usual.sum())
+    beyond = bulk(np.array(after), usual if usual.any() else None, float(np.median(bars)) if bars else 0.0)
+    marks = (
+        [] if beyond is None else edge_marks(beyond, np.array(after), number, [small_g(v) for v in data["residual"]])
+    )
+    worst = int(np.argmax(np.where(usual, np.abs(after), -1.0)))
+    scale = {} if beyond is None else {"range": [beyond.low, beyond.high]}
     return Figure(
         title="Residual |f| − g of each attitude",
-        caption="Above: with the nominal sensor (for counts and volts: the span of each axis). Below: calibrated"
+        message=f"Before: {small_g(_rms(data['residual_before']))} rms. After: the largest of the attitudes that count "
+        f"is {small_g(data['residual'][worst])}, attitude {worst + 1}.",
+        caption="Above, grey bars: with the nominal sensor (for counts and volts: the span of each axis). Below, "
+        "points: calibrated"
         + ("; bars are one standard uncertainty of |f|" if bars else "")
-        + (f"; {bad} attitude{'s' if bad > 1 else ''} {_held_back(record)} in red" if bad else "")
-        + ". A pattern in the lower plot is an error that the model does not know.",
+        + (f"; {bad} {_held_back(record)} in red, as diamonds" if bad else "")
+        + ". f is the specific force, g local gravity, 1 µg = 9.8 µm/s². A pattern in the lower plot is an error that "
+        "the model does not know." + edge_note(0 if beyond is None else int(beyond.beyond.sum())),
         traces=[
             {
                 "type": "bar",
@@ -136,167 +133,28 @@ def _residuals(record: Calibration) -> Figure:
                 "name": "before",
             },
             trace,
+            *marks,
         ],
         layout={
             "xaxis": _axis(
                 "attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6], anchor="y"
             ),
-            "yaxis": _axis("after, µg", domain=[0, 0.6], range=[-span, span]),
+            "yaxis": _axis("after, µg", domain=[0, 0.6]) | scale,
             "yaxis2": _axis("before, mg", domain=[0.68, 1]),
             "showlegend": False,
-            "annotations": [
-                {
-                    "x": x,
-                    "y": span if y > 0 else -span,
-                    "text": f"{y / 1e3:+.2f} mg",
-                    "showarrow": True,
-                    "ax": 34,
-                    "ay": 14 if y > 0 else -14,
-                    "arrowcolor": BAD,
-                    "font": {"color": BAD},
-                    "xref": "x",
-                    "yref": "y",
-                }
-                for x, y in zip(number, after, strict=True)
-                if abs(y) > span
-            ],
         },
         height=460,
-    )
-
-
-def _span(values: list[float], bars: list[float] | None) -> float:
-    """Half the height of the residual plot: what the attitudes that count need."""
-    return 1.25 * (max(map(abs, values)) + (float(np.median(bars)) if bars else 0.0)) or 1.0
-
-
-def _basis(record: Calibration) -> str:
-    """Say what the uncertainties rest on."""
-    fit = record.fit
-    freedom = fit.get("effective_degrees_of_freedom", fit["degrees_of_freedom"])
-    if fit["noise"] != "known" and freedom is None:
-        return "As many parameters as attitudes: nothing tells the noise, and no uncertainty is stated."
-    if fit["noise"] != "known":
-        return f"Noise estimated from the residuals; Student's t with {freedom:.0f} degrees of freedom."
-    if not fit["excess"]["value"] or freedom is None:
-        return "Noise known from the attitudes' own scatter; normal quantiles."
-    return (
-        f"Noise known from the attitudes' own scatter, with {_micro_g(fit['excess']['value']):.3g} µg more for each "
-        f"attitude, as its residual makes plausible; Student's t with {freedom:.0f} effective degrees of freedom."
-    )
-
-
-def _parameters(record: Calibration) -> Table:
-    blend = record.fit.get("blend")
-    factors = {False: record.fit["coverage_factor_95"], True: record.fit.get("gyro", {}).get("coverage_factor_95")}
-    rows = []
-    for row in engineering_rows(record):
-        factor = factors[row.name.startswith("gyro_")]
-        value, uncertainty = row.text()
-        interval = "not stated"
-        if row.standard_uncertainty is not None and factor is not None:
-            half = factor * row.standard_uncertainty
-            interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
-        given = [] if blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]
-        rows.append([row.name, value, uncertainty, *given, interval, row.unit])
-    basis = _basis(record)
-    if blend is not None:
-        basis += (
-            f" The standard uncertainty holds whatever the order is, up to {blend['highest_order']}; beside it what it "
-            f"would be if order {record.model['order']} were known to be right."
-        )
-    turned = ""
-    if "gyro" in record.fit:
-        degrees = record.fit["gyro"]["degrees_of_freedom"]
-        turned = f" Gyroscopes: M = S (T ω + b + G f), Student's t with {degrees} degrees of freedom."
-    return Table(
-        title="Parameters",
-        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.{turned}",
-        columns=[
-            "parameter",
-            "value",
-            "standard uncertainty",
-            *([] if blend is None else [f"if order {record.model['order']} is right"]),
-            "95 % interval",
-            "unit",
-        ],
-        rows=rows,
-    )
-
-
-def _propagated(record: Calibration) -> Table:
-    trials = record.fit["monte_carlo"]
-    failed = f", {trials['failed']} more did not converge" if trials["failed"] else ""
-    return Table(
-        title="Monte Carlo",
-        caption=f"95 % intervals of {trials['trials']} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
-        "from 1 means that the model is not linear over its own uncertainty: trust the trials then.",
-        columns=["parameter", "linear", "Monte Carlo", "ratio of widths", "unit"],
-        rows=propagated_rows(record),
-    )
-
-
-def _shares(record: Calibration) -> Table:
-    prior = record.fit["prior"]
-    rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior["shares"].items()]
-    return Table(
-        title="Prior and data",
-        caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior['created']}) or "
-        "these attitudes; variance now over that of the prior with what it aged since.",
-        columns=["parameter", "from the prior", "from the data"],
-        rows=rows,
-    )
-
-
-def _orders(record: Calibration) -> Table:
-    rows, highlight = [], None
-    for index, row in enumerate(record.fit["orders"]):
-        if row["order"] == record.model["order"]:
-            highlight = index
-        probability = row["f_probability"]
-        rows.append(
-            [
-                str(row["order"]),
-                str(row["parameters"]),
-                plain_number(_micro_g(row["rms"]), 4),
-                plain_number(_micro_g(row["leave_one_out"]), 4) if row["leave_one_out"] is not None else "–",
-                f"{probability:.2g}" if probability is not None else "–",
-                f"{row['bic']:.1f}" if row["bic"] is not None else "–",
-                plain_number(_micro_g(predicted), 3)
-                if (predicted := row.get("largest_uncertainty")) is not None
-                else "–",
-                plain_number(row["condition_number"], 3),
-                "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
-            ]
-        )
-    huber = " Rms of all attitudes, a down-weighted one by its weight." if record.fit["loss"] == "huber" else ""
-    return Table(
-        title="Choice of the order",
-        caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
-        "attitudes it has not seen better (leave-one-out), by more than the error of that comparison, if the F-test "
-        "finds the gain significant, and if the attitudes can observe it: nowhere on the sphere may the predicted "
-        f"uncertainty of |f| exceed 4 times the scatter at order 1.{huber}",
-        columns=[
-            "order",
-            "parameters",
-            "rms, µg",
-            "leave-one-out, µg",
-            "F-test p",
-            "BIC",
-            "largest u(|f|), µg",
-            "condition",
-            "observable",
-        ],
-        rows=rows,
-        highlight=highlight,
     )
 
 
 def _trace(record: Calibration) -> Figure:
     trace, data = record.data["trace"], record.data["attitudes"]
     deviation = [max(float(from_si(value, "mg")), 1e-6) for value in trace["deviation"]]
+    rest = sum(stop - start for start, stop in zip(data["start"], data["stop"], strict=True))
+    whole = trace["time"][-1] - trace["time"][0]
     return Figure(
         title="Where the unit was at rest",
+        message=f"{len(data['start'])} stretches were used, {rest:.0f} s of {whole:.0f} s.",
         caption="Standard deviation within a sliding window (three axes together), the threshold below which the unit "
         "counts as at rest, and the stretches that were used (shaded), without their settling edges.",
         traces=[
@@ -322,7 +180,7 @@ def _trace(record: Calibration) -> Figure:
         layout={
             "xaxis": _axis("time, s"),
             "yaxis": _axis("standard deviation, mg", type="log", dtick=1, exponentformat="none"),
-            "legend": {"orientation": "h", "y": 1.12},
+            "legend": LEGEND,
             "shapes": [
                 {
                     "type": "rect",
@@ -352,25 +210,34 @@ def _turns(record: Calibration) -> Figure:
     number = list(range(1, len(angle) + 1))
     text = [f"{a:.1f} to {b:.1f} s" for a, b, *_ in turns]
     rms = float(from_si(_rms(data["residual"]), "deg"))
+    beyond = bulk(np.array(angle))
+    marks = [] if beyond is None else edge_marks(beyond, np.array(angle), number, [f"{v:.3g} deg" for v in angle])
     return Figure(
         title="What the gyroscopes miss in each turn",
-        caption="Angle between the direction of gravity as the gyroscopes carry it and the one found after the turn, "
-        f"rms {rms:.3g} deg. A few high bars: very fast turns, or a unit that moved while it was taken to be at rest."
-        + (" Red: set aside." if aside else ""),
+        message=f"Largest: {max(angle):.3g} deg, in turn {number[int(np.argmax(angle))]}; rms of those that count "
+        f"{rms:.3g} deg.",
+        caption="Angle between the direction of gravity as the gyroscopes carry it and the one found after the turn. "
+        "A few high bars: very fast turns, or a unit that moved while it was taken to be at rest."
+        + (" Hatched and red: set aside." if aside else "")
+        + edge_note(0 if beyond is None else int(beyond.beyond.sum())),
         traces=[
             {
                 "type": "bar",
                 "x": number,
                 "y": angle,
-                "marker": {"color": [turn[3] for turn in turns] if aside else GOOD},
+                "marker": {
+                    "color": [turn[3] for turn in turns] if aside else GOOD,
+                    "pattern": {"shape": ["/" if turn[3] == BAD else "" for turn in turns]},
+                },
                 "text": text,
                 "textposition": "none",
                 "hovertemplate": "turn %{x}, %{text}<br>%{y:.3f} deg<extra></extra>",
-            }
+            },
+            *marks,
         ],
         layout={
             "xaxis": _axis("turn", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
-            "yaxis": _axis("residual angle, deg"),
+            "yaxis": _axis("residual angle, deg", **({} if beyond is None else {"range": [0, beyond.high]})),
             "showlegend": False,
         },
         height=320,
@@ -382,9 +249,15 @@ def _correlation(record: Calibration) -> Figure:
     sigma = np.sqrt(np.diag(matrix))
     correlation = matrix / np.outer(sigma, sigma)
     names = list(record.covariance.names)
+    off = np.abs(np.triu(correlation, 1))
+    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
     return Figure(
         title="Correlation of the parameters",
-        caption="Far from white off the diagonal: two parameters that these attitudes hardly tell apart.",
+        message=f"The pair that these attitudes tell apart least: {names[i]} and {names[j]}, {correlation[i, j]:+.2f}."
+        if len(names) > 1
+        else "",
+        caption="From −1 to +1, with numbers on hovering. Near 1 or −1 off the diagonal: two parameters that these "
+        "attitudes hardly tell apart, so that only their sum or difference is well known.",
         traces=[
             {
                 "type": "heatmap",

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from imulab.calibration import Calibration
-from imulab.exhibit import BAD, GOOD, INK, QUIET, Exhibits, Figure, Table, plain_number
+from imulab.exhibit import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, plain_number
 from imulab.recording import Array
 from imulab.warmup.apply import record_table
 from imulab.warmup.engineering import engineering_unit
-from imulab.warmup.grid import axis_style, grid, temperature_colour
+from imulab.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
 from imulab.warmup.model import Table as WarmupTable
 from imulab.warmup.model import evaluate
 
@@ -40,7 +40,7 @@ def exhibits(record: Calibration) -> Exhibits:
         *_worst(record, table, head, factor, label),
         ("repeatability", _text(floor, head, factor, f" {label}")),
         (jump[0], f"{_largest(chosen[jump[1]], head, factor)} {label}"),
-        ("T_M", f"{table.settling_time:g} s"),
+        ("settling time T_M", f"{table.settling_time:g} s"),
         ("power cycles", str(record.fit["cycles"])),
     ]
     items: list[Figure | Table] = []
@@ -130,7 +130,8 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     what = "unit" if record.model.get("pool") == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
-        caption="Root mean square over t < T_M and all axes, white noise taken off: of the cycles "
+        caption="Root mean square over all axes and the time t after power-on up to T_M, from which the unit is "
+        "settled and nothing is subtracted; white noise taken off. Z is what the table subtracts. Columns: the cycles "
         f"fitted, of each {what} left out, of each temperature left out (its neighbours are then twice as far as in "
         "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
         f"once. No table can beat the repeatability of cycles, {floor}.",
@@ -176,12 +177,13 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
         traces: list[dict[str, Any]] = []
         for cycle in record.data["cycles"]:
             at = cycle["calibration_temperature"]
+            colour, mark = temperature_colour(at, table.temperatures), temperature_mark(at, table.temperatures)
             traces.append(
                 {
                     "mode": "markers",
                     "x": cycle["time"],
                     "y": _rounded(np.array(cycle["curve"][i]) * factor),
-                    "marker": {"color": temperature_colour(at, table.temperatures), "size": 4, "opacity": 0.55},
+                    "marker": {"color": colour, "symbol": mark, "size": 4, "opacity": 0.55},
                     "hovertemplate": f"{at:g} degC, {cycle['file']}<br>%{{x:.0f}} s: %{{y:.3g}} {label}<extra></extra>",
                 }
             )
@@ -202,7 +204,7 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     return grid(
         title=f"Power cycles and what the unit subtracts, {kind}",
         caption="Points: each cycle less its settled mean, averaged over bins. Lines: the table at the calibration "
-        "temperatures (colours). A line beside its points is what the model cannot follow."
+        "temperatures (colours and marks). A line beside its points is what the model cannot follow."
         + (half if table.model == "interval-cubic" else ""),
         names=[table.axes[i] for i in index],
         cells=cells,
@@ -224,7 +226,7 @@ def _residuals(record: Calibration, table: WarmupTable, kind: str, index: list[i
                     "x": _rounded(time),
                     "y": _rounded(left[i] * factor),
                     "line": {"color": temperature_colour(at, table.temperatures), "width": 1.2},
-                    "marker": {"size": 3},
+                    "marker": {"size": 4, "symbol": temperature_mark(at, table.temperatures)},
                     "hovertemplate": f"{at:g} degC, {len(members)} cycles<br>%{{x:.0f}} s: %{{y:.3g}} {label}"
                     "<extra></extra>",
                 }
@@ -266,16 +268,16 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
     none = next(row for row in models if row["model"] == "none")
     knots = sorted({cycle["calibration_temperature"] for cycle in record.data["cycles"]})
     lines = [
-        ("none", none["by_temperature"], QUIET, "solid"),
-        (f"{chosen['model']}, left out", chosen["left_by_temperature"], BAD, "dash"),
-        (str(chosen["model"]), chosen["by_temperature"], GOOD, "solid"),
-        ("repeatability", record.fit["repeatability"]["by_temperature"], INK, "dot"),
+        ("none", none["by_temperature"], QUIET, "solid", "circle"),
+        (f"{chosen['model']}, left out", chosen["left_by_temperature"], BAD, "dash", "square"),
+        (str(chosen["model"]), chosen["by_temperature"], GOOD, "solid", "diamond"),
+        ("repeatability", record.fit["repeatability"]["by_temperature"], INK, "dot", "x"),
     ]
     source = next((row for row in models if row["model"] == "interval-cubic" and not row["chosen"]), None)
     if source is not None:
-        lines.insert(1, ("interval-cubic", source["by_temperature"], "#b08a3e", "solid"))
+        lines.insert(1, ("interval-cubic", source["by_temperature"], "#b08a3e", "dashdot", "triangle-up"))
     traces = []
-    for name, rows, colour, dash in lines:
+    for name, rows, colour, dash, symbol in lines:
         values = [_rms(row, index) * factor for row in rows]
         points = [(t, v) for t, v in zip(knots, values, strict=True) if np.isfinite(v) and v > 0]
         if points:
@@ -287,19 +289,20 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
                     "x": [t for t, _ in points],
                     "y": [float(f"{v:.4g}") for _, v in points],
                     "line": {"color": colour, "dash": dash},
+                    "marker": {"symbol": symbol, "size": 8},
                     "hovertemplate": f"{name}<br>%{{x:g}} degC: %{{y:.3g}} {label}<extra></extra>",
                 }
             )
     return Figure(
         title=f"Error by power-on temperature, {kind}",
-        caption="Root mean square over t < T_M and all axes, on a logarithmic scale. Left out: the temperature "
-        "predicted from its neighbours alone. Nothing can lie much below the repeatability. A point that is missing "
-        "lies in the noise.",
+        caption="Root mean square over all axes and the time up to T_M, on a logarithmic scale. Left out: the "
+        "temperature predicted from its neighbours alone. Nothing can lie much below the repeatability. A point that "
+        "is missing lies in the noise.",
         traces=traces,
         layout={
             "xaxis": axis_style("power-on temperature, degC", tickvals=knots),
             "yaxis": axis_style(f"rms, {label}", type="log", dtick="D2" if len(traces) > 9 else 1),
-            "legend": {"orientation": "h", "y": 1.12, "x": 0},
+            "legend": LEGEND,
         },
         height=400,
     )
@@ -323,6 +326,7 @@ def _over_temperature(table: WarmupTable) -> Figure:
         suffix = "" if number == 0 else "2"
         for j, instant in enumerate(instants):
             shade = ["#12303c", GOOD, "#5aa5bd", "#a9cfdb"][j]
+            dash = ["solid", "dash", "dashdot", "dot"][j]
             traces.append(
                 {
                     "type": "scatter",
@@ -333,11 +337,11 @@ def _over_temperature(table: WarmupTable) -> Figure:
                     "y": _rounded(z[:, i, j] * factor),
                     "xaxis": f"x{suffix}",
                     "yaxis": f"y{suffix}",
-                    "line": {"color": shade, "width": 2},
+                    "line": {"color": shade, "width": 2, "dash": dash},
                     "hovertemplate": f"{instant:g} s<br>%{{x:.1f}} degC: %{{y:.3g}} {label}<extra></extra>",
                 }
             )
-    layout: dict[str, Any] = {"legend": {"orientation": "h", "y": 1.12, "x": 0, "title": {"text": "after power-on: "}}}
+    layout: dict[str, Any] = {"legend": {**LEGEND, "title": {"text": "after power-on: "}}}
     for number, (axis, label) in enumerate(names):
         suffix = "" if number == 0 else "2"
         domain = [0, 1] if len(names) == 1 else [[0, 0.44], [0.56, 1]][number]

@@ -11,6 +11,7 @@ from imulab.recording import Array
 
 _ACROSS = 3
 _DECADES = [1, 3, 10, 30, 100, 300, 1000, 3000]
+_SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross")
 _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
 """Cold to warm; distinct in lightness too."""
 
@@ -29,6 +30,11 @@ def temperature_colour(temperature: float, temperatures: Array) -> str:
     ends = [np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) for colour in _SCALE[first : first + 2]]
     mixed = np.rint((1 - share) * ends[0] + share * ends[1]).astype(int)
     return "#" + "".join(f"{value:02x}" for value in mixed)
+
+
+def temperature_mark(temperature: float, temperatures: Array) -> str:
+    """Return the mark of the calibration temperature that is nearest."""
+    return _SYMBOLS[int(np.argmin(np.abs(temperatures - temperature))) % len(_SYMBOLS)]
 
 
 def grid(
@@ -52,17 +58,18 @@ def grid(
     traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "showlegend": True,
-        "legend": {"orientation": "h", "x": 0, "y": 1 + 0.16 / down, "yanchor": "bottom", "itemsizing": "constant"},
+        "legend": {"orientation": "h", "x": 0, "y": 1 + 0.09 / down, "yanchor": "bottom", "itemsizing": "constant"},
         "annotations": [],
     }
     traces += [
         {
             "type": "scatter",
-            "mode": "lines",
+            "mode": "lines+markers",
             "x": [None],
             "y": [None],
             "name": f"{at:g} °C",
             "line": {"color": temperature_colour(at, temperatures), "width": 3},
+            "marker": {"symbol": temperature_mark(at, temperatures), "size": 7},
         }
         for at in temperatures.tolist()
     ]
