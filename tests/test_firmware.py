@@ -1,5 +1,6 @@
 """What was validated on the desk is what runs in the unit: Python against the exported C, as compiled there."""
 
+import re
 import shutil
 import subprocess
 
@@ -9,7 +10,8 @@ import pytest
 import imulab as il
 import madeup
 from conftest import REPOSITORY
-from imulab.arraytable import METHODS
+from imulab.arraytable import METHODS, Fusion
+from imulab.cli import main
 from imulab.exporters import export
 from imulab.exporters.c import _header
 from imulab.packing import pack
@@ -309,6 +311,69 @@ int main(void) {
     done = subprocess.run([tmp_path / "project"], input=text, capture_output=True, text=True, check=True)
     expected = il.fuse(flight, il.FuseOptions(calibration=record)).rate[:, 0]
     assert np.array_equal(np.array(done.stdout.split(), dtype=float), expected)
+
+
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize(
+    "fusion",
+    [
+        Fusion("feedback"),
+        Fusion("feedback", 0.01),
+        Fusion("feedback", None, 100),
+        *map(Fusion, ("mean", "covariance", "support", "least-squares")),
+        Fusion("robust", 0.02),
+    ],
+    ids=str,
+)
+def test_the_self_test_passes_with_the_method_that_was_chosen(compiler, tmp_path, fusion, real):
+    array = {"elements": 4, "axes": 3, "unit": "deg/s"}
+    still = il.simulate_array(experiment="static", duration=30.0, **array)
+    moving = il.simulate_array(experiment="moving", duration=40.0, **array)
+    record = il.calibrate_array(still, moving, fusion=fusion).calibration
+    export("c", [record], tmp_path)
+    assert f".method = {METHODS.index(fusion.method)}," in (tmp_path / "unit.c").read_text(encoding="utf-8")
+    files = [tmp_path / name for name in ("imulab.c", "unit.c", "selftest.c")]
+    command = [compiler, *STRICT, f"-DIMULAB_REAL={real}", f"-I{tmp_path}", *files, "-o", tmp_path / "t", "-lm"]
+    subprocess.run(command, check=True)
+    done = subprocess.run([tmp_path / "t"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "pass" in done.stdout
+
+
+def test_export_takes_the_method_of_the_record_or_another(tmp_path, capsys):
+    for experiment, name in (("static", "still.csv"), ("dynamic", "run.csv")):
+        il.write_csv(il.simulate_array(experiment=experiment, duration=30.0), tmp_path / name)
+    record, out = str(tmp_path / "r.json"), str(tmp_path / "unit")
+
+    def method(*more):
+        assert main(["export", "--to", "c", record, "-o", out, *more]) == 0
+        text = (tmp_path / "unit" / "unit.c").read_text(encoding="utf-8")
+        found = re.search(r"\.method = (\d),", text), re.search(r"\.start = (\d+),", text)
+        return METHODS[int(found[0][1])], int(found[1][1]), re.search(r"\.memory = R\((.*)\)", text)[1]
+
+    still = str(tmp_path / "still.csv")
+    assert main(["array", "calibrate", still, "-o", record]) == 0
+    assert method() == ("robust", 1, "0.0")
+    assert method("--method", "feedback") == ("feedback", 1, "0.0")
+    assert main(["array", "calibrate", still, "--method", "feedback", "--memory", "growing:50", "-o", record]) == 0
+    assert method() == ("feedback", 50, "0.0")
+    assert method("--memory", "0.02") == ("feedback", 1, "0.02")
+    assert method("--method", "mean") == ("mean", 50, "0.0")
+    capsys.readouterr()
+    run, fused = str(tmp_path / "run.csv"), str(tmp_path / "f.csv")
+    assert main(["array", "fuse", run, "--calibration", record, "-o", fused]) == 0
+    assert capsys.readouterr().out.startswith("good: ")
+    options = il.FuseOptions(method="feedback", start=50, calibration=il.load(record))
+    expected = il.fuse(il.read(run), options).rate[:, 0]
+    np.testing.assert_allclose(il.read(fused).column("rate"), expected, rtol=1e-12)
+    for wrong, words in (
+        (["--method", "median"], "--method 'median': expected one of mean"),
+        (["--memory", "2"], "--memory '2': expected growing"),
+        (["--method", "kalman"], "method kalman has no table for a unit"),
+    ):
+        assert main(["export", "--to", "c", record, "-o", str(tmp_path / "no"), *wrong]) == 2
+        assert words in capsys.readouterr().err
+        assert not (tmp_path / "no").exists()
 
 
 def test_a_large_array_has_room_in_the_header():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.arraytable import Fusion
 from imulab.gyro_array.compare import compare_methods
 from imulab.gyro_array.experiments import run_experiment
 from imulab.gyro_array.fit import calibrate_array
@@ -16,6 +17,7 @@ from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse
 from imulab.gyro_array.model import METHODS
 from imulab.gyro_array.simulate import Fault, simulate_array
 from imulab.present import exhibits_of
+from imulab.verdict import Note
 from test_gyro_array_fuse import array_recording, dynamic
 
 G = 9.80665
@@ -69,6 +71,48 @@ def test_what_happened_to_a_gyro_is_one_line_that_names_its_column(imulab, run_f
     assert "from 10.5 s" in lines[0]
     assert lines[1].startswith("imulab: warning: gyro_5: jumped 51 samples from 20.4")
     assert done.stdout.splitlines()[9].startswith("time [s],rate [deg/s]")
+
+
+def test_the_verdict_is_printed_first_where_the_rate_goes_to_a_file(imulab, run_file, tmp_path):
+    done = imulab("array", "fuse", run_file / "run.csv", "-o", tmp_path / "out.csv")
+    assert done.stdout.startswith("look: understand this before you use the result: gyro_3: stuck 2")
+    assert done.stdout.count("\n") == 1
+    good = simulate_array(duration=20.0, seed=2)
+    il.write_csv(good, tmp_path / "good.csv")
+    done = imulab("array", "fuse", tmp_path / "good.csv", "-o", tmp_path / "out.csv")
+    assert done.stdout == "good: nothing in the data speaks against this result\n"
+
+
+@pytest.mark.parametrize(
+    ("elements", "rate", "words"),
+    [
+        (2, 100.0, ["method feedback with 2 gyros on each axis"]),
+        (6, 400.0, ["method feedback at 400 Hz: its source states it for 50 to 200 Hz"]),
+        (6, 20.0, ["method feedback at 20 Hz"]),
+        (6, 50.0, []),
+        (6, 200.0, []),
+    ],
+)
+def test_feedback_says_where_its_source_does_not_reach(elements, rate, words):
+    run = simulate_array(elements=elements, sample_rate=rate, duration=30.0, seed=3)
+    still = simulate_array(experiment="static", elements=elements, sample_rate=rate, duration=30.0, seed=3)
+    said = [fuse(run, FuseOptions(method="feedback")).notes, compare_methods(run).warnings]
+    said.append(calibrate_array(still, fusion=Fusion("feedback")).calibration.warnings)
+    for found in said:
+        mine = [line for line in found if "method feedback" in line]
+        assert len(mine) == len(words)
+        assert all(word in line and isinstance(line, Note) for word, line in zip(words, mine, strict=True))
+    assert not [line for line in fuse(run, FuseOptions(method="mean")).notes if "method feedback" in line]
+
+
+def test_compare_runs_with_the_memory_that_is_given(imulab, run_file, tmp_path):
+    done = imulab("array", "compare", run_file / "run.csv", "--memory", "0.05", "-o", tmp_path / "c.json")
+    assert done.returncode == 0, done.stderr
+    record = il.load(tmp_path / "c.json")
+    assert record.model["memory"] == "memory 0.05"
+    plain = compare_methods(il.read(run_file / "run.csv")).record
+    mine, other = (r.data["figures"]["feedback"][0]["rate_std"] for r in (record, plain))
+    assert mine != other
 
 
 def test_lines_are_fused_as_they_come(run_file):

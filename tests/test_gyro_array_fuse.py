@@ -11,7 +11,8 @@ import imulab as il
 from imulab.arraytable import ArraySettings
 from imulab.blob import Blob, make_blob
 from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream, parse_memory
+from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream
+from imulab.gyro_array.memory import parse_memory
 from imulab.gyro_array.model import METHODS, find_elements
 from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording
@@ -472,7 +473,13 @@ def test_a_blob_fuses_as_the_unit_does(imulab, tmp_path):
     np.testing.assert_allclose(unit, desk.rate[:, 0], atol=2e-5)
     refused = imulab("array", "fuse", "run.csv", "--calibration", blob, "--method", "mean")
     assert refused.returncode == 2
-    assert "a blob fuses by robust with growing memory, and by nothing else" in refused.stderr
+    assert "this blob fuses by robust with growing memory, and by nothing else" in refused.stderr
+    export = ("export", "--to", "blob", "a.json", "--method", "feedback", "--memory", "0.01", "-o", "unit2")
+    assert imulab(*export).returncode == 0
+    done = imulab("array", "fuse", "run.csv", "--calibration", "unit2/unit.blob", "-o", "blob2.csv")
+    assert done.returncode == 0, done.stderr
+    desk = fuse(run, FuseOptions(method="feedback", memory=0.01, calibration=record))
+    np.testing.assert_allclose(il.read(tmp_path / "blob2.csv").columns["rate"], desk.rate[:, 0], atol=2e-5)
     il.write_csv(simulate_array(duration=2.0, elements=4), tmp_path / "four.csv")
     assert "four.csv: 4 gyros on 1 axis; the blob" in imulab("array", "fuse", "four.csv", "--calibration", blob).stderr
     refused = imulab("array", "fuse", "run.csv", "--calibration", blob, "--initial-bias", "zero")

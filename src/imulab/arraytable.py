@@ -8,13 +8,50 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import OptionError, listed
+from imulab.errors import OptionError, RecordError, listed
 from imulab.packing import Field, Table
 from imulab.recording import Array
 
 METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")
 MOST_ELEMENTS = 64
+MOST_COUNT = 1_000_000_000
+"""Largest starting count of the growing memory."""
 _LEAST_WHITE = 0.05
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """The method that a unit fuses by, with its memory: None for the growing one that begins at k = `start`."""
+
+    method: str = "robust"
+    memory: float | None = None
+    start: int = 1
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as a record or a blob holds it."""
+        return {"method": self.method, "memory": "growing" if self.memory is None else self.memory, "start": self.start}
+
+
+def fusion_of(held: Any) -> Fusion:
+    """Return what a record or a blob holds; robust with growing memory where it says nothing.
+
+    Raises
+    ------
+    RecordError
+        It is no such method, memory or count.
+    """
+    if held is None:
+        return Fusion()
+    if isinstance(held, Mapping):
+        method, memory, start = held.get("method"), held.get("memory", "growing"), held.get("start", 1)
+        gain = isinstance(memory, float) and 0 < memory < 1
+        if method in METHODS and (gain or memory == "growing") and type(start) is int and 1 <= start <= MOST_COUNT:
+            return Fusion(str(method), memory if isinstance(memory, float) else None, start)
+    raise RecordError(f"fusion: expected a method, a memory and a starting count, found {str(held)[:60]}")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from imulab.arraytable import Fusion
 from imulab.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.errors import RecordError
 from imulab.packing import TEXT, Table, pack
@@ -47,8 +48,8 @@ def make_blob(records: Sequence[Calibration], tables: Sequence[Table]) -> bytes:
     return pack(tables, 4, plain_values(text, ""))
 
 
-def tables_of_all(records: Sequence[Calibration]) -> list[Table]:
-    """Return the tables of several records of one unit, in their order.
+def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[Table]:
+    """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
 
     Raises
     ------
@@ -58,7 +59,7 @@ def tables_of_all(records: Sequence[Calibration]) -> list[Table]:
     serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
         raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
-    tables = [table for record in records for table in tables_of(record)]
+    tables = [table for record in records for table in tables_of(record, fusion)]
     kinds = [table.kind for table in tables]
     twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
     if twice:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.arraytable import ArraySettings, array_table, element_white_noise
+from imulab.arraytable import ArraySettings, Fusion, array_table, element_white_noise, fusion_of
 from imulab.calibration import Calibration
 from imulab.errors import RecordError
 from imulab.packing import Field, Table
@@ -21,8 +21,10 @@ _CROSSED = 256
 """Added to the order of a table that has cross terms."""
 
 
-def tables_of(record: Calibration) -> tuple[Table, ...]:
+def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table, ...]:
     """Return the tables of a record, in the order in which they are applied.
+
+    An array fuses by `fusion`; by what its record carries where that is None.
 
     Raises
     ------
@@ -30,6 +32,8 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
         The record lacks a parameter or has one that cannot be.
     """
     try:
+        if record.procedure == "gyro_array":
+            return _array(record, fusion)
         return _BUILD[record.procedure](record)
     except KeyError as error:
         raise RecordError(f"the record lacks {error.args[0]}") from None
@@ -231,8 +235,8 @@ def _end(table: Mapping[str, Any]) -> float:
 # ---- gyro array ----------------------------------------------------------------------------------------------------
 
 
-def _array(record: Calibration) -> tuple[Table, ...]:
-    """The robust method, with the elements' biases, alignment and noise; readings in rad/s."""
+def _array(record: Calibration, fusion: Fusion | None) -> tuple[Table, ...]:
+    """The method that the record carries, with the elements' biases, alignment and noise; readings in rad/s."""
     if record.model.get("kind") != "calibration":
         raise RecordError(f"expected the record of an array calibration, found one of a {record.model.get('kind')}")
     elements = record.sections["elements"]
@@ -244,18 +248,28 @@ def _array(record: Calibration) -> tuple[Table, ...]:
             [e["matrix"]["value"] if "matrix" in e else [[1 / e["scale_factor"]["value"]]] for e in elements]
         )
         white = np.sqrt(np.einsum("nab,bn->an", matrices**2, white**2))
-    inverse = 1 / np.maximum(white, 1e-300) ** 2
+    by = fusion or fusion_of(record.model.get("fusion"))
+    weights = None
+    if by.method == "robust":
+        inverse = 1 / np.maximum(white, 1e-300) ** 2
+        weights = inverse / inverse.sum(axis=1, keepdims=True)
+    elif by.method == "covariance":
+        weights = np.array(record.sections["correlation"]["weights"], dtype=np.float64)
+    elif by.method == "kalman":
+        raise RecordError("method kalman has no table for a unit: expected another method, such as --method robust")
     settings = ArraySettings(
-        "robust",
+        by.method,
         len(elements),
         axes,
         bias=np.array([np.atleast_1d(element["bias"]["value"]) for element in elements]).T,
         matrices=matrices,
-        weights=inverse / inverse.sum(axis=1, keepdims=True),
+        weights=weights,
+        memory=by.memory,
+        start=by.start,
         rate=float(record.fit["sample_rate"]["value"]),
     )
     table = array_table(settings)
-    return (Table(table.kind, table.fields, {**table.columns, "unit": "rad/s", "rate": settings.rate}),)
+    return (Table(table.kind, table.fields, {**table.columns, **by.to_dict(), "unit": "rad/s", "rate": settings.rate}),)
 
 
 # ---- small things --------------------------------------------------------------------------------------------------
@@ -281,4 +295,4 @@ def _nonzero(scale: Array) -> Array:
     return scale
 
 
-_BUILD = {"tumble": _tumble, "gyro_array": _array, "centrifuge": _centrifuge, "warmup": _warmup}
+_BUILD = {"tumble": _tumble, "centrifuge": _centrifuge, "warmup": _warmup}

@@ -159,6 +159,12 @@ def calibrate(
         str | None, typer.Option("--interval", metavar="START,STOP", help="Use STILL from START to STOP, s.")
     ] = None,
     averaging: Annotated[str, typer.Option(help="Averaging time of the covariance matrix.")] = "1 s",
+    method: Annotated[
+        str | None, typer.Option(help="Method that fuse and export take from the record; robust if not given.")
+    ] = None,
+    memory: Annotated[
+        str | None, typer.Option(help="Its memory: growing, growing:COUNT, or a gain between 0 and 1.")
+    ] = None,
     layout: LayoutFile = None,
     output: OutputFile = None,
     report: ReportFile = None,
@@ -170,16 +176,22 @@ def calibrate(
 
     check_outputs([output, report], [name for name in (still, moving, layout) if name])
     files = [still] if moving is None else [still, moving]
-    options = {"interval": interval, "averaging": averaging, "layout": layout}
+    options = {"interval": interval, "averaging": averaging, "method": method, "memory": memory, "layout": layout}
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
 
 def fuse(
     file: RecordingFile,
     method: Annotated[
-        str, typer.Option(help="mean support least-squares feedback robust covariance kalman.")
-    ] = "robust",
-    memory: Annotated[str, typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1.")] = "growing",
+        str | None,
+        typer.Option(
+            help="mean support least-squares feedback robust covariance kalman; the calibration's, or robust."
+        ),
+    ] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing."),
+    ] = None,
     initial_bias: Annotated[
         str, typer.Option("--initial-bias", metavar="first|zero|RECORD", help="Biases to start from.")
     ] = "first",
@@ -192,7 +204,8 @@ def fuse(
     output: OutputFile = None,
 ) -> None:
     """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
-    from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording, parse_memory
+    from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording
+    from imulab.gyro_array.memory import carried, fusion_text
     from imulab.readers import read_blocks
     from imulab.writers import check_writable, write, write_csv_to
 
@@ -200,13 +213,15 @@ def fuse(
     check_outputs([output], [name for name in (file, layout, *records) if name])
     if output:
         check_writable(output)
-    gain, start = parse_memory(memory)
+    fusion_text(method, memory)  # refuses before a record is read
+    known = None if calibration is None else _load_any(calibration)
+    by = fusion_text(method, memory, held=carried(known))
     options = FuseOptions(
-        method=method,
-        memory=gain,
-        start=start,
+        method=by.method,
+        memory="growing" if by.memory is None else by.memory,
+        start=by.start,
         initial_bias=initial_bias if initial_bias in ("first", "zero") else _load(initial_bias, "--initial-bias"),
-        calibration=None if calibration is None else _load_any(calibration),
+        calibration=known,
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
         still=None if interval is None else _interval(interval, "--still"),
     )
@@ -218,7 +233,7 @@ def fuse(
         first = next(blocks)  # fused before anything is written, so that a refusal leaves no head behind
         write_csv_to(_flushed(first, blocks), sys.stdout.buffer)
         sys.stdout.buffer.flush()
-    _say(fuser)
+    _say(fuser, verdict=output is not None)
 
 
 def _load(name: str, option: str) -> Calibration:
@@ -260,12 +275,16 @@ def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]
         sys.stdout.buffer.flush()
 
 
-def _say(fuser: Fuser) -> None:
-    for line in fuser.notes():
+def _say(fuser: Fuser, *, verdict: bool) -> None:
+    """Print what there is to know of what was fused; the verdict first, where standard output is not the rate."""
+    from imulab.cli.show import verdict_line
+    from imulab.verdict import verdict_of
+
+    lines = fuser.notes() + (fuser.health.lines() if fuser.health is not None else [])
+    if verdict:
+        print(verdict_line(verdict_of(lines)))
+    for line in lines:
         warn(line)
-    if fuser.health is not None:
-        for line in fuser.health.lines():
-            warn(line)
 
 
 def compare(
@@ -275,6 +294,10 @@ def compare(
         str | None, typer.Option(metavar="static|dynamic", help="Run the source's set-up instead of a FILE.")
     ] = None,
     seeds: Annotated[str, typer.Option(help="Runs of the experiment.")] = "20",
+    memory: Annotated[
+        str | None,
+        typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing."),
+    ] = None,
     layout: LayoutFile = None,
     output: OutputFile = None,
     report: ReportFile = None,
@@ -288,8 +311,8 @@ def compare(
     check_outputs([output, report], [name for name in (file, calibration, layout) if name])
     count = whole_number(seeds, "--seeds")
     if experiment is not None:
-        if output or report:
-            raise OptionError("array compare: -o and --report need a FILE")
+        if output or report or memory:
+            raise OptionError("array compare: -o, --report and --memory need a FILE")
         from imulab.gyro_array.experiments import run_experiment
 
         with progress_bar("seeds", count) as progress:
@@ -302,10 +325,13 @@ def compare(
         return
     from imulab.cli.show import verdict_line
     from imulab.gyro_array.compare import compare_methods
+    from imulab.gyro_array.memory import carried, fusion_text
     from imulab.readers import read
 
     record = None if calibration is None else _load(calibration, "--calibration")
-    comparison = compare_methods(read(str(file), layout), calibration=record)
+    by = fusion_text(None, memory, held=carried(record))
+    kept = "growing" if by.memory is None else by.memory
+    comparison = compare_methods(read(str(file), layout), calibration=record, memory=kept, count_from=by.start)
     arraytext.write(comparison.record, output, report)
     if not json:
         print(verdict_line(comparison.record.verdict))

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from imulab.cli.options import naming, warn, whole_number
 from imulab.errors import OptionError, listed
+
+if TYPE_CHECKING:
+    from imulab.arraytable import Fusion
+    from imulab.calibration import Calibration
 
 _DEVICE_IDS = 2**32
 
@@ -24,6 +29,12 @@ def export(
     device_id: Annotated[str, typer.Option("--device-id", metavar="N", help="PX4: number of the sensor.")] = "0",
     noise: Annotated[
         str | None, typer.Option("--noise", metavar="FILE", help="What 'allan --json' printed, for noise keys.")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", help="c, blob: how an array fuses; what its record carries if not given.")
+    ] = None,
+    memory: Annotated[
+        str | None, typer.Option("--memory", help="c, blob: growing, growing:COUNT, or a gain between 0 and 1.")
     ] = None,
 ) -> None:
     """Write calibration records in the form of firmware, an autopilot or a toolbox."""
@@ -46,15 +57,26 @@ def export(
         lossy=lossy, device_id=number, noise=_noise(noise) if noise else {}, noise_file=noise or "", tell=warn
     )
     loaded = [load(name) for name in records]
+    if method is not None or memory is not None:
+        options = replace(options, fusion=_fusion(to, method, memory, loaded))
     if to in ("c", "blob"):
         for name, record in zip(records, loaded, strict=True):
             with naming(name):
-                tables_of(record)
+                tables_of(record, options.fusion)
     for name, record in zip(records, loaded, strict=True):
         if record.verdict.state == "bad":
             warn(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     for file in write(to, loaded, output, options):
         print(f"{to}: {file}")
+
+
+def _fusion(to: str, method: str | None, memory: str | None, records: list[Calibration]) -> Fusion:
+    from imulab.gyro_array.memory import carried, fusion_text
+
+    array = next((record for record in records if record.procedure == "gyro_array"), None)
+    if to not in ("c", "blob") or array is None:
+        raise OptionError("--method and --memory say how a gyro array fuses: expected its record, and --to c or blob")
+    return fusion_text(method, memory, held=carried(array))
 
 
 def _noise(file: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from imulab.arraytable import Fusion
 from imulab.calibration import Calibration
 from imulab.errors import OptionError, listed
 
@@ -41,6 +42,8 @@ class ExportOptions:
         What ``allan --json`` found, for targets with noise keys.
     noise_file
         What messages call the file that it came from.
+    fusion
+        Method and memory of an array in firmware or a blob; what its record carries where None.
     tell
         Called with a sentence on each loss that was allowed.
     """
@@ -49,6 +52,7 @@ class ExportOptions:
     device_id: int = 0
     noise: Mapping[str, Any] = field(default_factory=dict)
     noise_file: str = "the noise file"
+    fusion: Fusion | None = None
     tell: Callable[[str], object] = _nothing
 
 

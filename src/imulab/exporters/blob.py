@@ -22,7 +22,7 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     OptionError
         The file cannot be written.
     """
-    data = make_blob(records, tables_of_all(records))
+    data = make_blob(records, tables_of_all(records, options.fusion))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

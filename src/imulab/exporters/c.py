@@ -44,7 +44,7 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     OptionError
         The folder cannot be written to.
     """
-    tables = tables_of_all(records)
+    tables = tables_of_all(records, options.fusion)
     blob = make_blob(records, tables)
     contents = {
         "imulab.h": _header(tables),

@@ -14,7 +14,8 @@ from imulab.gyro_array.bandwidth import Response, responses
 from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
-from imulab.gyro_array.model import FEWEST_ROBUST, METHODS, Elements, array_calibration, find_elements
+from imulab.gyro_array.memory import memory_text
+from imulab.gyro_array.model import FEWEST_ROBUST, METHODS, Elements, array_calibration, feedback_notes, find_elements
 from imulab.gyro_array.single import Singles, single_gyros
 from imulab.noise import allan_deviation
 from imulab.recording import Array, Recording
@@ -70,8 +71,14 @@ class Comparison:
     warnings: tuple[str, ...]
 
 
-def compare_methods(recording: Recording, *, calibration: Calibration | None = None) -> Comparison:
-    """Run all seven methods over a recording.
+def compare_methods(
+    recording: Recording,
+    *,
+    calibration: Calibration | None = None,
+    memory: str | float = "growing",
+    count_from: int = 1,
+) -> Comparison:
+    """Run all seven methods over a recording; memory and `count_from` are memory and start of `FuseOptions`.
 
     The truth is the column ``truth_rate`` (or ``truth_rate_x`` ..); without it the unit must be still, or still for a
     stretch of 5 s or more: the figures are then of the longest such stretch, and the truth there is 0. With six gyros
@@ -115,7 +122,7 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
     response: dict[str, list[Response]] = {}
     for method in METHODS:
         try:
-            options = FuseOptions(method=method, calibration=calibration, rate=rate)
+            options = FuseOptions(method=method, memory=memory, start=count_from, calibration=calibration, rate=rate)
             fused = fuse(recording, options, weights=method == "robust", flags=method == "robust")
             spoilt = (np.isnan(fused.rate) & ~lost).any(axis=1)
             if spoilt.any():
@@ -148,6 +155,8 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
     }
     health = _health(rates["robust"], recording) if "robust" in rates else {}
     warnings += _filtering(figures, response, rate)
+    if not isinstance(figures["feedback"], str):
+        warnings += [type(line)(f"{recording.name}: {line}") for line in feedback_notes(elements.count, rate)]
     data = {
         "figures": {m: f if isinstance(f, str) else [asdict(x) for x in f] for m, f in figures.items()},
         "allan": curves,
@@ -174,6 +183,7 @@ def compare_methods(recording: Recording, *, calibration: Calibration | None = N
             "units": list(elements.units),
             "truth": "column truth_rate" if truth is not None else "a still unit",
             "calibrated": calibration is not None,
+            "memory": memory_text(memory, count_from),
         },
         fit={
             "samples": stop - start,

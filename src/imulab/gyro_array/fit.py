@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.allan import ColumnNoise, column_noise, noise_lines
+from imulab.arraytable import Fusion
 from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.coefficients import COEFFICIENTS, coefficients_dict
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
@@ -16,7 +17,7 @@ from imulab.gyro_array.align import Alignment
 from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import on_one_clock
 from imulab.gyro_array.latency import align_in_time, latency_notes
-from imulab.gyro_array.model import Elements, find_elements, fixed_weights
+from imulab.gyro_array.model import Elements, feedback_notes, find_elements, fixed_weights
 from imulab.gyro_array.rest import find_rest
 from imulab.noise import AllanCurve
 from imulab.recording import Array, Recording, check_finite, check_time
@@ -53,7 +54,12 @@ class _AtRest:
 
 
 def calibrate_array(
-    still: Recording, moving: Recording | None = None, *, averaging_time: float = 1.0, serial: str | None = None
+    still: Recording,
+    moving: Recording | None = None,
+    *,
+    averaging_time: float = 1.0,
+    serial: str | None = None,
+    fusion: Fusion | None = None,
 ) -> ArrayFit:
     """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
 
@@ -68,6 +74,8 @@ def calibrate_array(
         Recordings with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h.
     averaging_time
         Of the covariance matrix, s.
+    fusion
+        Method and memory that `array fuse` and `export` take from the record; robust and growing where not given.
 
     Raises
     ------
@@ -114,7 +122,11 @@ def calibrate_array(
         )
     noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
     warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
+    if fusion is not None and fusion.method == "feedback":
+        warnings += [type(line)(f"{still.name}: {line}") for line in feedback_notes(elements.count, rest.rate)]
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
+    if fusion is not None:
+        record = replace(record, model={**record.model, "fusion": fusion.to_dict()})
     if serial is not None:
         record = Calibration(**{**record.__dict__, "sensor": {**record.sensor, "serial": serial}})
     return ArrayFit(record, rest.curves)

@@ -8,30 +8,31 @@ from typing import Any
 
 import numpy as np
 
+from imulab.arraytable import MOST_COUNT
 from imulab.blob import Blob
 from imulab.calibration import Calibration
-from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
+from imulab.errors import DataError, OptionError, listed
+from imulab.gyro_array.blobs import blob_stream, fusion_of_blob
 from imulab.gyro_array.checks import Checks
 from imulab.gyro_array.clocks import Clock, to_one_clock
 from imulab.gyro_array.health import Health
 from imulab.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
+from imulab.gyro_array.memory import memory_text
 from imulab.gyro_array.model import (
     FEWEST_ROBUST,
     METHODS,
     ArrayCalibration,
     Elements,
     array_calibration,
-    count_of_axes,
+    feedback_notes,
     find_elements,
 )
 from imulab.recording import Array, Recording
 from imulab.rows import HISTORY, zero_rows
-from imulab.units import conversion_factor, from_si, parse_unit
+from imulab.units import from_si, parse_unit
 
 _NEED_THREE = ("robust", "support", "least-squares")
 _FOR_NOISE = 10_000
-MOST_COUNT = 1_000_000_000
-"""Largest starting count of the growing memory."""
 _WITHOUT_UNIT = 16.0
 
 
@@ -83,10 +84,13 @@ class FuseOptions:
             raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record")
         if self.method == "covariance" and self.calibration is None:
             raise OptionError("method covariance needs --calibration RECORD: its weights come from a recording at rest")
-        if isinstance(self.calibration, Blob) and (self.method, self.memory, self.start) != ("robust", "growing", 1):
-            raise OptionError(
-                f"{self.calibration.name}: a blob fuses by robust with growing memory, and by nothing else"
-            )
+        if isinstance(self.calibration, Blob):
+            held = fusion_of_blob(self.calibration).to_dict()
+            if {"method": self.method, "memory": self.memory, "start": self.start} != held:
+                raise OptionError(
+                    f"{self.calibration.name}: this blob fuses by {held['method']} with "
+                    f"{memory_text(held['memory'], held['start'])}, and by nothing else"
+                )
         if isinstance(self.calibration, Blob) and self.initial_bias != "first":
             raise OptionError(f"{self.calibration.name}: a blob holds the biases it starts from: no --initial-bias")
         if isinstance(self.initial_bias, Calibration) and self.calibration is not None:
@@ -127,26 +131,6 @@ class Fused:
     health: Health
     notes: tuple[str, ...] = ()
     block: Recording | None = None
-
-
-def parse_memory(text: str) -> tuple[str | float, int]:
-    """Return memory and starting count of a text such as ``growing``, ``growing:100`` or ``0.01``.
-
-    Raises
-    ------
-    OptionError
-        It is none of these.
-    """
-    kind, colon, count = text.partition(":")
-    if kind == "growing" and (not colon or (count.isascii() and count.isdecimal() and 0 < int(count) <= MOST_COUNT)):
-        return "growing", int(count) if colon else 1
-    try:
-        gain = float(text)
-    except ValueError:
-        gain = np.nan
-    if not 0 < gain < 1:
-        raise OptionError(f"--memory {text!r}: expected growing, growing:COUNT, or a gain between 0 and 1")
-    return gain, 1
 
 
 def fuse(
@@ -242,12 +226,15 @@ class Fuser:
 
     def notes(self) -> list[str]:
         """Return what there is to say at the end: gaps, rows of zeros, and what the readings show (`Checks`)."""
+        said: list[str] = []
+        if self.options.method == "feedback" and self.health is not None:
+            said = feedback_notes(len(self.health.names[0]), self.clock.rate)
         known = self.health.stuck() if self.health is not None else ()
         found = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
             found = [*found, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
-        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in found)]
+        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*found, *said])]
 
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""
@@ -305,7 +292,7 @@ def open_stream(
     from imulab.runtime import array_stream
 
     if isinstance(options.calibration, Blob):
-        return _blob_stream(options.calibration, elements, recording)
+        return blob_stream(options.calibration, elements, recording)
     calibration = None
     if options.calibration is not None:
         calibration = array_calibration(options.calibration, elements, recording)
@@ -336,39 +323,6 @@ def open_stream(
     if options.method == "kalman":
         settings["gain"] = _gain(options, elements, rate, first, calibration)
     return array_stream(options.method, **settings)
-
-
-@dataclass(frozen=True)
-class _InUnits:
-    """A stream in rad/s behind readings in another unit."""
-
-    stream: Any
-    factor: Array
-
-    def process(self, readings: Array, **more: Any) -> Any:
-        out = self.stream.process(readings * self.factor[:, None], **more)
-        return replace(out, rate=out.rate / self.factor)
-
-
-def _blob_stream(blob: Blob, elements: Elements, recording: str) -> _InUnits:
-    """Return the stream of an exported blob."""
-    from imulab.arraytable import ArraySettings
-    from imulab.runtime import Stream
-
-    section = next((s for s in blob.text["sections"] if s["kind"] == "array"), None)
-    if section is None:
-        raise RecordError(f"{blob.name}: the blob holds no array")
-    if (section["elements"], section["axes"]) != (elements.count, len(elements.axes)):
-        raise RecordError(
-            f"{recording}: {elements.count} gyros on {count_of_axes(len(elements.axes))}; the blob {blob.name} holds "
-            f"{section['elements']} on {count_of_axes(section['axes'])}"
-        )
-    for row, unit in zip(elements.names, elements.units, strict=True):
-        if parse_unit(unit).quantity != "rate":
-            raise UnitError(f"{recording}: column {row[0]} is in {unit}; the blob {blob.name} is in rad/s")
-    factor = np.array([conversion_factor(unit, "rad/s") for unit in elements.units])
-    settings = ArraySettings(section["method"], elements.count, len(elements.axes), rate=section["rate"])
-    return _InUnits(Stream.of_blob(blob.data, settings), factor)
 
 
 def _aligned(matrices: Array | None, spread: Array) -> Array:

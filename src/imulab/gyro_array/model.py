@@ -17,9 +17,12 @@ from imulab.calibration import Calibration
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, from_si, parse_unit
+from imulab.verdict import Note
 
 METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")
 FEWEST_ROBUST = 3
+SOURCE_RATES = (50.0, 200.0)
+"""Sampling rates for which the source states its recursion, Hz."""
 MOST_ELEMENTS = 64
 _ELEMENT = re.compile(r"gyro_(?:([xyz])_)?([1-9][0-9]*)")
 _MISNUMBERED = re.compile(r"gyro_(?:[xyz]_)?0[0-9]*")
@@ -156,6 +159,27 @@ class ArrayCalibration:
     weights: Array
     white: Array
     walk: Array
+
+
+def feedback_notes(count: int, rate: float) -> list[str]:
+    """Return what to know of the method `feedback` for so many gyros on each axis and this sampling rate, Hz."""
+    found: list[str] = []
+    if count < FEWEST_ROBUST:
+        found.append(
+            Note(
+                f"method feedback with {count} gyro{'s' * (count > 1)} on each axis: with fewer than {FEWEST_ROBUST} "
+                "no gyro stands out from the others, so that the weights mean little"
+            )
+        )
+    low, high = SOURCE_RATES
+    if not 0.99 * low <= rate <= 1.01 * high:
+        found.append(
+            Note(
+                f"method feedback at {rate:.6g} Hz: its source states it for {low:g} to {high:g} Hz, and its memory "
+                "counts samples"
+            )
+        )
+    return found
 
 
 def check_calibration(record: Calibration, name: str = "the record") -> None:

@@ -11,6 +11,7 @@ from imulab.tasks.task import Files, Task
 from imulab.texts import quantity
 
 if TYPE_CHECKING:
+    from imulab.arraytable import Fusion
     from imulab.calibration import Calibration
     from imulab.recording import Recording
 
@@ -26,7 +27,17 @@ def _array_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "interval": ends,
         "averaging": quantity(texts.get("averaging", "1 s"), label.format("averaging"), "time", "s"),
         "layout": texts.get("layout"),
+        "fusion": _fusion(texts, label),
     }
+
+
+def _fusion(texts: Mapping[str, str], label: str) -> Fusion | None:
+    """Method and memory that the record is to carry; None where neither is given."""
+    from imulab.gyro_array.memory import fusion_text
+
+    if texts.get("method") is None and texts.get("memory") is None:
+        return None
+    return fusion_text(texts.get("method"), texts.get("memory"), label)
 
 
 def _array_fit(
@@ -36,7 +47,7 @@ def _array_fit(
 
     still = _between(access.recording(files[0], values["layout"]), values["interval"])
     moving = access.recording(files[1], values["layout"]) if len(files) > 1 else None
-    return calibrate_array(still, moving, averaging_time=values["averaging"]).calibration
+    return calibrate_array(still, moving, averaging_time=values["averaging"], fusion=values["fusion"]).calibration
 
 
 def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
@@ -59,7 +70,7 @@ TASK = Task(
     procedure="gyro_array",
     files="STILL, or STILL;MOVING",
     count=(1, 2),
-    options=("interval", "averaging", "layout"),
+    options=("interval", "averaging", "method", "memory", "layout"),
     paths=("layout",),
     modules=("imulab.readers", "imulab.gyro_array.fit", "scipy.special"),
     values=_array_values,
