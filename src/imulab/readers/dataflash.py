@@ -230,8 +230,14 @@ def _choose(
     if not titles:
         found = " ".join(sorted(contents.other)) or "none"
         raise ReadError(f"{name}: no IMU, ACC or GYR messages; messages found: {found}")
-    topic = selection.topic or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
     instance = selection.instance or 0
+    topic = selection.topic or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
+    samples = {title: contents.counts[there[title, instance][0], instance] for title, n in there if n == instance}
+    if not selection.topic and samples.get("ACC", 0) > logs.PLAINLY_MORE * samples.get("IMU", np.inf):
+        topic = "ACC"
+        contents.notes.append(
+            f"ACC, which has {samples['ACC']} samples, is read rather than {samples['IMU']} of IMU; a topic chooses"
+        )
     if (topic, instance) not in there:
         found = ", ".join(f"{title} {number}" for title, number in sorted(there))
         raise OptionError(f"{name}: no {topic} of instance {instance}; found {found}")

@@ -1,7 +1,9 @@
 """Streams of different clocks to one recording.
 
 Logs interleave the samples of several sensors. The accelerometer's samples (or whatever stream comes first) are the
-clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file.
+clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file. Before a
+stream's first sample and after its last nothing is known of it, and nothing is made up: the few rows by which streams
+that begin and end together overlap each other are left out, and longer parts without a stream hold no numbers of it.
 """
 
 from __future__ import annotations
@@ -50,6 +52,7 @@ class _Buffer:
         self._waiting: list[Piece] = []
         self.count = 0
         self.step = np.nan
+        self.first: int | None = None
 
     def add(self, piece: Piece) -> None:
         self._waiting.append(piece)
@@ -61,6 +64,8 @@ class _Buffer:
             self.ticks = np.concatenate([self.ticks, *(piece.ticks for piece in self._waiting)])
             self.values = np.concatenate([self.values, *(piece.values for piece in self._waiting)])
             self._waiting = []
+        if self.first is None and self.count:
+            self.first = int(self.ticks[0])
         if np.isnan(self.step) and self.count > 1:
             self.step = float(np.median(np.diff(self.ticks)))
 
@@ -119,13 +124,24 @@ def on_one_clock(
             done = max(done, int(clock.ticks[:ready].max()))
         if ready == 0:
             continue
+        whole_time = [(other, *_bounds(clock, other, ended=piece is None)) for other in others]
         ticks = clock.ticks[:ready]
+        kept = np.ones(ready, dtype=np.bool_)
+        said = list(notes)
+        for other, from_tick, to_tick in whole_time:
+            within = (ticks >= from_tick) & (ticks <= to_tick)
+            if not within.all():
+                said.append(_left_out(other, clock, int(np.count_nonzero(~within))))
+            kept &= within
+        ticks = ticks[kept]
+        if not ticks.size:
+            clock.drop(ready)
+            continue
         start = int(ticks[0]) if origin is None else origin
         origin = start
         columns: dict[str, Array] = {"time": (ticks - start) / per_second}
         units = {"time": "s"}
-        said = list(notes)
-        values = clock.values[:ready]
+        values = clock.values[:ready][kept]
         for buffer in buffers:
             if buffer is not clock:
                 values, moved = _interpolated(buffer, ticks, start, per_second, name)
@@ -136,7 +152,7 @@ def on_one_clock(
         yield Recording(
             columns=columns, units=units, metadata=metadata(start), name=name, first_row=row, notes=tuple(said)
         )
-        row += ready
+        row += len(ticks)
         clock.drop(ready)
     if row == 1:
         raise ReadError(f"{name}: no samples of the {clock.stream.what}")
@@ -165,6 +181,27 @@ def _ready(clock: _Buffer, others: list[_Buffer]) -> int:
     return int(np.searchsorted(np.maximum.accumulate(clock.ticks), horizon, side="right"))
 
 
+def _bounds(clock: _Buffer, other: _Buffer, *, ended: bool) -> tuple[float, float]:
+    """Return the ticks between which the clock's rows are kept, for a stream that begins later or ends earlier.
+
+    Rows before and after it are left out where they are few, and kept without its values where they are many.
+    """
+    low, high = -np.inf, np.inf
+    if other.stream.slow or not other.count or np.isnan(other.step):
+        return low, high
+    few = _WIDEST_GAP * other.step
+    if clock.first is not None and other.first is not None and 0 < other.first - clock.first <= few:
+        low = other.first
+    if ended and 0 < clock.ticks[-1] - other.ticks[-1] <= few:
+        high = int(other.ticks[-1])
+    return low, high
+
+
+def _left_out(other: _Buffer, clock: _Buffer, count: int) -> str:
+    rows = f"{count} row{'s' * (count > 1)}"
+    return f"{rows} of the {clock.stream.what} left out where the {other.stream.what} has not begun or has ended"
+
+
 def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:
     """Values of a stream at the clock's ticks, shape (n, columns), and whether any had to be interpolated."""
     if buffer.count == 0:
@@ -177,20 +214,16 @@ def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, n
             f"{name}: the time of the {buffer.stream.what} runs backwards: "
             f"expected more than {before:.9g} s, found {after:.9g} s"
         )
+    outside = (ticks < buffer.ticks[0]) | (ticks > buffer.ticks[-1])
     known, wanted = (buffer.ticks - origin).astype(np.float64), (ticks - origin).astype(np.float64)
     values = np.column_stack([np.interp(wanted, known, column) for column in buffer.values.T])
     right = np.clip(np.searchsorted(buffer.ticks, ticks), 0, buffer.count - 1)
     met = buffer.ticks[right] == ticks
     left = np.clip(right - 1, 0, None)
     if not buffer.stream.slow and not np.isnan(buffer.step):
-        # Across a gap, or beyond the ends by more than a gap, there is no reading: that is not invented.
-        outside = (ticks < buffer.ticks[0]) | (ticks > buffer.ticks[-1])
-        distance = np.where(
-            outside,
-            np.minimum(np.abs(ticks - buffer.ticks[0]), np.abs(ticks - buffer.ticks[-1])),
-            buffer.ticks[right] - buffer.ticks[left],
-        )
-        values[~met & (distance > _WIDEST_GAP * buffer.step)] = np.nan
+        # Across a gap there is no reading: that is not invented.
+        values[~met & (buffer.ticks[right] - buffer.ticks[left] > _WIDEST_GAP * buffer.step)] = np.nan
+    values[outside] = np.nan
     # The sample before the last tick stays: the next block may begin right behind it.
     buffer.drop(max(int(np.searchsorted(buffer.ticks, ticks.max(), side="right")) - 1, 0))
     return values, not met.all()

@@ -1,4 +1,4 @@
-"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined.
+"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined where that has plainly more samples.
 
 Source: the file format in the PX4 user guide ("ULog File Format", version 1): a header of 16 bytes, then messages
 u16 size, u8 type, payload. Time is ``timestamp_sample`` (``timestamp`` where a log has none), microseconds since boot.
@@ -170,10 +170,20 @@ def _choose(
             f"{name}: no {' '.join(_TOPICS[:2])} or {_TOPICS[2]}; topics found: {' '.join(others) or 'none'}"
         )
     titles = {title for title, _ in there}
-    wanted = [topic] if topic else [t for t in _TOPICS[:2] if t in titles] or ["sensor_combined"]
+    instance = selection.instance or 0
+    raw = [t for t in _TOPICS[:2] if t in titles]
+    wanted = [topic] if topic else raw or ["sensor_combined"]
     if wanted == ["sensor_accel"] and "sensor_gyro" in titles:
         wanted.append("sensor_gyro")
-    instance = selection.instance or 0
+    if topic is None and raw:
+        samples = {t: contents.counts[there[t, instance]] for t in (*raw, "sensor_combined") if (t, instance) in there}
+        combined = samples.pop("sensor_combined", 0)
+        if samples and combined > logs.PLAINLY_MORE * min(samples.values()):
+            wanted = ["sensor_combined"]
+            few = " and ".join(f"{count} of {title}" for title, count in samples.items())
+            contents.notes.append(
+                f"sensor_combined, which has {combined} samples, is read rather than {few}; a topic chooses"
+            )
     chosen = [title for title in wanted if (title, instance) in there]
     if not chosen:
         found = ", ".join(f"{title} {number}" for title, number in sorted(there))
