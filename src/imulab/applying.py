@@ -204,9 +204,10 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     if isinstance(record, Calibration) and record.verdict.state == "bad":
         found.append(f"the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     sensor = record.text["sensor"] if isinstance(record, Blob) else record.sensor
-    mine, its = sensor.get("serial"), recording.metadata.get("serial")
-    if mine and its and mine != its:
-        found.append(f"{recording.name}: serial {its}, but the record was made for {mine}")
+    for key in ("serial", "element"):
+        mine, its = sensor.get(key), recording.metadata.get(key)
+        if mine and its and mine != its:
+            found.append(f"{recording.name}: {key} {its}, but the record was made for {mine}")
     found += _missing_triad(record, recording)
     messages = []
     for columns in _warmup_columns(record):

@@ -27,6 +27,7 @@ _QUANTITIES = {
     "temperature": ("temperature", "output"),
     "table_angle": ("angle", "output"),
 }
+_ELEMENT = re.compile(r"(?:accel|gyro)(?:_[xyz])?_(\d+)")
 _CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
 """What loggers call the time, and the unit in it."""
 
@@ -126,6 +127,12 @@ class Recording:
             return self.columns[name]
         except KeyError:
             foreign = all(_expected(other) in (None, ("time",)) for other in self.columns)
+            several = sorted({number for other in self.columns if (number := element_number(other, name)) is not None})
+            if several:
+                raise DataError(
+                    f"{self.name}: no column {name}, but one of each of {len(several)} IMUs; choose one, from "
+                    f"{several[0]} to {several[-1]} (--element {several[0]})"
+                ) from None
             hint = "; a layout says where columns of other names are (--layout; docs/recordings.md)" if foreign else ""
             raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
 
@@ -208,6 +215,12 @@ class Recording:
         except ImportError:
             raise DataError("to_frame needs polars: pip install 'imulab[tables]'") from None
         return polars.DataFrame({f"{name} [{self.units[name]}]": values for name, values in self.columns.items()})
+
+
+def element_number(column: str, stem: str = "") -> int | None:
+    """Return which of several IMUs a column such as ``accel_x_7`` (of the stem ``accel_x``) is of, None for others."""
+    match = _ELEMENT.fullmatch(column)
+    return int(match[1]) if match and column.startswith(f"{stem}_" if stem else "") else None
 
 
 def parse_column_title(title: str, file: str) -> tuple[str, str]:

@@ -65,13 +65,15 @@ def whole_number(text: str, option: str) -> int:
         raise OptionError(f"{option} {text!r}: expected a whole number") from None
 
 
-def chosen(topic: str | None, instance: str | None, window: str | None, label: str = "--{}") -> dict[str, Any]:
+def chosen(
+    topic: str | None, instance: str | None, window: str | None, element: str | None = None, *, label: str = "--{}"
+) -> dict[str, Any]:
     """Return the options of `read` that choose a part of a file; `label` is how messages call an option.
 
     Raises
     ------
     OptionError
-        The instance is no number, or the window is not FROM:TO.
+        The instance or the element is no number, or the window is not FROM:TO.
     """
     part: tuple[float | None, ...] | None = None
     if window is not None:
@@ -81,7 +83,8 @@ def chosen(topic: str | None, instance: str | None, window: str | None, label: s
             raise OptionError(f"{name} {window!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
         part = tuple(quantity(end, name, "time", "s") if end.strip() else None for end in ends)
     number = None if instance is None else whole_number(instance, label.format("instance"))
-    return {"topic": topic, "instance": number, "window": part}
+    one = None if element is None else whole_number(element, label.format("element"))
+    return {"topic": topic, "instance": number, "window": part, "element": one}
 
 
 def number(text: str, option: str) -> float:

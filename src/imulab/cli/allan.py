@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.options import AsJson, LayoutFile, RecordingFile, warn
+from imulab.cli.options import AsJson, Element, Instance, LayoutFile, RecordingFile, Topic, Window, chosen, warn
 from imulab.printable import printable
 
 _HOUR = 3600.0
@@ -18,13 +18,17 @@ def allan(
     file: RecordingFile,
     taus: Annotated[str, typer.Option(help="octave, or dense (24 a decade).")] = "octave",
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
+    element: Element = None,
     json: AsJson = False,
 ) -> None:
     """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
     from imulab.allan import analyse
     from imulab.readers import read
 
-    found = analyse(read(file, layout), taus)
+    found = analyse(read(file, layout, **chosen(topic, instance, window, element)), taus)
     if json:
         from json import dumps
 

@@ -11,11 +11,15 @@ import typer
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
+    Instance,
     LayoutFile,
     OutputFile,
     RecordingFile,
     ReportFile,
+    Topic,
+    Window,
     check_outputs,
+    chosen,
     heard,
     progress_bar,
     quantity,
@@ -129,6 +133,9 @@ def merge(
     column: Annotated[str | None, typer.Option(metavar="NAME", help="Take this column of each.")] = None,
     align: Annotated[bool, typer.Option("--align", help="Move the clocks to where the motion fits the first.")] = False,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
 ) -> None:
     """Join files of one gyroscope each to the recording of an array, by time, at the times of the first file."""
     from imulab.cli.options import note, read_recording
@@ -140,9 +147,10 @@ def merge(
     if axis is not None and column is not None:
         raise OptionError("array merge: --axis and --column both say which column to take; expected one of them")
     check_outputs([output], [*files, *([layout] if layout else [])])
+    reading = chosen(topic, instance, window)
     check_writable(output)
     merged = merge_recordings(
-        [read_recording(file, layout, {}) for file in files], axis=axis, column=column, align=align
+        [read_recording(file, layout, reading) for file in files], axis=axis, column=column, align=align
     )
     write(merged.recording, output)
     for message in merged.notes:
@@ -166,6 +174,11 @@ def calibrate(
         str | None, typer.Option(help="Its memory: growing, growing:COUNT, or a gain between 0 and 1.")
     ] = None,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Annotated[
+        str | None, typer.Option("--window", metavar="FROM:TO", help="Part of STILL to read, s; as --interval.")
+    ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -177,6 +190,7 @@ def calibrate(
     check_outputs([output, report], [name for name in (still, moving, layout) if name])
     files = [still] if moving is None else [still, moving]
     options = {"interval": interval, "averaging": averaging, "method": method, "memory": memory, "layout": layout}
+    options |= {"topic": topic, "instance": instance, "window": window}
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
 
@@ -201,6 +215,9 @@ def fuse(
         str | None, typer.Option("--still", metavar="START,STOP", help="The unit is known to be at rest then, s.")
     ] = None,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     output: OutputFile = None,
 ) -> None:
     """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
@@ -211,6 +228,7 @@ def fuse(
 
     records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
     check_outputs([output], [name for name in (file, layout, *records) if name])
+    reading = chosen(topic, instance, window)
     if output:
         check_writable(output)
     fusion_text(method, memory)  # refuses before a record is read
@@ -226,7 +244,7 @@ def fuse(
         still=None if interval is None else _interval(interval, "--still"),
     )
     fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
-    blocks = (fused_recording(part) for part in fuser.fuse(heard(read_blocks(file, layout))))
+    blocks = (fused_recording(part) for part in fuser.fuse(heard(read_blocks(file, layout, **reading))))
     if output:
         write(blocks, output)
     else:
@@ -299,6 +317,9 @@ def compare(
         typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing."),
     ] = None,
     layout: LayoutFile = None,
+    topic: Topic = None,
+    instance: Instance = None,
+    window: Window = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -309,6 +330,7 @@ def compare(
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
     check_outputs([output, report], [name for name in (file, calibration, layout) if name])
+    reading = chosen(topic, instance, window)
     count = whole_number(seeds, "--seeds")
     if experiment is not None:
         if output or report or memory:
@@ -331,7 +353,9 @@ def compare(
     record = None if calibration is None else _load(calibration, "--calibration")
     by = fusion_text(None, memory, held=carried(record))
     kept = "growing" if by.memory is None else by.memory
-    comparison = compare_methods(read(str(file), layout), calibration=record, memory=kept, count_from=by.start)
+    comparison = compare_methods(
+        read(str(file), layout, **reading), calibration=record, memory=kept, count_from=by.start
+    )
     arraytext.write(comparison.record, output, report)
     if not json:
         print(verdict_line(comparison.record.verdict))

@@ -8,6 +8,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from imulab.cli.options import (
+    Element,
     Instance,
     LayoutFile,
     OutputFile,
@@ -29,13 +30,14 @@ def convert(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     output: OutputFile = None,
 ) -> None:
     """Write a recording of any kind as native CSV or Parquet to OUT, or as CSV to standard output."""
     from imulab.readers import read_blocks
 
     check_outputs([output], [name for name in (file, layout) if name])
-    write_out(heard(read_blocks(file, layout, **chosen(topic, instance, window))), output)
+    write_out(heard(read_blocks(file, layout, **chosen(topic, instance, window, element))), output)
 
 
 def write_out(blocks: Iterable[Recording], output: str | None) -> None:

@@ -40,6 +40,7 @@ Instance = Annotated[
 Window = Annotated[
     str | None, typer.Option("--window", metavar="FROM:TO", help="Part to read, s; either side may be left out.")
 ]
+Element = Annotated[str | None, typer.Option("--element", metavar="N", help="One IMU of a file of several, from 1.")]
 _PAPER = (".pdf", ".png", ".svg", ".docx")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 

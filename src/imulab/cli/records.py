@@ -12,6 +12,7 @@ import typer
 from imulab.cli.convert import write_out
 from imulab.cli.options import (
     AsJson,
+    Element,
     Instance,
     LayoutFile,
     OutputFile,
@@ -46,6 +47,7 @@ def apply(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     again: Annotated[bool, typer.Option("--again", help="Correct a recording that a record corrected before.")] = False,
     latest_start: Annotated[
         str,
@@ -70,7 +72,7 @@ def apply(
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
     *names, file = files
     check_outputs([output], files)
-    part = chosen(topic, instance, window)
+    part = chosen(topic, instance, window, element)
     try:
         records = [load_any(name) for name in names]
     except RecordError:
@@ -127,6 +129,7 @@ def show(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     formats: Annotated[bool, typer.Option("--formats", help="List the kinds of recording that can be read.")] = False,
     json: AsJson = False,
 ) -> None:
@@ -161,7 +164,7 @@ def show(
         return
     if json:
         raise OptionError(f"{file}: --json prints records; expected a record")
-    print(describe_recording(read_blocks(file, layout, **chosen(topic, instance, window))))
+    print(describe_recording(read_blocks(file, layout, **chosen(topic, instance, window, element))))
 
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from imulab.cli.options import (
     AsJson,
+    Element,
     GivenFiles,
     Instance,
     LayoutFile,
@@ -119,6 +120,7 @@ def fit(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     order: Annotated[
         str,
         typer.Option(
@@ -180,6 +182,7 @@ def fit(
         "topic": topic,
         "instance": instance,
         "window": window,
+        "element": element,
     }
     trials = None if monte_carlo is None else whole_number(monte_carlo, "--monte-carlo")
     with progress_bar("Monte Carlo", trials) as progress:
@@ -228,6 +231,7 @@ def gyro(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     fit_bias: Annotated[bool, typer.Option("--fit-bias", help="Fit the biases to the turns too.")] = False,
     g_sensitivity: Annotated[str, typer.Option(help="auto, yes or no.")] = "auto",
     clock: Annotated[
@@ -249,8 +253,11 @@ def gyro(
     inputs = [name for name in (file, accel, accel_file, layout, accel_layout) if name]
     check_outputs([output, report], inputs)
     record = load(accel)
-    recording = read_recording(file, layout, chosen(topic, instance, window))
-    own = recording if accel_file is None else read_recording(accel_file, accel_layout or layout, {})
+    part = chosen(topic, instance, window, element)
+    recording = read_recording(file, layout, part)
+    own = recording
+    if accel_file is not None:
+        own = read_recording(accel_file, accel_layout or layout, {"element": part["element"]})
     result = fit_gyro(
         record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
@@ -265,6 +272,7 @@ def check(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     limit: Annotated[str | None, typer.Option(help="Largest | |f| - g | that passes, beside the test.")] = None,
     gravity: Annotated[
         str | None, typer.Option(help="Local gravity, m/s^2; else of the file's head, else of the record.")
@@ -288,7 +296,7 @@ def check(
     held = load(record)
     local = gravity_option(gravity, latitude, height, "--{}")
     largest = None if limit is None else quantity(limit, "--limit", "acceleration", "mg")
-    attitudes = find_attitudes(read_recording(file, layout, chosen(topic, instance, window)))
+    attitudes = find_attitudes(read_recording(file, layout, chosen(topic, instance, window, element)))
     try:
         result = check_tumble(held, attitudes, limit=largest, gravity=local)
     except RecordError as error:

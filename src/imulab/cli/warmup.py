@@ -9,6 +9,7 @@ import typer
 
 from imulab.cli.options import (
     AsJson,
+    Element,
     GivenFiles,
     Instance,
     LayoutFile,
@@ -141,6 +142,7 @@ def fit(
     topic: Topic = None,
     instance: Instance = None,
     window: Window = None,
+    element: Element = None,
     model: Annotated[
         str, typer.Option(help="auto, interval-cubic, knot-cubic, knot-log-cubic or exponential.")
     ] = "auto",
@@ -195,6 +197,7 @@ def fit(
         "topic": topic,
         "instance": instance,
         "window": window,
+        "element": element,
     }
     finish(run_task("warmup", files, options, GivenFiles()), output, report, json=json)
 

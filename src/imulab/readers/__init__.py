@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import as_strided
 from imulab.errors import ReadError
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import Layout, load_layout
-from imulab.readers.selection import Selection, windowed
+from imulab.readers.selection import Selection, of_element, windowed
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Recording, Source
 
@@ -35,6 +35,7 @@ def read(
     topic: str | None = None,
     instance: int | None = None,
     window: tuple[float | None, float | None] | None = None,
+    element: int | None = None,
     name: str | None = None,
 ) -> Recording:
     """Read a recording as a whole.
@@ -51,6 +52,8 @@ def read(
         Which sensor of a flight log, from 0; by default the first.
     window
         First and last time to read, s; None for no bound.
+    element
+        Which IMU of a file of several, from 1; its columns are called as those of a file of one.
     name
         What messages and the source call the file; its path if not given.
 
@@ -64,12 +67,14 @@ def read(
     ReadError, UnitError
         The file cannot be read; the message names file, row and column.
     OptionError
-        The file has no such topic, instance or window.
+        The file has no such topic, instance, element or window.
     """
-    selection = Selection(topic, instance, window)
+    selection = Selection(topic, instance, window, element)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
-    blocks = list(_told(windowed(_blocks(file, name, known, selection, hashed), window, name)))
+    blocks = list(
+        _told(windowed(of_element(_blocks(file, name, known, selection, hashed), element, name), window, name))
+    )
     source = Source(name, hashed.of(file))
     first = blocks[0]
     joined = {key: _joined([block.columns[key] for block in blocks]) for key in first.columns}
@@ -93,15 +98,18 @@ def read_blocks(
     topic: str | None = None,
     instance: int | None = None,
     window: tuple[float | None, float | None] | None = None,
+    element: int | None = None,
     name: str | None = None,
 ) -> Iterator[Recording]:
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
     Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
     """
-    selection = Selection(topic, instance, window)
+    selection = Selection(topic, instance, window, element)
     name = name or _name(file)
-    yield from _told(windowed(_blocks(file, name, _layout(layout), selection, None), window, name))
+    yield from _told(
+        windowed(of_element(_blocks(file, name, _layout(layout), selection, None), element, name), window, name)
+    )
 
 
 def _told(blocks: Iterator[Recording]) -> Iterator[Recording]:

@@ -1,4 +1,4 @@
-"""Which part of a file to read: topic, instance, time window."""
+"""Which part of a file to read: topic, instance, element, time window."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imulab.errors import OptionError
-from imulab.recording import Recording
+from imulab.recording import Recording, element_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,15 +23,20 @@ class Selection:
         Number of the sensor in a flight log, from 0.
     window
         First and last time to read, s, each None for no bound; the bounds belong to the window.
+    element
+        Number of the IMU whose columns to read, from 1, in a file of several.
     """
 
     topic: str | None = None
     instance: int | None = None
     window: tuple[float | None, float | None] | None = None
+    element: int | None = None
 
     def __post_init__(self) -> None:
         if self.instance is not None and self.instance < 0:
             raise OptionError(f"instance {self.instance}: expected a number from 0")
+        if self.element is not None and self.element < 1:
+            raise OptionError(f"element {self.element}: expected a number from 1")
         first, last = self.window or (None, None)
         if first is not None and last is not None and not first < last:
             raise OptionError(f"window {first:g}:{last:g}: expected a start before its end")
@@ -80,4 +85,32 @@ def windowed(
     if not found:
         raise OptionError(
             f"{name}: nothing in the window {first:g} to {last:g} s; the file runs from {low:g} to {high:g} s"
+        )
+
+
+def of_element(blocks: Iterator[Recording], element: int | None, name: str) -> Iterator[Recording]:
+    """Pass on the columns of one IMU of several (``accel_x_7`` as ``accel_x``), with those that belong to none.
+
+    Raises
+    ------
+    OptionError
+        The file has no columns of several IMUs, or none of this one.
+    """
+    if element is None:
+        yield from blocks
+        return
+    for block in blocks:
+        numbers = {column: element_number(column) for column in block.columns}
+        there = sorted({number for number in numbers.values() if number is not None})
+        if not there:
+            raise OptionError(f"{name}: no columns of several IMUs; leave out the element {element}")
+        if element not in there:
+            raise OptionError(f"{name}: no element {element}; elements found: {' '.join(map(str, there))}")
+        own = {column: column for column, number in numbers.items() if number is None}
+        own |= {column: column.rpartition("_")[0] for column, number in numbers.items() if number == element}
+        yield replace(
+            block,
+            columns={own[column]: values for column, values in block.columns.items() if column in own},
+            units={own[column]: unit for column, unit in block.units.items() if column in own},
+            metadata={**block.metadata, "element": str(element)},
         )

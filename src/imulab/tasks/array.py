@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
 from imulab.tasks.task import Files, Task
-from imulab.texts import quantity
+from imulab.texts import chosen, quantity
 
 if TYPE_CHECKING:
     from imulab.arraytable import Fusion
@@ -23,10 +23,13 @@ def _array_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         ends = [quantity(part, name, "time", "s") for part in interval.split(",")]
         if len(ends) != 2 or not ends[0] < ends[1]:
             raise OptionError(f"{name} {interval!r}: expected START,STOP, such as 468,496")
+        if texts.get("window"):
+            raise OptionError(f"{name} together with {label.format('window')}: expected one of them, they say the same")
     return {
         "interval": ends,
         "averaging": quantity(texts.get("averaging", "1 s"), label.format("averaging"), "time", "s"),
         "layout": texts.get("layout"),
+        "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label=label),
         "fusion": _fusion(texts, label),
     }
 
@@ -45,8 +48,9 @@ def _array_fit(
 ) -> Calibration:
     from imulab.gyro_array.fit import calibrate_array
 
-    still = _between(access.recording(files[0], values["layout"]), values["interval"])
-    moving = access.recording(files[1], values["layout"]) if len(files) > 1 else None
+    part = values["part"]
+    still = _between(access.recording(files[0], values["layout"], **part), values["interval"])
+    moving = access.recording(files[1], values["layout"], **{**part, "window": None}) if len(files) > 1 else None
     return calibrate_array(still, moving, averaging_time=values["averaging"], fusion=values["fusion"]).calibration
 
 
@@ -70,7 +74,7 @@ TASK = Task(
     procedure="gyro_array",
     files="STILL, or STILL;MOVING",
     count=(1, 2),
-    options=("interval", "averaging", "method", "memory", "layout"),
+    options=("interval", "averaging", "method", "memory", "layout", "topic", "instance", "window"),
     paths=("layout",),
     modules=("imulab.readers", "imulab.gyro_array.fit", "scipy.special"),
     values=_array_values,

@@ -32,7 +32,7 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "ageing": _ageing(texts.get("ageing"), label.format("ageing")),
         "cross": _yes(texts.get("cross", "no"), label.format("cross")),
         "layout": texts.get("layout"),
-        "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
+        "part": chosen(*(texts.get(key) for key in ("topic", "instance", "window", "element")), label=label),
     }
     check_options(
         values["order"], values["method"], values["loss"],
@@ -131,6 +131,7 @@ TASK = Task(
         "topic",
         "instance",
         "window",
+        "element",
     ),
     paths=("prior", "layout"),
     modules=("imulab.readers", "imulab.segment", "imulab.tumble.fit", "scipy.special"),

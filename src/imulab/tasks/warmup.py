@@ -61,7 +61,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "latest_start": quantity(texts.get("latest_start", "5 s"), name("latest-start"), "time", "s"),
         "temperature_column": _SWITCH[column],
         "layout": texts.get("layout"),
-        "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label),
+        "part": chosen(*(texts.get(key) for key in ("topic", "instance", "window", "element")), label=label),
     }
 
 
@@ -141,6 +141,7 @@ TASK = Task(
         "topic",
         "instance",
         "window",
+        "element",
     ),
     paths=("layout",),
     modules=("imulab.readers", "imulab.warmup.cycles", "imulab.warmup.fit", "scipy.special"),

@@ -145,7 +145,7 @@ def make_record(
         },
         options=dict(options),
         data=_data(found.attitudes, scaling, found.problem, found.solution, g),
-        sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
+        sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
         sources=(recording.source,) if recording.source else (),
         warnings=(
             *_warnings(attitudes, gravity, problem, solution, observability, options),
