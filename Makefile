@@ -1,12 +1,14 @@
-# Each target makes .venv and installs imulab on first use; afterwards it starts at once.
+# Each target makes .venv and installs on first use what it needs, the demonstration only imulab itself; afterwards it
+# starts at once.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 
 .PHONY: demo test test-all core fuzz dist lint format bench truth docs clean
 
-demo: $(STAMP)
+demo: $(ALONE)
 	$(BIN)/imulab demo demo
 
 test: core $(STAMP)
@@ -58,10 +60,10 @@ clean:
 
 C_SOURCES := $(wildcard src/imulab/*.c src/imulab/*/*.c runtime/*.[ch])
 
-$(STAMP): pyproject.toml CMakeLists.txt $(C_SOURCES)
+$(STAMP) $(VENV)/.alone: pyproject.toml CMakeLists.txt $(C_SOURCES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imulab needs Python 3.11 or later")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(if $(filter $(STAMP),$@),[dev])'
 	touch $@
 
 $(VENV)/.release: $(STAMP)

@@ -465,7 +465,7 @@ def _without(*names: str) -> str:
         (None, ["--calibration", "bad.csv"], ["bad.csv: not a calibration record"]),
         (None, ["-o", "out.txt"], ["out.txt", ".csv"]),
         (None, ["-o", "bad.csv"], ["bad.csv: would overwrite bad.csv"]),
-        (None, ["--still", "5"], ["--still '5'", "START,STOP"]),
+        (None, ["--still", "5"], ["--still '5'", "FROM:TO"]),
     ],
 )  # fmt: skip
 def test_a_bad_input_gets_one_line_and_leaves_nothing(text, options, fragments, imulab, tmp_path):

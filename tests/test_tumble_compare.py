@@ -204,12 +204,14 @@ def test_the_commands(imulab, tmp_path):
         imulab("tumble", "fit", f"{name}.csv", "--gravity", str(G), "--order", "1", "-o", f"{name}.json")
     done = imulab("tumble", "check", "a.json", "b.csv")
     assert done.returncode == 0, done.stderr
-    assert re.match(r"pass: p = [\d.]+ \(chi-square [\d.]+ of 20\), 20 attitudes, largest \|f\| - g -?\d+", done.stdout)
+    first, second, *_ = done.stdout.splitlines()
+    assert first == "pass: the attitudes agree with the record"
+    assert re.match(r"p = [\d.]+ \(chi-square [\d.]+ of 20\), 20 attitudes, largest \|f\| - g -?\d+", second)
     assert "the record was made from this recording" in imulab("tumble", "check", "a.json", "a.csv").stderr
     strict = imulab("tumble", "check", "a.json", "b.csv", "--limit", "1ug")
     assert strict.returncode == 1
-    assert strict.stdout.startswith("fail: p = ")
-    assert "no change of the unit is shown; the limit is smaller than" in strict.stdout
+    assert strict.stdout.startswith("fail: no change of the unit is shown, but an attitude is beyond the limit\n")
+    assert "the limit is smaller than the uncertainty of the attitudes can tell" in strict.stdout
     told = json.loads(imulab("tumble", "check", "a.json", "b.csv", "--limit", "1ug", "--json").stdout)
     assert told["verdict"] == "fail"
     assert told["p"] > 0.05

@@ -222,7 +222,7 @@ def test_plan_writes_the_programme_and_says_what_is_missing(tmp_path, capsys):
     captured = capsys.readouterr()
     assert "24 power cycles" in captured.out
     assert "--temperatures -40,-30,-20,-10,0,20,40,50,60" in captured.out
-    assert "interval [0, 40) degC is 40 K wide" in captured.err
+    assert "the interval 0 to 40 degC is 40 K wide" in captured.err
     rows = il.read(tmp_path / "p.csv")
     assert rows.column("power").sum() == 24
     recorded = rows.column("power") == 1

@@ -148,7 +148,7 @@ class Attitudes:
 
     def times(self) -> str:
         """Return when the attitudes were found, for a message."""
-        shown = [f"{a:.0f}-{b:.0f} s" for a, b in zip(self.start[:12], self.stop[:12], strict=True)]
+        shown = [f"{a:.0f} to {b:.0f} s" for a, b in zip(self.start[:12], self.stop[:12], strict=True)]
         return ", ".join(shown) + (", ..." if len(self) > 12 else "")
 
     def only(self, kept: NDArray[np.intp]) -> Attitudes:

@@ -10,6 +10,8 @@ from imulab.errors import OptionError, UnitError
 from imulab.units import parse_unit, to_si
 
 _BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
+_BETWEEN = re.compile(r"\s+to\s+|[:,]")
+"""What stands between the ends of an interval: a colon; a comma or "to" are read as well."""
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
 
 
@@ -78,13 +80,27 @@ def chosen(
     part: tuple[float | None, ...] | None = None
     if window is not None:
         name = label.format("window")
-        ends = window.split(":")
+        ends = _BETWEEN.split(window.strip())
         if len(ends) != 2 or not any(end.strip() for end in ends):
             raise OptionError(f"{name} {window!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
         part = tuple(quantity(end, name, "time", "s") if end.strip() else None for end in ends)
     number = None if instance is None else whole_number(instance, label.format("instance"))
     one = None if element is None else whole_number(element, label.format("element"))
     return {"topic": topic, "instance": number, "window": part, "element": one}
+
+
+def interval(text: str, option: str) -> tuple[float, float]:
+    """Return an interval of time such as ``468:496``, s; as messages print it, ``468 to 496 s``, it is read too.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    ends = [quantity(end, option, "time", "s") for end in _BETWEEN.split(text.strip())]
+    if len(ends) != 2 or not ends[0] < ends[1]:
+        raise OptionError(f"{option} {text!r}: expected FROM:TO in seconds, such as 468:496")
+    return ends[0], ends[1]
 
 
 def number(text: str, option: str) -> float:

@@ -18,7 +18,7 @@ from imulab.centrifuge.mismatch import Measured, delays, mismatch, tilted, weigh
 from imulab.centrifuge.run import LoadedRun
 from imulab.units import STANDARD_GRAVITY
 
-_FLEXURE = 1e-7 / STANDARD_GRAVITY
+FLEXURE = 1e-7 / STANDARD_GRAVITY
 _DELAY = 1e-3
 _MISMATCH = 5e-3
 
@@ -107,7 +107,7 @@ def _flexure(test: Measured) -> Entry:
     senses = np.sign(test.arm)
     if not test.encoder or len(np.unique(senses)) < 2:
         return Entry(
-            "differential flexure", False, _FLEXURE, None, "rad/(m/s^2)", _FLEXURE * reach, None,
+            "differential flexure", False, FLEXURE, None, "rad/(m/s^2)", FLEXURE * reach, None,
             "needs both senses, encoder",
         )  # fmt: skip
     # Per unit of force: Z = D(level) + w_t kappa_d; the levels' own lines are free.

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from imulab.centrifuge.budget import FLEXURE
 from imulab.centrifuge.manifest import Manifest, make_manifest
 from imulab.errors import OptionError
-from imulab.units import from_si
+from imulab.units import from_si, to_si
 
 PERIODS_ASKED = 500
 _NEAR = 0.05
@@ -134,7 +135,7 @@ def plan_centrifuge(
     total = cycles * static_duration + runs * len(levels) * duration
     return Plan(
         manifest, tuple(planned), duration, static_duration, total,
-        tuple(_warnings(planned, net_rate, duration, runs, uncertainty, both_senses)),
+        tuple(_warnings(planned, net_rate, duration, runs, K, uncertainty, both_senses)),
     )  # fmt: skip
 
 
@@ -159,7 +160,13 @@ def _check(
 
 
 def _warnings(
-    planned: list[PlannedLevel], net_rate: float, duration: float, runs: int, uncertainty: float, both_senses: bool
+    planned: list[PlannedLevel],
+    net_rate: float,
+    duration: float,
+    runs: int,
+    K: float,
+    uncertainty: float,
+    both_senses: bool,
 ) -> list[str]:
     found = []
     for level in planned:
@@ -186,9 +193,11 @@ def _warnings(
             "them at every level); method least-squares does not need them"
         )
     if not both_senses:
+        top = planned[-1]
         found.append(
-            "one sense of rotation only: differential flexure (0.1 µrad/g is up to 7.5 % of K at 40 g), scale mismatch "
-            "and azimuth are not separated; run both senses (--both-senses, with table_angle recorded)"
+            f"one sense of rotation only: differential flexure ({1e6 * to_si(FLEXURE, 'g'):.1g} µrad/g would be "
+            f"{100 * top.arm_rate * FLEXURE / K:.2g} % of K at {from_si(top.force, 'g'):.4g} g), scale mismatch and "
+            "azimuth are not separated; run both senses (--both-senses, with table_angle recorded)"
         )
     return found
 

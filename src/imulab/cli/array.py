@@ -53,8 +53,8 @@ def simulate(
     experiment: Annotated[str, typer.Option(help="static, dynamic (the source's set-ups) or moving.")] = "dynamic",
     elements: Annotated[str, typer.Option(help="Gyros on each axis.")] = "6",
     axes: Annotated[str, typer.Option(help="1 or 3.")] = "1",
-    rate: Annotated[str | None, typer.Option(help="Sampling rate; that of the experiment if not given.")] = None,
-    duration: Annotated[str | None, typer.Option(help="That of the experiment if not given.")] = None,
+    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the experiment if not given.")] = None,
+    duration: Annotated[str | None, typer.Option(help="Duration, s; that of the experiment if not given.")] = None,
     white: Annotated[str, typer.Option(help="White noise of a sample, before a factor for each gyro.")] = "0.05 deg/s",
     spread: Annotated[str, typer.Option(help="Range of that factor.")] = "0.6,1.6",
     gauss_markov: Annotated[str, typer.Option(help="Standard deviation of the correlated noise.")] = "0.003 deg/s",
@@ -164,7 +164,7 @@ def calibrate(
         str | None, typer.Option("--moving", metavar="FILE", help="Recording in motion, for alignment and scale.")
     ] = None,
     interval: Annotated[
-        str | None, typer.Option("--interval", metavar="START,STOP", help="Use STILL from START to STOP, s.")
+        str | None, typer.Option("--interval", metavar="FROM:TO", help="Use STILL between these times only, s.")
     ] = None,
     averaging: Annotated[str, typer.Option(help="Averaging time of the covariance matrix.")] = "1 s",
     method: Annotated[
@@ -210,9 +210,9 @@ def fuse(
         str, typer.Option("--initial-bias", metavar="first|zero|RECORD", help="Biases to start from.")
     ] = "first",
     calibration: CalibrationFile = None,
-    rate: Annotated[str | None, typer.Option(help="Sampling rate; from the first samples if not given.")] = None,
-    interval: Annotated[
-        str | None, typer.Option("--still", metavar="START,STOP", help="The unit is known to be at rest then, s.")
+    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; from the first samples if not given.")] = None,
+    still: Annotated[
+        str | None, typer.Option("--still", metavar="FROM:TO", help="The unit is known to be at rest then, s.")
     ] = None,
     layout: LayoutFile = None,
     topic: Topic = None,
@@ -224,6 +224,7 @@ def fuse(
     from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording
     from imulab.gyro_array.memory import carried, fusion_text
     from imulab.readers import read_blocks
+    from imulab.texts import interval
     from imulab.writers import check_writable, write, write_csv_to
 
     records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
@@ -241,7 +242,7 @@ def fuse(
         initial_bias=initial_bias if initial_bias in ("first", "zero") else _load(initial_bias, "--initial-bias"),
         calibration=known,
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
-        still=None if interval is None else _interval(interval, "--still"),
+        still=None if still is None else interval(still, "--still"),
     )
     fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
     blocks = (fused_recording(part) for part in fuser.fuse(heard(read_blocks(file, layout, **reading))))
@@ -275,13 +276,6 @@ def _load_any(name: str) -> Calibration | Blob:
     if not isinstance(record, Blob):
         check_calibration(record, name)
     return record
-
-
-def _interval(text: str, option: str) -> tuple[float, float]:
-    ends = [quantity(part, option, "time", "s") for part in text.split(",")]
-    if len(ends) != 2 or not ends[0] < ends[1]:
-        raise OptionError(f"{option} {text!r}: expected START,STOP, such as 0,10")
-    return ends[0], ends[1]
 
 
 def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]:

@@ -50,7 +50,7 @@ def plan(
     levels: Levels = "1,2,5,10,15,20,30,40",
     radius: Radius = "2 m",
     net_rate: NetRate = "40 deg/s",
-    duration: Annotated[str, typer.Option(help="Of each run.")] = "15 min",
+    duration: Annotated[str, typer.Option(help="Of each run, s, or with a unit.")] = "15 min",
     cycles: Cycles = "2",
     both_senses: BothSenses = False,
     drift: Annotated[str, typer.Option("--drift", metavar="K", help="Expected drift per g.")] = "3.3 deg/h/g",
@@ -63,6 +63,7 @@ def plan(
         str | None,
         typer.Option("-o", "--output", metavar="PLAN.toml", help="Manifest, or .csv list of runs, to write."),
     ] = None,
+    json: AsJson = False,
 ) -> None:
     """List the runs for wanted levels, predict uncertainties, and say which are too short, too close or too noisy."""
     from imulab.centrifuge.plan import plan_centrifuge
@@ -86,8 +87,9 @@ def plan(
     )
     if output is not None:
         _write_plan(result, output)
-    print(_plan_text(result))
-    if output is not None:
+    wanted = _fraction(uncertainty, "--uncertainty")
+    print(_plan_json(result, wanted) if json else _plan_text(result, wanted))
+    if output is not None and not json:
         print(f"{'plan' if output.lower().endswith('.csv') else 'manifest'}: {output}")
     for message in result.warnings:
         warn(message)
@@ -104,8 +106,8 @@ def simulate(
     net_rate: NetRate = "40 deg/s",
     cycles: Cycles = "2",
     both_senses: BothSenses = False,
-    duration: Annotated[str, typer.Option(help="Of each run.")] = "5 min",
-    static_duration: Annotated[str, typer.Option(help="Of each static run.")] = "1 min",
+    duration: Annotated[str, typer.Option(help="Of each run, s, or with a unit.")] = "5 min",
+    static_duration: Annotated[str, typer.Option(help="Of each static run, s, or with a unit.")] = "1 min",
     rate: Annotated[str, typer.Option(help="Sample rate.")] = "50 Hz",
     nonlinearity: Annotated[str, typer.Option(help="K(20 g) / K(0) - 1.")] = "1 %",
     tilt: Annotated[str, typer.Option(help="Table axis against the arm's axis.")] = "10 arcsec",
@@ -216,7 +218,7 @@ def _fraction(text: str, option: str) -> float:
     return float(match[1]) * {None: 1.0, "%": 1e-2, "ppm": 1e-6}[match[2]]
 
 
-def _plan_text(result: Plan) -> str:
+def _plan_text(result: Plan, wanted: float) -> str:
     from imulab.cli.show import aligned
     from imulab.units import from_si
 
@@ -232,12 +234,45 @@ def _plan_text(result: Plan) -> str:
         ]
         for level in result.levels
     ]
+    too_few = sum(level.relative > wanted for level in result.levels)
     titles = ["level, g", "arm, deg/s", "table, deg/s", "periods", "u(K), %", "u(zeta), %", "needed, min"]
     head = (
         f"{len(result.manifest.runs)} runs, {result.total / 3600:.1f} h of recording ({result.duration / 60:.0f} min "
-        f"each, static {result.static_duration / 60:.0f} min); needed: duration of a run for the wanted uncertainty"
+        f"each, static {result.static_duration / 60:.0f} min); "
+        + (f"{too_few} of {len(result.levels)} levels do not reach" if too_few else "every level reaches")
+        + f" u(K) = {100 * wanted:.3g} % (needed: how long a run must be for that)"
     )
     return "\n".join([head, *aligned(titles, rows)])
+
+
+def _plan_json(result: Plan, wanted: float) -> str:
+    from imulab.jsontext import json_text
+
+    def of(value: float | None, unit: str) -> dict[str, Any]:
+        return {"value": None if value is None or value == float("inf") else value, "unit": unit}
+
+    return json_text(
+        {
+            "runs": len(result.manifest.runs),
+            "duration": of(result.duration, "s"),
+            "static_duration": of(result.static_duration, "s"),
+            "total": of(result.total, "s"),
+            "wanted": of(wanted, "1"),
+            "levels": [
+                {
+                    "specific_force": of(level.force, "m/s^2"),
+                    "arm_rate": of(level.arm_rate, "rad/s"),
+                    "table_rate": of(level.table_rate, "rad/s"),
+                    "periods": level.periods,
+                    "relative_uncertainty": level.relative,
+                    "zeta_uncertainty": level.zeta,
+                    "needed": of(level.needed, "s"),
+                }
+                for level in result.levels
+            ],
+            "warnings": list(result.warnings),
+        }
+    ).rstrip()
 
 
 def _write_plan(result: Plan, output: str) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imulab.cli.speech import coloured
 from imulab.jsontext import json_text
 from imulab.tumble.engineering import small_g
 from imulab.tumble.prior import FALSE_ALARM
@@ -20,20 +22,25 @@ def as_text(check: Check, attitudes: Attitudes, record: str, file: str) -> str:
     n = len(attitudes)
     test = "not tested, the record states no uncertainties"
     if check.probability is not None:
-        test = f"p = {check.probability:.2g} (chi-square {check.chi_square:.3g} of {n})"
+        p = f"p = {check.probability:.2g}" if check.probability else "p below 1e-300"
+        test = f"{p} (chi-square {check.chi_square:.3g} of {n})"
     limit = "" if check.limit is None else f", limit {small_g(check.limit)}"
-    lines = [
-        f"{'pass' if check.passed else 'fail'}: {test}, {n} attitudes, largest |f| - g "
-        f"{small_g(check.residuals[check.worst])} ({attitudes.label(check.worst)}){limit}"
-    ]
-    if not check.passed:
-        lines.append(
-            "no change of the unit is shown; the limit is smaller than the uncertainty of the attitudes can tell"
-            if check.probability is not None and check.probability >= FALSE_ALARM
-            else "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed: "
+    verdict, next_step = "the attitudes agree with the record", []
+    if not check.passed and check.probability is not None and check.probability >= FALSE_ALARM:
+        verdict = "no change of the unit is shown, but an attitude is beyond the limit"
+        next_step = ["the limit is smaller than the uncertainty of the attitudes can tell"]
+    elif not check.passed:
+        verdict = "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
+        next_step = [
             f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
             "change"
-        )
+        ]
+    lines = [
+        f"{coloured('pass' if check.passed else 'fail')}: {verdict}",
+        *next_step,
+        f"{test}, {n} attitudes, largest |f| - g {small_g(check.residuals[check.worst])} "
+        f"({attitudes.label(check.worst)}){limit}",
+    ]
     for index, value in enumerate(check.residuals.tolist()):
         beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
         expected = ""
@@ -43,7 +50,7 @@ def as_text(check: Check, attitudes: Attitudes, record: str, file: str) -> str:
     return "\n".join(lines)
 
 
-def as_json(check: Check, attitudes: Attitudes) -> str:
+def as_json(check: Check, attitudes: Attitudes, notes: Sequence[str]) -> str:
     """Return the same as JSON, in SI."""
     uncertainty = [None] * len(attitudes) if check.standard_uncertainty is None else check.standard_uncertainty.tolist()
     return json_text(
@@ -58,6 +65,6 @@ def as_json(check: Check, attitudes: Attitudes) -> str:
                 {"label": attitudes.label(i), "residual": value, "standard_uncertainty": u}
                 for i, (value, u) in enumerate(zip(np.asarray(check.residuals).tolist(), uncertainty, strict=True))
             ],
-            "notes": [str(note) for note in check.notes],
+            "notes": [str(note) for note in notes],
         }
     ).rstrip()

@@ -12,12 +12,14 @@ from imulab.cli.options import check_outputs, is_json, quantity, whole_number
 from imulab.cli.show import aligned
 from imulab.errors import ImulabError, OptionError, RecordError
 from imulab.files import replacing
+from imulab.jsontext import json_text
 from imulab.readers import read
 from imulab.recording import Array
 from imulab.report import render_plan
 from imulab.segment import find_attitudes
 from imulab.tumble.engineering import predicted_rows
 from imulab.tumble.fit import fit_tumble
+from imulab.tumble.model import parameter_units
 from imulab.tumble.plan import Plan, fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
 from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.units import STANDARD_GRAVITY, from_si
@@ -34,6 +36,7 @@ def run(
     source: str,
     add: str | None,
     report: str | None,
+    json: bool,
 ) -> None:
     """Plan, print the prediction, and write what was asked for."""
     check_outputs([output, report], [name for name in (add, source) if name])
@@ -71,11 +74,41 @@ def run(
             write_csv_to(plan_recording(plan), to_csv)
         if to_sheet:
             to_sheet.write(render_plan("Tumble plan", lead, _pictures(plan), predicted).encode("utf-8"))
+    if json:
+        print(_as_json(plan, criterion, sigma), end="")
+        return
     print(lead)
     print("\n".join(aligned(["parameter", "predicted u", "unit"], [list(row) for row in predicted])))
     for name, what in ((output, "plan"), (report, "sheet")):
         if name:
             print(f"{what}: {name}")
+
+
+def _as_json(plan: Plan, criterion: str, sigma: float) -> str:
+    """Return the plan for scripts, in SI under the names of a record."""
+    angles = roll_pitch(plan.directions)
+    units = parameter_units(plan.order, "m/s^2")
+    # A bias in units of g is so many times gravity, a k_n in 1/g^(n-1) so many times its inverse power.
+    powers = {"m/s^2": 1, "1/(m/s^2)": -1} | {f"1/(m/s^2)^{n}": -n for n in range(2, plan.order)}
+    predicted = plan.uncertainties(sigma)
+    return json_text(
+        {
+            "order": plan.order,
+            "criterion": criterion,
+            "condition_number": float(plan.condition_number),
+            "noise": {"value": sigma * STANDARD_GRAVITY, "unit": "m/s^2"},
+            "already": plan.already,
+            "attitudes": [
+                {"up": up, "roll": {"value": roll, "unit": "rad"}, "pitch": {"value": pitch, "unit": "rad"}}
+                for up, (roll, pitch) in zip(plan.directions.tolist(), angles.tolist(), strict=True)
+            ],
+            "again": [list(pair) for pair in plan.again],
+            "parameters": {
+                name: {"standard_uncertainty": u * STANDARD_GRAVITY ** powers.get(unit, 0), "unit": unit}
+                for (name, u), unit in zip(predicted.items(), units, strict=True)
+            },
+        }
+    )
 
 
 def _noise(text: str | None) -> tuple[float, str]:

@@ -16,6 +16,7 @@ from imulab.exhibit import Table, format_uncertain, plain_number
 from imulab.present import change_unit, exhibits_of
 from imulab.printable import printable
 from imulab.recording import Array, Recording
+from imulab.tumble.figures import gyro_headline
 from imulab.verdict import SENTENCES, Verdict
 
 _GAP = 1.5
@@ -39,6 +40,23 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
             f"{'warning' if message in record.verdict.reasons else 'note'}: {message}" for message in record.warnings
         ]
     return "\n".join(lines).rstrip()
+
+
+def describe_gyro(record: Calibration, accelerometers: str) -> str:
+    """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
+    table = next(item for item in exhibits_of(record).items if isinstance(item, Table))
+    rows = [row for row in table.rows if row[0].startswith("gyro_")]
+    serial = record.sensor.get("serial", "unit without serial number")
+    return "\n".join(
+        [
+            verdict_line(record.verdict),
+            f"gyroscopes of {serial}: {gyro_headline(record)}",
+            f"accelerometers: unchanged from {accelerometers}",
+            "",
+            table.title,
+            *aligned(table.columns, rows),
+        ]
+    )
 
 
 def verdict_line(verdict: Verdict) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -64,6 +65,7 @@ def plan(
         str | None, typer.Option(metavar="FILE", help="Attitudes already there: a plan, a record or a recording.")
     ] = None,
     report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
+    json: AsJson = False,
 ) -> None:
     """Choose the attitudes to measure, and predict the uncertainty of every parameter."""
     from imulab.cli.plan import run
@@ -77,6 +79,7 @@ def plan(
         source=source,
         add=add,
         report=report,
+        json=json,
     )
 
 
@@ -190,8 +193,15 @@ def fit(
     finish(record, output, report, json=json)
 
 
-def finish(record: Calibration, output: str | None, report: str | None, *, json: bool) -> None:
-    """Write a record and its report, both or none, and say what was found."""
+def finish(
+    record: Calibration,
+    output: str | None,
+    report: str | None,
+    *,
+    json: bool,
+    describe: Callable[[Calibration], str] | None = None,
+) -> None:
+    """Write a record and its report, both or none, and say what was found, in full or as `describe` has it."""
     from imulab.files import replacing
     from imulab.present import exhibits_of
     from imulab.report import render
@@ -206,13 +216,13 @@ def finish(record: Calibration, output: str | None, report: str | None, *, json:
             to_report.write(render(record, exhibits_of(record)).encode("utf-8"))
     if json:
         print(record.to_json(), end="")
-        return
-    from imulab.cli.show import describe_record
+    else:
+        from imulab.cli.show import describe_record
 
-    print(describe_record(record, provenance=False))
-    for name, what in ((output, "record"), (report, "report")):
-        if name:
-            print(f"{what}: {name}")
+        print(describe(record) if describe else describe_record(record, provenance=False))
+        for name, what in ((output, "record"), (report, "report")):
+            if name:
+                print(f"{what}: {name}")
     for message in record.warnings:
         (warn if message in record.verdict.reasons else note)(message)
 
@@ -246,6 +256,7 @@ def gyro(
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
     from imulab.calibration import load
+    from imulab.cli.show import describe_gyro
     from imulab.segment import find_attitudes
     from imulab.tumble.gyro import fit_gyro
     from imulab.tumble.gyrorecord import with_gyro
@@ -262,7 +273,13 @@ def gyro(
         record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
     )  # fmt: skip
-    finish(with_gyro(record, result, recording, own), output, report, json=json)
+    finish(
+        with_gyro(record, result, recording, own),
+        output,
+        report,
+        json=json,
+        describe=lambda both: describe_gyro(both, accel),
+    )
 
 
 def check(
@@ -273,7 +290,7 @@ def check(
     instance: Instance = None,
     window: Window = None,
     element: Element = None,
-    limit: Annotated[str | None, typer.Option(help="Largest | |f| - g | that passes, beside the test.")] = None,
+    limit: Annotated[str | None, typer.Option(help="Largest | |f| - g | that passes, mg, beside the test.")] = None,
     gravity: Annotated[
         str | None, typer.Option(help="Local gravity, m/s^2; else of the file's head, else of the record.")
     ] = None,
@@ -301,7 +318,12 @@ def check(
         result = check_tumble(held, attitudes, limit=largest, gravity=local)
     except RecordError as error:
         raise RecordError(f"{record}: {error}") from None
-    for message in (*warnings_of(held, attitudes.recording), *result.notes):
+    recording = attitudes.recording
+    said = [f"{recording.name}: was corrected before, by {entry}" for entry in recording.corrected_by]
+    if said:
+        said[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
+    notes = (*said, *warnings_of(held, recording), *result.notes)
+    print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, record, file))
+    for message in notes:
         warn(message)
-    print(as_json(result, attitudes) if json else as_text(result, attitudes, record, file))
     return 0 if result.passed else 1

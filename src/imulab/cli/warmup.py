@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,6 +27,9 @@ from imulab.errors import OptionError
 from imulab.tasks.warmup import TEMPERATURES, temperature_list
 from imulab.texts import number as _number
 
+if TYPE_CHECKING:
+    from imulab.warmup.plan import WarmupPlan
+
 Temperatures = Annotated[str, typer.Option(metavar="T,T,...", help="Calibration temperatures, degC, ascending.")]
 
 
@@ -41,14 +44,15 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
 def plan(
     temperatures: Temperatures = TEMPERATURES,
     cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "5",
-    soak: Annotated[str, typer.Option(help="Before each power-on, unit off.")] = "60 min",
-    record: Annotated[str, typer.Option(help="Recording from power-on on.")] = "10 min",
+    soak: Annotated[str, typer.Option(help="Before each power-on, unit off, s, or with a unit.")] = "60 min",
+    record: Annotated[str, typer.Option(help="Recording from power-on on, s, or with a unit.")] = "10 min",
     ramp: Annotated[str, typer.Option(metavar="K/MIN", help="Of the chamber, K/min.")] = "2",
     noise: Annotated[str, typer.Option(metavar="N", help="Angle random walk, deg/sqrt(h).")] = "0.3",
     repeatability: Annotated[str, typer.Option(help="Of the curve from cycle to cycle, percent.")] = "2",
     output: Annotated[
         str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Programme to write.")
     ] = None,
+    json: AsJson = False,
 ) -> None:
     """Write the chamber programme and its duration; say which temperatures are missing."""
     from math import sqrt
@@ -69,6 +73,10 @@ def plan(
     share = _number(repeatability, "--repeatability")
     if output:
         write_csv(programme(result), output)
+    white = result.curve_uncertainty(60 * _number(noise, "--noise"), seconds, min(300.0, seconds / 2))
+    if json:
+        _print_plan(result, white, share / sqrt(result.cycles))
+        return
     total = len(result.temperatures) * result.cycles
     print(
         f"{total} power cycles: {len(result.temperatures)} temperatures, {result.cycles} at each; "
@@ -80,7 +88,6 @@ def plan(
         end = steps[-1].start + steps[-1].duration
         rows.append([f"{at:g}", str(result.cycles), _hours(steps[0].start), _hours(end)])
     print("\n".join(aligned(["set point, degC", "cycles", "from, h:min", "to, h:min"], rows)))
-    white = result.curve_uncertainty(60 * _number(noise, "--noise"), seconds, min(300.0, seconds / 2))
     print(
         f"standard uncertainty of a curve at its temperature: {white:.2g} deg/h from noise, and "
         f"{share / sqrt(result.cycles):.2g} % of the curve from repeatability"
@@ -91,6 +98,31 @@ def plan(
         print(f"better: --temperatures {','.join(f'{t:g}' for t in result.proposal)}")
     if output:
         print(f"plan: {output}")
+
+
+def _print_plan(result: WarmupPlan, white: float, share: float) -> None:
+    from dataclasses import asdict
+
+    from imulab.jsontext import json_text
+    from imulab.units import to_si
+
+    print(
+        json_text(
+            {
+                "temperatures": list(result.temperatures),
+                "cycles": result.cycles,
+                "duration": {"value": result.duration, "unit": "s"},
+                "steps": [asdict(step) for step in result.steps],
+                "curve_uncertainty": {"value": to_si(white, "deg/h"), "unit": "rad/s"},
+                "repeatability": {"value": share / 100, "unit": "1"},
+                "proposal": list(result.proposal),
+                "warnings": list(result.warnings),
+            }
+        ),
+        end="",
+    )
+    for message in result.warnings:
+        warn(message)
 
 
 def simulate(
@@ -149,7 +181,7 @@ def fit(
     temperatures: Temperatures = TEMPERATURES,
     tolerance: Annotated[str, typer.Option(metavar="K", help="A power-on temperature within this fits, K.")] = "1",
     settling_time: Annotated[
-        str | None, typer.Option("--settling-time", help="T_M; chosen from the data if not given.")
+        str | None, typer.Option("--settling-time", help="T_M, s; chosen from the data if not given.")
     ] = None,
     settling_limit: Annotated[
         str, typer.Option("--settling-limit", help="Settled below this: percent of the peak, or deg/h, mg ...")

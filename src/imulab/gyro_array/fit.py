@@ -180,7 +180,7 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
     first, last = time[found.start], time[found.stop - 1]
     return part, [
         f"{still.name}: not at rest throughout ({found.moved}): used is the longest stretch at rest, {first:.6g} to "
-        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval START,STOP chooses another"
+        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another"
     ]
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
 from imulab.tasks.task import Files, Task
-from imulab.texts import chosen, quantity
+from imulab.texts import chosen, interval, quantity
 
 if TYPE_CHECKING:
     from imulab.arraytable import Fusion
@@ -17,16 +17,11 @@ if TYPE_CHECKING:
 
 
 def _array_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    name, interval = label.format("interval"), texts.get("interval")
-    ends: list[float] | None = None
-    if interval is not None:
-        ends = [quantity(part, name, "time", "s") for part in interval.split(",")]
-        if len(ends) != 2 or not ends[0] < ends[1]:
-            raise OptionError(f"{name} {interval!r}: expected START,STOP, such as 468,496")
-        if texts.get("window"):
-            raise OptionError(f"{name} together with {label.format('window')}: expected one of them, they say the same")
+    name, between = label.format("interval"), texts.get("interval")
+    if between is not None and texts.get("window"):
+        raise OptionError(f"{name} together with {label.format('window')}: expected one of them, they say the same")
     return {
-        "interval": ends,
+        "interval": None if between is None else interval(between, name),
         "averaging": quantity(texts.get("averaging", "1 s"), label.format("averaging"), "time", "s"),
         "layout": texts.get("layout"),
         "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label=label),
@@ -60,7 +55,7 @@ def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
         return recording
     import numpy as np
 
-    shown = f"{ends[0]:g},{ends[1]:g}"
+    shown = f"{ends[0]:g} to {ends[1]:g} s"
     if "time" not in recording:
         raise OptionError(f"{recording.name}: interval {shown} needs a column time")
     inside = np.flatnonzero((recording.si("time") >= ends[0]) & (recording.si("time") < ends[1]))

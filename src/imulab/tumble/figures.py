@@ -48,16 +48,20 @@ def exhibits(record: Calibration) -> Exhibits:
         items.append(_correlation(record))
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_held_back(record)}" if bad else ""
     if "gyro" in fit:
-        missed = from_si(fit["gyro"]["rms"]["value"], "deg")
-        aside += (
-            f"; {fit['gyro']['turns']} turns of the gyroscopes carry gravity's direction within {missed:.2g} deg rms"
-        )
+        aside += f"; {gyro_headline(record)}"
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
         f"{small_g(_rms(used))} rms (before: {small_g(_rms(data['residual_before']))}){aside}.",
         facts=facts,
         items=items,
     )
+
+
+def gyro_headline(record: Calibration) -> str:
+    """Return the result for the gyroscope triad, without a point."""
+    fit = record.fit["gyro"]
+    missed = from_si(fit["rms"]["value"], "deg")
+    return f"{fit['turns']} turns of the gyroscopes carry gravity's direction within {missed:.2g} deg rms"
 
 
 def _held_back(record: Calibration) -> str:

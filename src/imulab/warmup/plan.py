@@ -130,8 +130,8 @@ def plan_warmup(
         {*at, *(round(float(t), 6) for low, high in wide for t in np.linspace(low, high, _pieces(low, high) + 1))}
     )
     warnings = tuple(
-        f"interval [{low:g}, {high:g}) degC is {high - low:g} K wide: interval-cubic uses the mean of both ends for "
-        "all of it, wrong by half of their difference just inside each end, and no model sees a bend between them; "
+        f"the interval {low:g} to {high:g} degC is {high - low:g} K wide: interval-cubic uses the mean of both ends "
+        "for all of it, wrong by half of their difference just inside each end, and no model sees a bend between them; "
         f"measure also at {' '.join(f'{t:g}' for t in proposal if low < t < high)} degC"
         for low, high in wide
     )

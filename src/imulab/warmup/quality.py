@@ -222,14 +222,14 @@ def _intervals(curves: Curves, chosen: Judged) -> list[str]:
     if chosen.model != "interval-cubic":
         return []
     wide = [
-        f"[{low:g}, {high:g})"
+        f"{low:g} to {high:g}"
         for low, high in zip(curves.temperatures[:-1], curves.temperatures[1:], strict=True)
         if high - low > _WIDE
     ]
     if not wide:
         return []
     return [
-        f"interval-cubic uses one curve for all of {' '.join(wide)} degC, the mean of both ends: measure in between, "
+        f"interval-cubic uses one curve for all of {', '.join(wide)} degC, the mean of both ends: measure in between, "
         "or use a model with knots"
     ]
 
