@@ -528,7 +528,7 @@ def test_clocks_that_disagree_are_refused(imulab, tmp_path):
     ("arguments", "fragment"),
     [
         (["compare"], "expected FILE, or --experiment static|dynamic"),
-        (["compare", "--experiment", "shaken"], "experiment 'shaken': expected static or dynamic"),
+        (["compare", "--experiment", "shaken"], "experiment 'shaken': expected one of static dynamic"),
         (["compare", "--experiment", "static", "--seeds", "0"], "seeds 0: expected 1 to 10000"),
         (["simulate", "-o", "s.csv", "--experiment", "wild"], "expected one of static dynamic moving"),
         (["simulate", "-o", "s.csv", "--axes", "2"], "axes 2: expected 1 or 3"),
