@@ -71,7 +71,7 @@ CASES = {
     ),
     "too few attitudes": (
         lambda r: first_rows(r, 2000),
-        ["bad.csv", "5 attitudes (found at 0-3 s, ", "determine 5 of the 9 parameters of order 1", "misalignment_z",
+        ["bad.csv", "5 attitudes (found at 0 to 3 s, ", "determine 5 of the 9 parameters of order 1", "misalignment_z",
          "standard deviation within a window", "would help most"],
     ),
     "no attitude at all": (
