@@ -16,6 +16,7 @@ from imulab.noise import AllanCurve, allan_deviation
 from imulab.recording import Array, Recording
 from imulab.rows import leave_out
 from imulab.sampling import bridged, sampling_rate, steady_part
+from imulab.steps import Step, find_step
 from imulab.units import from_si, parse_unit
 from imulab.verdict import Note
 
@@ -79,6 +80,8 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         )
         samples = recording.si(name)
         noises[name] = column_noise(samples, rate, moved.get(name, ""))
+        if name not in moved and (step := find_step(noises[name].lines.samples)) is not None:
+            notes.append(_step_line(recording, name, step))
         curve = noises[name].curve if taus == "octave" else allan_deviation(samples, rate, taus)
         columns[name] = {
             "unit": unit,
@@ -132,6 +135,17 @@ def column_noise(samples: Array, rate: float, moved: str = "") -> ColumnNoise:
     of_noise = allan_deviation(lines.samples, rate) if len(lines.frequency) else curve
     found = read_coefficients(of_noise, resolution(samples))
     return ColumnNoise(curve, found, lines)
+
+
+def _step_line(recording: Recording, name: str, step: Step) -> str:
+    """Say that a level changed at once, which the coefficients take for noise."""
+    unit = recording.units[name]
+    when = "" if recording.time is None else f" near {recording.time[step.sample]:.4g} s"
+    size = from_si(abs(step.size), unit) if parse_unit(unit).quantity in _STILL else abs(step.size)
+    return (
+        f"{recording.name}: column {name}: the level changes at once by {size:.2g} {unit}{when}, which is no noise: "
+        "bias instability and rate random walk contain it; read the parts before and after it apart (--window)"
+    )
 
 
 def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
