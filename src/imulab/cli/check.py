@@ -9,8 +9,8 @@ import numpy as np
 
 from imulab.cli.speech import coloured
 from imulab.jsontext import json_text
+from imulab.tumble.checkfigures import meaning, measured, next_step
 from imulab.tumble.engineering import small_g
-from imulab.tumble.prior import FALSE_ALARM
 
 if TYPE_CHECKING:
     from imulab.attitudes import Attitudes
@@ -19,27 +19,10 @@ if TYPE_CHECKING:
 
 def as_text(check: Check, attitudes: Attitudes, record: str, file: str) -> str:
     """Return the verdict with its p, what to do next, and the residual of every attitude."""
-    n = len(attitudes)
-    test = "not tested, the record states no uncertainties"
-    if check.probability is not None:
-        p = f"p = {check.probability:.2g}" if check.probability else "p below 1e-300"
-        test = f"{p} (chi-square {check.chi_square:.3g} of {n})"
-    limit = "" if check.limit is None else f", limit {small_g(check.limit)}"
-    verdict, next_step = "the attitudes agree with the record", []
-    if not check.passed and check.probability is not None and check.probability >= FALSE_ALARM:
-        verdict = "no change of the unit is shown, but an attitude is beyond the limit"
-        next_step = ["the limit is smaller than the uncertainty of the attitudes can tell"]
-    elif not check.passed:
-        verdict = "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
-        next_step = [
-            f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
-            "change"
-        ]
     lines = [
-        f"{coloured('pass' if check.passed else 'fail')}: {verdict}",
-        *next_step,
-        f"{test}, {n} attitudes, largest |f| - g {small_g(check.residuals[check.worst])} "
-        f"({attitudes.label(check.worst)}){limit}",
+        f"{coloured('pass' if check.passed else 'fail')}: {meaning(check)}",
+        *next_step(check, record, file),
+        measured(check, attitudes),
     ]
     for index, value in enumerate(check.residuals.tolist()):
         beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""

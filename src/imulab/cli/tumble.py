@@ -296,6 +296,7 @@ def check(
     ] = None,
     latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
     height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
+    report: ReportFile = None,
     json: AsJson = False,
 ) -> int:
     """Test whether fresh attitudes still agree with a record, without refitting; exit status 0: pass, 1: fail.
@@ -310,6 +311,7 @@ def check(
     from imulab.segment import find_attitudes
     from imulab.tumble.compare import check_tumble
 
+    check_outputs([report], [name for name in (record, file, layout) if name])
     held = load(record)
     local = gravity_option(gravity, latitude, height, "--{}")
     largest = None if limit is None else quantity(limit, "--limit", "acceleration", "mg")
@@ -323,7 +325,14 @@ def check(
     if said:
         said[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
     notes = (*said, *warnings_of(held, recording), *result.notes)
+    if report:
+        from imulab.files import write_text
+        from imulab.tumble.checkfigures import check_page
+
+        write_text(report, check_page(result, attitudes, held, record=record, file=file, said=notes))
     print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, record, file))
     for message in notes:
         warn(message)
+    if report and not json:
+        print(f"report: {report}")
     return 0 if result.passed else 1

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab import panels as grid
 from imulab.bulk import bulk, edge_marks, edge_note
 from imulab.exhibit import BAD, GOOD, QUIET, Figure
 from imulab.fleet import panels as small
@@ -37,9 +38,9 @@ def shown_first(statistics: Sequence[ParameterStatistics]) -> list[ParameterStat
 def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> list[Figure]:
     """Draw a histogram of each parameter, with median, units that stand out, and limits."""
     panels = shown_first(statistics)
-    pages = small.pages(panels)
+    pages = grid.pages(panels)
     return [
-        _distributions(small.paged(f"{title}: distribution over the units", n, len(pages)), page,
+        _distributions(grid.paged(f"{title}: distribution over the units", n, len(pages)), page,
                        small.some(statistics, panels))
         for n, page in enumerate(pages)
     ]  # fmt: skip
@@ -47,12 +48,12 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> list
 
 def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str) -> Figure:
     traces: list[dict[str, Any]] = []
-    layout = small.grid()
+    layout = grid.grid()
     beyond = 0
     for index, item in enumerate(panels):
         shown = display_of(item.unit)
         values = np.asarray(shown.of(item.values))
-        x, y = small.names(index)
+        x, y = grid.names(index)
         far = bulk(values)
         inside = np.ones(len(values), dtype=bool) if far is None else ~far.beyond
         edges = small.edges(values[inside])
@@ -61,7 +62,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
         traces.append(
             {
                 "type": "bar",
-                "x": small.plain((edges[1:] + edges[:-1]) / 2),
+                "x": grid.plain((edges[1:] + edges[:-1]) / 2),
                 "y": counts.tolist(),
                 "width": float(edges[1] - edges[0]),
                 "marker": {"color": GOOD},
@@ -76,7 +77,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
                 {
                     "type": "scatter",
                     "mode": "markers",
-                    "x": small.plain(values[out]),
+                    "x": grid.plain(values[out]),
                     "y": [0] * int(out.sum()),
                     "text": [s for s, o in zip(item.serials, out, strict=True) if o],
                     "marker": {"color": BAD, "size": 9, "symbol": "diamond"},
@@ -86,18 +87,18 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
                     "hovertemplate": "%{text}: %{x}<extra></extra>",
                 }
             )
-        small.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
+        grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
         if far is not None:
             far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
             traces += edge_marks(
                 far, values, small.staggered(far.beyond, int(counts.max())), labels, axes=(x, y), upright=False
             )
-            layout[small.axis_key(x)]["range"] = [far.low, far.high]
+            layout[grid.axis_key(x)]["range"] = [far.low, far.high]
             beyond += int(far.beyond.sum())
-        layout["shapes"] += [small.line(x, y, float(shown.of(item.median)), "#22303a", "dot")]
-        layout["shapes"] += [small.line(x, y, end, BAD, "solid") for end in limits]
-        layout[small.axis_key(y)]["rangemode"] = "tozero"
+        layout["shapes"] += [grid.line(x, y, float(shown.of(item.median)), "#22303a", "dot")]
+        layout["shapes"] += [grid.line(x, y, end, BAD, "solid") for end in limits]
+        layout[grid.axis_key(y)]["rangemode"] = "tozero"
     standing = sorted({s for item in panels for s, o in zip(item.serials, item.outliers, strict=True) if o})
     return Figure(
         title,
@@ -106,7 +107,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
         "robust z is beyond what one normal population of this size in a hundred would show." + edge_note(beyond),
         traces,
         layout,
-        height=small.height(len(panels)),
+        height=grid.height(len(panels)),
         message=f"{'Stands' if len(standing) == 1 else 'Stand'} out: {', '.join(standing[:6])}"
         f"{f' and {len(standing) - 6} more' if len(standing) > 6 else ''}."
         if standing
@@ -119,21 +120,21 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Fig
     panels = shown_first(statistics)
     dated = any(item.drift is not None for item in panels)
     name = f"{title}: over the {'date' if dated else 'units in the order of the manifest'}"
-    pages = small.pages(panels)
+    pages = grid.pages(panels)
     return [
-        _over_date(small.paged(name, n, len(pages)), page, small.some(statistics, panels), dated=dated)
+        _over_date(grid.paged(name, n, len(pages)), page, small.some(statistics, panels), dated=dated)
         for n, page in enumerate(pages)
     ]
 
 
 def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, dated: bool) -> Figure:
     traces: list[dict[str, Any]] = []
-    layout = small.grid()
+    layout = grid.grid()
     beyond = 0
     for index, item in enumerate(panels):
         shown = display_of(item.unit)
         values = np.asarray(shown.of(item.values))
-        x, y = small.names(index)
+        x, y = grid.names(index)
         out = item.outliers
         places = item.days if dated else np.arange(1.0, len(values) + 1)
         where = [small.date(day) for day in places] if dated else places.tolist()
@@ -147,7 +148,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
                         "type": "scatter",
                         "mode": "markers",
                         "x": [where[i] for i in chosen],
-                        "y": small.plain(values[chosen]),
+                        "y": grid.plain(values[chosen]),
                         "text": [item.serials[i] for i in chosen],
                         "marker": {"color": colour, "size": size, "symbol": symbol},
                         "xaxis": x,
@@ -164,7 +165,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
                     "type": "scatter",
                     "mode": "lines",
                     "x": [small.date(item.drift.start), small.date(item.drift.start + item.drift.days)],
-                    "y": small.plain(np.asarray(shown.of(ends))),
+                    "y": grid.plain(np.asarray(shown.of(ends))),
                     "line": {"color": BAD if item.drift.significant else QUIET, "width": 2,
                              "dash": "dash" if item.drift.significant else "solid"},
                     "xaxis": x,
@@ -172,13 +173,13 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
                     "hoverinfo": "skip",
                 }
             )  # fmt: skip
-        small.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
-        layout[small.axis_key(x)] |= small.date_axis(places) if dated else {"nticks": 5}
+        grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
+        layout[grid.axis_key(x)] |= small.date_axis(places) if dated else {"nticks": 5}
         far = bulk(values)
         if far is not None:
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
             traces += edge_marks(far, values, where, labels, axes=(x, y))
-            layout[small.axis_key(y)]["range"] = [far.low, far.high]
+            layout[grid.axis_key(y)]["range"] = [far.low, far.high]
             beyond += int(far.beyond.sum())
     drifting = [item.name for item in panels if item.drift is not None and item.drift.significant]
     return Figure(
@@ -194,7 +195,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
         + edge_note(beyond),
         traces,
         layout,
-        height=small.height(len(panels)),
+        height=grid.height(len(panels)),
         message=(f"Beyond chance: {', '.join(drifting)}." if drifting else "No drift is beyond chance.")
         if dated
         else "",

@@ -19,7 +19,7 @@ function draw(onPaper) {
   JSON.parse(text).forEach((plot, number) => {
     if (!plot) return;
     const shown = slim.matches && !onPaper && plot.narrow ? plot.narrow : plot;
-    const size = onPaper ? { width: 640, height: Math.min(0.85 * shown.height, 620) } : { height: shown.height };
+    const size = onPaper ? { width: 640, height: Math.min(0.75 * shown.height, 620) } : { height: shown.height };
     const place = document.getElementById("plot-" + number);
     place.style.height = size.height + "px";
     Plotly.newPlot(place, plot.data, { ...base, ...shown.layout, ...size }, {

@@ -11,15 +11,18 @@ _LEAST, _MOST = 150, 300
 _GAP = 74
 _KEY_LINE = 21
 """Height of a panel, room between panels for ticks and titles, and height of a line of the key, pixels."""
+_MOST_NUMBERS = 8
 
 
 def narrow(figure: Figure) -> dict[str, Any] | None:
     """Return layout and height of a figure for a narrow screen; None where they stay as they are."""
-    layout = figure.layout
+    layout = {key: _sparse(value) for key, value in figure.layout.items()}
     keys = _legend_lines(figure)
     panels = [key[5:] for key in layout if key.startswith("xaxis") and "yaxis" + key[5:] in layout]
     if len({tuple(layout["xaxis" + panel].get("domain", (0, 1))) for panel in panels}) < 2:
-        return None if not keys else {"layout": layout, "height": figure.height + keys * _KEY_LINE}
+        if not keys and layout == figure.layout:
+            return None
+        return {"layout": layout, "height": figure.height + keys * _KEY_LINE}
     margin = {"l": 62, "r": 14, "t": 30, "b": 55, **{k: v for k, v in layout.get("margin", {}).items() if k == "l"}}
     shares = [_domain(layout["yaxis" + panel]) for panel in panels]
     tallest = max(high - low for low, high in shares) * (figure.height - 75)
@@ -43,6 +46,14 @@ def narrow(figure: Figure) -> dict[str, Any] | None:
         "layout": {**layout, **changed, "annotations": notes, "legend": legend, "margin": margin},
         "height": round(plot + margin["t"] + margin["b"] + keys * _KEY_LINE),
     }
+
+
+def _sparse(axis: Any) -> Any:
+    """Return an axis that is numbered evenly, with no more numbers than a narrow screen has room for."""
+    if not isinstance(axis, dict) or axis.get("type") == "log" or not {"dtick", "range"} <= axis.keys():
+        return axis
+    low, high = axis["range"]
+    return {**axis, "dtick": max(axis["dtick"], math.ceil((high - low) / _MOST_NUMBERS))}
 
 
 def _domain(axis: dict[str, Any]) -> tuple[float, float]:
