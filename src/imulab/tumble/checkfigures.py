@@ -39,7 +39,8 @@ def next_step(check: Check, record: str, file: str) -> list[str]:
     if _limit_alone(check):
         return ["the limit is smaller than the uncertainty of the attitudes can tell"]
     return [
-        f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the change"
+        f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
+        "change"
     ]
 
 
