@@ -78,6 +78,32 @@ def test_the_gyroscopes_are_printed_without_the_accelerometers(run):
     assert {name: both.parameters[name] for name in alone.parameters} == dict(alone.parameters)
 
 
+def test_a_recording_as_json_is_what_numpy_finds(run):
+    status, out, err = run("show", "a.csv", "--json", "--window", "1:20")
+    assert (status, err) == (0, "")
+    told, read = json.loads(out), il.read("a.csv", window=(1, 20))
+    assert (told["samples"], told["gaps"], told["metadata"]["serial"]) == (len(read), 0, "SIM-0003")
+    assert told["sample_rate"] == {"value": pytest.approx(100, rel=1e-9), "unit": "Hz"}
+    assert told["duration"] == {"value": pytest.approx(19), "unit": "s"}
+    assert list(told["columns"]) == list(read.columns)
+    for name, column in told["columns"].items():
+        values = read.columns[name]
+        assert column == {
+            "unit": read.units[name],
+            "min": values.min(),
+            "mean": pytest.approx(values.mean(), rel=1e-9, abs=1e-12),
+            "max": values.max(),
+            "missing": 0,
+        }
+
+
+def test_a_recording_without_numbers_is_json_all_the_same(run):
+    Path("empty.csv").write_text("time [s],accel_x [g]\n0,nan\n")
+    told = json.loads(run("show", "empty.csv", "--json")[1])
+    assert told["columns"]["accel_x"] == {"unit": "g", "min": None, "mean": None, "max": None, "missing": 1}
+    assert told["sample_rate"]["value"] is None
+
+
 def test_the_plan_of_a_tumble_as_json(run):
     asked = ["tumble", "plan", "--attitudes", "18", "--noise", "20ug"]
     status, out, err = run(*asked, "--json", "-o", "plan.csv")

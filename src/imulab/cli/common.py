@@ -28,6 +28,8 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "array simulate --mounting": ("same", "alternate"),
     "array simulate --fault": ("imulab.gyro_array.simulate:FAULTS",),
     "array simulate --unit": ("rad/s", "deg/s", "deg/h"),
+    "array calibrate --method": ("imulab.arraytable:METHODS",),
+    "array calibrate --memory": ("growing",),
     "array fuse --method": ("imulab.arraytable:METHODS",),
     "array fuse --memory": ("growing",),
     "array fuse --initial-bias": ("first", "zero"),

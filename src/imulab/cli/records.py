@@ -151,7 +151,7 @@ def show(
     (file,) = files
     from imulab.blob import is_blob, load_blob
     from imulab.calibration import load
-    from imulab.cli.show import describe_blob, describe_record, describe_recording
+    from imulab.cli.show import describe_blob, describe_record, describe_recording, recording_json
     from imulab.readers import read_blocks
 
     if layout is None and is_blob(file):
@@ -162,9 +162,8 @@ def show(
         record = load(file)
         print(record.to_json().rstrip("\n") if json else describe_record(record))
         return
-    if json:
-        raise OptionError(f"{file}: --json prints records; expected a record")
-    print(describe_recording(read_blocks(file, layout, **chosen(topic, instance, window, element))))
+    blocks = read_blocks(file, layout, **chosen(topic, instance, window, element))
+    print(recording_json(blocks) if json else describe_recording(blocks))
 
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:

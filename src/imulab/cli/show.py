@@ -13,6 +13,7 @@ from imulab.changes import Comparison
 from imulab.cli.speech import coloured
 from imulab.errors import ReadError
 from imulab.exhibit import Table, format_uncertain, plain_number
+from imulab.jsontext import json_text
 from imulab.present import change_unit, exhibits_of
 from imulab.printable import printable
 from imulab.recording import Array, Recording
@@ -129,6 +130,15 @@ class _Column:
             self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
             self.total += float(finite.sum())
 
+    def values(self) -> dict[str, float | int | None]:
+        some = self.finite > 0
+        return {
+            "min": self.low if some else None,
+            "mean": self.total / self.finite if some else None,
+            "max": self.high if some else None,
+            "missing": self.missing,
+        }
+
     def texts(self) -> list[str]:
         numbers = (self.low, self.total / self.finite, self.high) if self.finite else ()
         return [*([f"{x:.6g}" for x in numbers] or ["–"] * 3), str(self.missing)]
@@ -171,8 +181,18 @@ class _Clock:
         return [*lines, f"time runs backwards {times}: procedures refuse it"] if self.backwards else lines
 
 
-def describe_recording(blocks: Iterable[Recording]) -> str:
-    """Return what a recording holds: samples, rate, gaps, duration, and each column's range."""
+@dataclass
+class _Contents:
+    """What a recording holds, as its blocks have told it."""
+
+    last: Recording
+    columns: dict[str, _Column]
+    clock: _Clock
+    samples: int
+    notes: list[str]
+
+
+def _contents(blocks: Iterable[Recording]) -> _Contents:
     columns: dict[str, _Column] = {}
     clock, samples, notes = _Clock(), 0, dict[str, None]()
     block = None
@@ -185,14 +205,43 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
             columns.setdefault(name, _Column()).add(values)
     if block is None:
         raise ReadError("the recording is empty")
-    lines = [f"{printable(block.name)}: {samples} samples"]
-    lines += clock.text() if "time" in block else ["no time column: a table of attitudes, a row each"]
-    rows = [[name, block.units[name], *column.texts()] for name, column in columns.items()]
+    return _Contents(block, columns, clock, samples, list(notes))
+
+
+def describe_recording(blocks: Iterable[Recording]) -> str:
+    """Return what a recording holds: samples, rate, gaps, duration, and each column's range."""
+    found = _contents(blocks)
+    last = found.last
+    lines = [f"{printable(last.name)}: {found.samples} samples"]
+    lines += found.clock.text() if "time" in last else ["no time column: a table of attitudes, a row each"]
+    rows = [[name, last.units[name], *column.texts()] for name, column in found.columns.items()]
     lines += ["", *aligned(["column", "unit", "min", "mean", "max", "missing"], rows)]
-    if block.metadata:
-        lines += ["", *(f"{key}: {value}" for key, value in block.metadata.items())]
-    lines += [f"{'warning' if note.startswith('truncated') else 'note'}: {note}" for note in notes]
+    if last.metadata:
+        lines += ["", *(f"{key}: {value}" for key, value in last.metadata.items())]
+    lines += [f"{'warning' if note.startswith('truncated') else 'note'}: {note}" for note in found.notes]
     return "\n".join(lines)
+
+
+def recording_json(blocks: Iterable[Recording]) -> str:
+    """Return the same as JSON, each column in its own unit; null where there is nothing to tell."""
+    found = _contents(blocks)
+    last, clock = found.last, found.clock
+    duration = rate = None
+    if clock.first is not None and not clock.broken:
+        duration = clock.last - clock.first
+        rate = 1 / clock.usual if clock.usual > 0 else None
+    return json_text(
+        {
+            "file": last.name,
+            "samples": found.samples,
+            "duration": {"value": duration, "unit": "s"},
+            "sample_rate": {"value": rate, "unit": "Hz"},
+            "gaps": clock.gaps,
+            "columns": {name: {"unit": last.units[name], **column.values()} for name, column in found.columns.items()},
+            "metadata": dict(last.metadata),
+            "notes": found.notes,
+        }
+    ).rstrip()
 
 
 def aligned(titles: list[str], rows: list[list[str]]) -> list[str]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -28,6 +27,8 @@ class Speech:
     held: dict[str, str] = field(default_factory=dict)
     """Warnings that wait for what becomes of their file: its name to the warning."""
     released: set[str] = field(default_factory=set)
+    stop: Callable[[], None] = lambda: None
+    """Ends what ``verbose`` began."""
 
 
 _SPEECH: ContextVar[Speech] = ContextVar("speech")
@@ -45,16 +46,12 @@ def speech() -> Speech:
 @contextmanager
 def begin(*, project: bool) -> Iterator[None]:
     """Begin a command, maybe within another: nothing has been said."""
-    token = _SPEECH.set(Speech(project=project))
-    told = _Told()
-    logger = logging.getLogger("imulab")
-    logger.addHandler(told)
-    level = logger.level
+    now = Speech(project=project)
+    token = _SPEECH.set(now)
     try:
         yield
     finally:
-        logger.removeHandler(told)
-        logger.setLevel(level)
+        now.stop()
         _SPEECH.reset(token)
 
 
@@ -63,14 +60,27 @@ def choose(*, quiet: bool, verbose: bool, project: bool) -> None:
     now = speech()
     now.quiet, now.verbose, now.project = quiet, verbose, now.project and project
     if verbose:
-        logging.getLogger("imulab").setLevel(logging.INFO)
+        now.stop = _listen()
 
 
-class _Told(logging.Handler):
-    """Prints what the readers tell of their work, where it was asked for."""
+def _listen() -> Callable[[], None]:
+    """Begin to print what the readers tell of their work; return what ends it."""
+    import logging
 
-    def emit(self, record: logging.LogRecord) -> None:
-        tell(record.getMessage())
+    class Told(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            tell(record.getMessage())
+
+    logger, told = logging.getLogger("imulab"), Told()
+    level = logger.level
+    logger.addHandler(told)
+    logger.setLevel(logging.INFO)
+
+    def stop() -> None:
+        logger.removeHandler(told)
+        logger.setLevel(level)
+
+    return stop
 
 
 def tell(message: str) -> None:
