@@ -27,7 +27,7 @@ RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; -
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
 LayoutFile = Annotated[
     str | None,
-    typer.Option("--layout", metavar="L.toml", help="Columns of a foreign file; imulab show --formats has an example."),
+    typer.Option("--layout", metavar="NAME|L.toml", help="Columns of a foreign file; see imulab show --formats."),
 ]
 OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
 ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]

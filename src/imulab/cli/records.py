@@ -135,11 +135,7 @@ def show(
 ) -> None:
     """Say what is in a record or a recording, or what changed between two records of one unit."""
     if formats:
-        from imulab.cli.show import aligned
-        from imulab.readers.formats import table
-        from imulab.readers.layout import EXAMPLE
-
-        print("\n".join([*aligned(*table()), "", "A layout (--layout FILE.toml):", "", EXAMPLE.rstrip("\n")]))
+        _show_formats(files or [])
         return
     if not files:
         raise OptionError("show: expected a FILE, two records, or --formats")
@@ -164,6 +160,24 @@ def show(
         return
     blocks = read_blocks(file, layout, **chosen(topic, instance, window, element))
     print(recording_json(blocks) if json else describe_recording(blocks))
+
+
+def _show_formats(names: list[str]) -> None:
+    """Print what can be read, or the layouts of these names."""
+    from imulab.cli.show import aligned
+    from imulab.readers import formats, shipped
+    from imulab.readers.layout import EXAMPLE, shipped_file, shipped_names
+
+    for name in names:
+        path = shipped_file(name)
+        if path is None:
+            raise OptionError(f"show --formats {name}: expected the name of a layout: {' '.join(shipped_names())}")
+        print(path.read_text(encoding="utf-8").rstrip("\n"))
+    if names:
+        return
+    lines = [*aligned(*formats.table()), "", "Layouts that come with imulab (--layout NAME):", ""]
+    lines += [*aligned(*shipped.table()), "", "imulab show --formats NAME prints one, to copy and change."]
+    print("\n".join([*lines, "", "A layout of your own (--layout FILE.toml):", "", EXAMPLE.rstrip("\n")]))
 
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:

@@ -170,8 +170,14 @@ class UnitFiles:
         self._stack.close()
 
     def path(self, name: str) -> Path:
-        """Return a local path for a name, which is relative to the manifest; URLs are fetched once."""
+        """Return a local path for a name: imulab's own layout, or relative to the manifest; URLs are fetched once."""
         if name not in self._local:
+            from imulab.readers.layout import shipped_file
+
+            shipped = shipped_file(name)
+            if shipped is not None:
+                self._local[name] = shipped
+                return shipped
             if is_url(name):
                 address = name
             elif is_url(self._base):

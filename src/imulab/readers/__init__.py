@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from time import perf_counter
@@ -15,17 +16,20 @@ from typing import BinaryIO
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from imulab.errors import ReadError
+from imulab.errors import ImulabError, ReadError, UnitError
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import Layout, load_layout
 from imulab.readers.selection import Selection, of_element, windowed
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Recording, Source
+from imulab.verdict import Note
 
 __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 
 _LOG = logging.getLogger(__name__)
 """Says of each file what it is, and how many rows of which times were read in how long."""
+_HEAD = 1 << 16
+_OURS = ("accel", "gyro", "dtg", "fog", "mag", "temperature", "truth")
 
 
 def read(
@@ -193,13 +197,55 @@ def _blocks(
             raise ReadError(f"{name}: cannot be read: {error.strerror or error}") from None
         return
     selection.refuse(name, "a text file")
+    try:
+        yield from _text_blocks(file, name, layout, hashed)
+    except (ReadError, UnitError) as error:
+        raise _advised(error, file, layout) from None
+
+
+def _text_blocks(file: str | Path, name: str, layout: Layout | None, hashed: _Hash | None) -> Iterator[Recording]:
     with _open(file, name) as stream:
         text = TextFile(stream, name, layout, hashed=hashed is not None, whole=hashed is not None)
         if hashed is not None:
             hashed.text = text
-        yield from text.blocks()
+        notes: list[str] | None = None
+        for block in text.blocks():
+            if notes is None:
+                notes = [] if layout or any(column.startswith(_OURS) for column in block.columns) else _found(file)
+            yield replace(block, notes=(*block.notes, *notes)) if notes else block
         if hashed is not None:
             text.drain()
+
+
+def _found(file: str | Path) -> list[str]:
+    """Return a note of the layout that fits a file without a column that imulab knows."""
+    from imulab.readers.shipped import advice
+
+    found = advice(_head(file))
+    return [Note(found)] if found else []
+
+
+def _advised(error: ImulabError, file: str | Path, layout: Layout | None) -> ImulabError:
+    """Return a refusal of a text file with the layout that reads it, or what a layout is, behind it."""
+    from imulab.readers.shipped import advice, is_titled
+
+    head = _head(file)
+    more = advice(head, None if layout is None else layout.name)
+    of_titles = isinstance(error, UnitError) or ": row " in str(error)
+    if not more and head and layout is None and of_titles and "--layout" not in str(error) and not is_titled(head):
+        more = "a layout says where columns of other titles are: --layout (imulab show --formats lists them)"
+    return type(error)(f"{error}; {more}") if more else error
+
+
+def _head(file: str | Path) -> bytes:
+    """Return the first bytes of a file that can be read again, none of another."""
+    if is_pipe(file):
+        return b""
+    try:
+        with Path(file).open("rb") as stream:
+            return stream.read(_HEAD)
+    except OSError:
+        return b""
 
 
 def _family(module: str, *, by_layout: bool) -> Callable[..., Iterator[Recording]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,7 @@ temperature = { value = 10, unit = "mV/degC" }
 [metadata]
 serial = "SN42"
 """
+_SHIPPED = Path(__file__).parent / "layouts"
 _DELIMITERS = {"whitespace": " ", " ": " ", ",": ",", ";": ";", "\t": "\t"}
 _KEYS = (
     "columns",
@@ -140,8 +142,20 @@ class Readings:
         return numbers + carried
 
 
+def shipped_names() -> list[str]:
+    """Return the names of the layouts that come with imulab."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.toml"))
+
+
+def shipped_file(name: str) -> Path | None:
+    """Return the file of a layout that comes with imulab, or None where no such is called so."""
+    return _SHIPPED / f"{name}.toml" if name in shipped_names() else None
+
+
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
-    """Read a layout file; `name` is what messages call it, its path if not given.
+    """Read a layout: a file, or one that comes with imulab by its name (a file of that name is ``./phyphox``).
+
+    `name` is what messages call it, its path if not given.
 
     Raises
     ------
@@ -151,7 +165,11 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
         A unit is unknown or does not belong to its column.
     """
     name = name or str(path)
-    table = load_toml(path, name, "layout")
+    shipped = shipped_file(str(path))
+    if shipped is None and not os.path.exists(path):  # noqa: PTH110  (Path.exists raises for names too long)
+        known = shipped_names()
+        raise ReadError(f"{name}: no such layout file; those that come with imulab: {listed(known, name)}")
+    table = load_toml(shipped or path, name, "layout")
     return _layout(table, name)
 
 

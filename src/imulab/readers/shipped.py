@@ -1,0 +1,77 @@
+"""Layouts that come with imulab, by name, and which of them fit a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from imulab.readers.layout import Layout, load_layout, shipped_file, shipped_names
+from imulab.readers.text import _fields
+
+_MOST_LINES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Shipped:
+    """A layout that comes with imulab: its name, the files that it is for, and what it says."""
+
+    name: str
+    about: str
+    layout: Layout
+
+    @property
+    def titles(self) -> frozenset[str]:
+        """The titles that it takes columns from; none where it counts them."""
+        return frozenset(c.origin for c in self.layout.columns.values() if isinstance(c.origin, str))
+
+    @property
+    def sensors(self) -> list[str]:
+        """What its columns hold, a triad as one: ``time``, ``accel``, ``gyro``."""
+        return list(dict.fromkeys(name.partition("_")[0] for name in self.layout.columns))
+
+
+@cache
+def shipped() -> tuple[Shipped, ...]:
+    """Return all of them, by name."""
+    found = []
+    for name in shipped_names():
+        text = (shipped_file(name) or Path()).read_text(encoding="utf-8")
+        found.append(Shipped(name, text.partition("\n")[0].removeprefix("# "), load_layout(name)))
+    return tuple(found)
+
+
+def fitting(head: bytes) -> list[str]:
+    """Return the names of the layouts that fit a text file by its first lines.
+
+    A layout fits where one line holds all titles that it wants. One that wants only some of the titles of another that
+    fits is not named.
+    """
+    lines = head.decode("utf-8-sig", "replace").splitlines()[:_MOST_LINES]
+    fits = [entry for entry in shipped() if any(_fits(entry, line) for line in lines)]
+    return [a.name for a in fits if not any(a.titles and a.titles < b.titles for b in fits)]
+
+
+def _fits(entry: Shipped, line: str) -> bool:
+    titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), entry.layout.delimiter)]
+    return bool(entry.titles) and entry.titles.issubset(titles)
+
+
+def advice(head: bytes, layout: str | None = None) -> str:
+    """Return which layout to try with a text file by its first lines; empty where none fits, or `layout` does."""
+    names = fitting(head)
+    if not names or layout in names:
+        return ""
+    return f"looks like a file of {' or '.join(names)}: try {' or '.join(f'--layout {name}' for name in names)}"
+
+
+def is_titled(head: bytes) -> bool:
+    """Return whether the first line that is no comment has a unit in brackets, as imulab's titles have."""
+    lines = head.decode("utf-8", "replace").splitlines()
+    return "[" in next((line for line in lines if line.strip() and not line.startswith("#")), "")
+
+
+def table() -> tuple[list[str], list[list[str]]]:
+    """Return titles and rows of the list of layouts."""
+    rows = [[entry.name, entry.about, " ".join(entry.sensors)] for entry in shipped()]
+    return ["--layout", "files", "columns"], rows

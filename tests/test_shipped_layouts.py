@@ -1,0 +1,181 @@
+"""Layouts that come with imulab: files in each format, made here from what is documented of it."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import ReadError
+from imulab.readers.layout import shipped_file, shipped_names
+from imulab.readers.shipped import fitting, shipped
+from imulab.units import to_si
+
+G = 9.80665
+DOCS = Path(__file__).parent.parent / "docs"
+ROWS = 5
+TIME = np.arange(ROWS) * 0.01
+ACCEL = np.random.default_rng(1).normal(0, 5, (ROWS, 3))
+GYRO = np.random.default_rng(2).normal(0, 2, (ROWS, 3))
+
+
+def lines(*columns, delimiter=","):
+    """Rows of numbers; a column may be texts."""
+    return "".join(f"{delimiter.join(map(str, row))}\n" for row in zip(*columns, strict=True))
+
+
+def stamps(factor, start=0):
+    return [start + round(float(t) * factor) for t in TIME]
+
+
+def euroc():
+    titles = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    titles += "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\r\n"
+    return titles + lines(stamps(1e9, 1403636579758555392), *GYRO.T, *ACCEL.T)
+
+
+def blackbox(accel, gyro, units):
+    acceleration, rotation = units
+    titles = ["loopIteration", "time (us)", "axisP[0]", "vbatLatest (V)"]
+    titles += [f"gyroADC[{i}]{rotation}" for i in range(3)] + [f"accSmooth[{i}]{acceleration}" for i in range(3)]
+    head = ", ".join([*titles, "flightModeFlags (flags)", "stateFlags (flags)"]) + "\n"
+    counts = [range(ROWS), stamps(1e6, 39_000_000), [-3] * ROWS, [15.82] * ROWS]
+    return head + lines(*counts, *gyro.T, *accel.T, ["ANGLE_MODE|HORIZON_MODE"] * ROWS, ["0"] * ROWS, delimiter=", ")
+
+
+def xyz(pattern):
+    return [pattern.format(axis, axis.upper()) for axis in "xyz"]
+
+
+def quoted(*titles):
+    return ",".join(f'"{title}"' for title in titles) + "\n"
+
+
+PHONE = "time,seconds_elapsed,z,y,x\n"
+FILES = {
+    "androsensor": lambda: (
+        ";".join([*xyz("ACCELEROMETER {1} (m/s²)"), *xyz("GYROSCOPE {1} (rad/s)"), "Time since start in ms ", "DATE"])
+        + "\n"
+        + lines(*ACCEL.T, *GYRO.T, stamps(1e3, 7), ["2014-05-07 10:12:15:123"] * ROWS, delimiter=";")
+    ),
+    "betaflight": lambda: blackbox(ACCEL / G, np.degrees(GYRO), (" (g)", " (deg/s)")),
+    "betaflight-raw": lambda: blackbox(ACCEL, GYRO, ("", "")),
+    "euroc": euroc,
+    "phyphox": lambda: (
+        quoted("Time (s)", *xyz("Acceleration {0} (m/s^2)"), "Absolute acceleration (m/s^2)")
+        + lines(TIME, *ACCEL.T, np.linalg.norm(ACCEL, axis=1))
+    ),
+    "phyphox-gyro": lambda: (
+        quoted("Time (s)", *xyz("Gyroscope {0} (rad/s)"), "Absolute (rad/s)")
+        + lines([f"{t:.9E}" for t in TIME], *GYRO.T, np.linalg.norm(GYRO, axis=1))
+    ),
+    "physics-toolbox": lambda: "time,gFx,gFy,gFz,wx,wy,wz,p\n" + lines(TIME, *(ACCEL / G).T, *GYRO.T, [1013.2] * ROWS),
+    "sensorlogger-accel": lambda: PHONE + lines(stamps(1e9, 1718030736872695300), TIME, *ACCEL.T[::-1]),
+    "sensorlogger-gyro": lambda: PHONE + lines(stamps(1e9, 1718030736872695300), TIME, *GYRO.T[::-1]),
+    "tum-vi": lambda: (
+        "# timestamp[ns] w.x w.y w.z a.x a.y a.z\n"
+        + lines(stamps(1e9, 1520530308181901469), *GYRO.T, *ACCEL.T, delimiter=" ")
+    ),
+    "x-imu3": lambda: (
+        ",".join(["Timestamp (us)", *xyz("Gyroscope {1} (deg/s)"), *xyz("Accelerometer {1} (g)")])
+        + "\n"
+        + lines(stamps(1e6, 12_000_000), *np.degrees(GYRO).T, *(ACCEL / G).T)
+    ),
+}
+ALIKE = {
+    "sensorlogger-accel": ["sensorlogger-accel", "sensorlogger-gyro"],
+    "sensorlogger-gyro": ["sensorlogger-accel", "sensorlogger-gyro"],
+}
+"""Which layouts fit a file of each, where that is not just its own."""
+
+
+def test_every_layout_has_a_file_here_and_a_line_in_the_docs():
+    assert sorted(FILES) == shipped_names()
+    text = (DOCS / "recordings.md").read_text()
+    for entry in shipped():
+        assert f"| `{entry.name}` |" in text
+        source = shipped_file(entry.name).read_text().splitlines()[1]
+        assert source.startswith("# ")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_is_read_by_the_name_of_its_layout(tmp_path, name):
+    path = tmp_path / "f.csv"
+    path.write_bytes(FILES[name]().encode())
+    found = il.read(path, name)
+    assert len(found) == ROWS
+    time = found.si("time")
+    # Nanoseconds since 1970 are held to 0.24 us.
+    np.testing.assert_allclose(time - time[0], TIME, atol=5e-7, rtol=0)
+    of = {"accel": ACCEL, "gyro": GYRO}
+    sensors = [sensor for sensor in of if f"{sensor}_x" in found]
+    assert sensors == [s for s in of if s not in {"phyphox": "gyro", "phyphox-gyro": "accel"}.get(name, "")] or (
+        "logger" in name and sensors == [name.partition("-")[2]]
+    )
+    for sensor in sensors:
+        read = np.column_stack([found.si(f"{sensor}_{axis}") for axis in "xyz"])
+        np.testing.assert_allclose(read, of[sensor], rtol=1e-14)
+        assert (found.triad_unit(sensor) == "count") == (name == "betaflight-raw")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_first_message_names_the_layout_that_fits(imulab, tmp_path, name):
+    (tmp_path / "f.csv").write_bytes(FILES[name]().encode())
+    expected = ALIKE.get(name, [name])
+    assert fitting((tmp_path / "f.csv").read_bytes()) == expected
+    done = imulab("tumble", "fit", "f.csv", "--gravity", "9.81", "-o", "r.json")
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "--layout" in done.stderr
+    if expected:
+        tried = " or ".join(f"--layout {one}" for one in expected)
+        assert done.stderr.endswith(f"looks like a file of {' or '.join(expected)}: try {tried}\n")
+
+
+def test_the_wrong_layout_gets_one_line_that_names_the_right_one(imulab, tmp_path):
+    (tmp_path / "f.csv").write_text(FILES["phyphox"]())
+    done = imulab("show", "f.csv", "--layout", "euroc")
+    assert done.returncode == 2
+    assert re.fullmatch(
+        r"imulab: .*f\.csv: euroc takes time from a column named 'timestamp \[ns\]', found Time \(s\) .*; "
+        r"looks like a file of phyphox: try --layout phyphox\n",
+        done.stderr,
+    )
+    assert imulab("show", "f.csv", "--layout", "phyphox").returncode == 0
+
+
+def test_a_name_that_is_none_lists_those_that_are(tmp_path):
+    (tmp_path / "f.csv").write_text(FILES["phyphox"]())
+    with pytest.raises(ReadError, match=r"^phypox: no such layout file; .* androsensor .*did you mean 'phyphox'"):
+        il.read(tmp_path / "f.csv", "phypox")
+
+
+def test_titles_that_nothing_fits_call_for_a_layout(imulab, tmp_path):
+    (tmp_path / "f.csv").write_text("Time (s),Ax,Ay,Az\n0,1,2,3\n")
+    done = imulab("show", "f.csv")
+    assert done.returncode == 2
+    assert "; a layout says where columns of other titles are: --layout (imulab show --formats" in done.stderr
+
+
+def test_formats_lists_them_and_prints_one(imulab):
+    shown = imulab("show", "--formats").stdout
+    for entry in shipped():
+        assert re.search(rf"^{entry.name} +{re.escape(entry.about)} +time ", shown, re.M)
+    printed = imulab("show", "--formats", "euroc").stdout
+    assert printed == shipped_file("euroc").read_text()
+    refused = imulab("show", "--formats", "nothing")
+    assert refused.returncode == 2
+    assert "nothing: expected the name of a layout: androsensor" in refused.stderr
+
+
+def test_a_fleet_takes_a_layout_by_name(imulab, tmp_path):
+    assert imulab("tumble", "simulate", "-o", "native.csv").returncode == 0
+    native = il.read(tmp_path / "native.csv")
+    triad = to_si(native.triad("accel"), native.triad_unit("accel"))
+    text = quoted("Time (s)", *xyz("Acceleration {0} (m/s^2)")) + lines(native.time, *triad.T)
+    (tmp_path / "f.csv").write_text(text)
+    (tmp_path / "m.csv").write_text("serial,procedure,file,layout,order\nA,tumble,f.csv,phyphox,0\n")
+    done = imulab("fleet", "run", "m.csv", "-o", "out")
+    assert done.returncode == 0, done.stderr
+    assert "phyphox" in (tmp_path / "out" / "A.json").read_text()
