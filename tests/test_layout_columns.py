@@ -76,7 +76,7 @@ def test_outputs_become_readings_in_other_kinds_of_file_too(layout, tmp_path):
 @pytest.mark.parametrize("size", [7, 64, 1 << 21])
 @pytest.mark.parametrize("bits", [8, 16, 32])
 def test_a_counter_that_begins_again_is_carried_on_and_its_gaps_stay(layout, file, monkeypatch, size, bits):
-    monkeypatch.setattr("imulab.readers.text._BLOCK_BYTES", size)
+    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
     numbers = 2**bits - 5 + np.arange(0, 20)
     kept = np.delete(numbers, [3, 4, 5, 11])
     content = b"".join(b"%d 1\n" % (number % 2**bits) for number in kept.tolist())
@@ -169,6 +169,25 @@ REFUSED = {
     "unit of counted time": (
         'sample_rate = 100\n[columns]\ntime = { from = 0, unit = "s" }\n',
         "both a time column and sample_rate; expected one of them, or a time of unit count",
+    ),
+    "prefix": ('prefix = ""\n' + FOG % "scale = 1", "prefix = ''; expected the first field of the lines that count"),
+    "prefix of two": ('prefix = "A B"\n' + FOG % "scale = 1", "prefix = 'A B'; expected the first field of the lines"),
+    "prefix number": ("prefix = 3\n" + FOG % "scale = 1", "prefix = 3; expected the first field of the lines"),
+    "skip_incomplete": (
+        "skip_incomplete = 1\n" + FOG % "scale = 1",
+        "skip_incomplete = 1; expected true or false",
+    ),
+    "misspelt key": (
+        "skip_incompleet = true\n" + FOG % "scale = 1",
+        "unknown key 'skip_incompleet' (did you mean 'skip_incomplete'?); known keys: ",
+    ),
+    "dates of a rate": (
+        '[columns]\nfog = { from = 0, unit = "iso" }\n',
+        "column fog: expected a unit of rate or output, found 's' (time)",
+    ),
+    "scaled dates": (
+        '[columns]\ntime = { from = 0, unit = "iso", scale = 2 }\n',
+        "column time: scale: expected none for dates",
     ),
     "unit of time": ('[columns]\ntime = { from = 0, unit = "count" }\n', "column time: expected a unit of time, found"),
 }

@@ -15,7 +15,11 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 400 };
+enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 400 }; /* 3: NOT_A_DATE */
+enum { DATE = 1 << 30 }; /* flag of a slot: the field is a date, the column takes nanoseconds since 1970 as int64 */
+
+#include "_dates.h"
+#include "_fields.h"
 
 static const double TENS[] = {1e0,  1e1,  1e2,  1e3,  1e4,  1e5,  1e6,  1e7,  1e8,  1e9,  1e10, 1e11,
                               1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20, 1e21, 1e22};
@@ -215,6 +219,7 @@ typedef struct {
     double *out;
     Py_ssize_t fields, capacity;
     char delimiter;
+    int dated; /* whether a field is a date */
     PyThreadState *thread;
 } Task;
 
@@ -265,9 +270,11 @@ static int line_fields(Task *t, const char *p, const char *end, Py_ssize_t row, 
             if (stop == NULL) stop = end;
         }
         if (field < t->fields && t->slots[field] >= 0) {
-            if (number(p, stop, &t->out[t->slots[field] * t->capacity + row], &t->thread) != OK) {
+            double *value = &t->out[(t->slots[field] & ~DATE) * t->capacity + row];
+            const int problem = t->slots[field] & DATE ? date(p, stop, value) : number(p, stop, value, &t->thread);
+            if (problem != OK) {
                 *found = field;
-                return NOT_A_NUMBER;
+                return problem;
             }
         }
         field++;
@@ -282,8 +289,9 @@ PyDoc_STRVAR(parse_doc,
              "parse(block, delimiter, slots, out, capacity, start=0, stop=-1, row=0) -> (rows, problem, field)\n\n"
              "Read whole lines of `block` from byte `start` to `stop`; field i goes to column slots[i] (int32, -1: skip) of\n"
              "`out`, a writable float64 buffer of columns with `capacity` rows each, from row `row` on. Delimiter ' ' means\n"
-             "any run of blanks. On a problem (1: field `field` is no number, 2: the line has `field` fields) `rows` is the\n"
-             "index of that line from `start`. The interpreter is released: threads may fill different rows.");
+             "any run of blanks. A slot with bit 30 set takes dates, as nanoseconds since 1970 (int64). On a problem (1: field\n"
+             "`field` is no number, 2: the line has `field` fields, 3: field `field` is no date) `rows` is the index of that\n"
+             "line from `start`. The interpreter is released: threads may fill different rows.");
 
 static PyObject *parse(PyObject *module, PyObject *args) {
     Py_buffer block, slots, out;
@@ -294,12 +302,14 @@ static PyObject *parse(PyObject *module, PyObject *args) {
         return NULL;
     }
     if (last < 0) last = block.len;
-    Task t = {NULL, slots.buf, out.buf, slots.len / (Py_ssize_t)sizeof(int32_t), capacity, (char)delimiter, NULL};
+    Task t = {NULL, slots.buf, out.buf, slots.len / (Py_ssize_t)sizeof(int32_t), capacity, (char)delimiter, 0, NULL};
     Py_ssize_t rows = 0, found = 0;
     int problem = OK, fits = prepared && capacity >= 0 && delimiter > 0 && delimiter < 128 && start >= 0 &&
                              start <= last && last <= block.len && row >= 0;
     for (Py_ssize_t i = 0; fits && i < t.fields; i++) {
-        fits = t.slots[i] < 0 || t.slots[i] < out.len / (Py_ssize_t)sizeof(double) / (capacity > 0 ? capacity : 1);
+        const Py_ssize_t columns = out.len / (Py_ssize_t)sizeof(double) / (capacity > 0 ? capacity : 1);
+        fits = t.slots[i] < 0 || (t.slots[i] & ~DATE) < columns;
+        t.dated |= t.slots[i] >= 0 && (t.slots[i] & DATE);
     }
     if (fits) {
         const char *p = (const char *)block.buf + start;
@@ -310,7 +320,7 @@ static PyObject *parse(PyObject *module, PyObject *args) {
                 fits = 0;
                 break;
             }
-            const char *next = plain_line(&t, p, row + rows);
+            const char *next = t.dated ? NULL : plain_line(&t, p, row + rows);
             if (next == NULL) {
                 const char *stop = memchr(p, '\n', (size_t)(t.end - p));
                 if (stop == NULL) stop = t.end;
@@ -354,6 +364,7 @@ static PyObject *prepare(PyObject *module, PyObject *args) {
 }
 
 static PyMethodDef methods[] = {{"parse", parse, METH_VARARGS, parse_doc},
+                                {"choose", choose, METH_VARARGS, choose_doc},
                                 {"prepare", prepare, METH_VARARGS, prepare_doc},
                                 {NULL, NULL, 0, NULL}};
 

@@ -12,4 +12,14 @@ def parse(
     stop: int = -1,
     row: int = 0,
 ) -> tuple[int, int, int]: ...
+def choose(
+    block: bytes,
+    delimiter: str,
+    out: bytearray,
+    prefix: bytes,
+    slots: NDArray[Any] | bytes,
+    skip: bool,
+    most_fields: int = 0,
+    most_rows: int = -1,
+) -> tuple[int, int, int, int]: ...
 def prepare(fives: bytes) -> None: ...

@@ -22,14 +22,22 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
     Raises
     ------
     ReadError
-        The layout takes a column by number.
+        The layout takes a column by number, or says what belongs to text.
     """
     found: dict[str, tuple[str, int | None]] = {}
+    text = ("prefix", "skip_incomplete") if kind != "JSON" else ("prefix",)
+    for key in text:
+        if getattr(layout, key):
+            raise ReadError(f"{name}: {layout.name}: {key} is for text, and this is a {kind} file; leave it out")
     for column, entry in layout.columns.items():
         if not isinstance(entry.origin, str):
             raise ReadError(
                 f"{name}: {layout.name} takes {column} from column {entry.origin}; in a {kind} file they have names: "
                 f'from = "variable" or "group/dataset", with [0] behind it for a column of a matrix'
+            )
+        if entry.date and kind != "JSON":
+            raise ReadError(
+                f'{name}: {layout.name}: column {column}: unit "iso" is for text and JSON, this is a {kind} file'
             )
         match = _INDEXED.fullmatch(entry.origin)
         found[column] = (match[1], int(match[2])) if match else (entry.origin, None)
@@ -111,7 +119,7 @@ def recordings(
     total = next(iter(lengths.values()), 0)
     if total == 0:
         raise ReadError(f"{name}: no rows of data")
-    readings = Readings(layout)
+    readings = Readings(layout, name)
     for start in range(0, total, ROWS):
         stop = min(start + ROWS, total)
         columns = {column: function(start, stop) for column, function in take.items()}

@@ -21,10 +21,12 @@ delimiter = "whitespace"                        # or "," ";" "\\t"
 decimal = "."                                   # or "," where numbers are written 9,81
 header = false                                  # true: the first line names the columns
 skip_lines = 0                                  # lines above the header or the data
+skip_incomplete = false                         # true: rows without a reading in every column are skipped and counted
+# prefix = "IMU"                                # only lines whose first field is IMU, without that field
 # encoding = "gbk"                              # of the names in the header, where they are not UTF-8
 # sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
 [columns]
-time = { from = 0, unit = "s" }                 # 0-based number, or a name in the header
+time = { from = 0, unit = "s" }                 # 0-based number, or a name in the header; unit "iso": dates
 accel_x = { from = 1, unit = "count" }
 accel_y = { from = 2, unit = "count" }
 accel_z = { from = 3, unit = "count" }
@@ -48,6 +50,8 @@ _KEYS = (
     "skip_lines",
     "decimal",
     "encoding",
+    "prefix",
+    "skip_incomplete",
     "scale_factor",
     "zero",
 )
@@ -63,7 +67,7 @@ _BY_COLUMN = {
 class LayoutColumn:
     """Where a column comes from (0-based number, or name in the header), and how it becomes a reading.
 
-    A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`.
+    A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`. Dates become seconds since the first.
     """
 
     origin: int | str
@@ -71,6 +75,7 @@ class LayoutColumn:
     scale: float = 1.0
     zero: float = 0.0
     scale_factor: float = 1.0
+    date: bool = False
 
     def convert(self, values: Array) -> None:
         """Turn what was read into readings, in place."""
@@ -87,8 +92,8 @@ class Layout:
     """Where the columns of a foreign file are.
 
     ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
-    in Hz or None; ``encoding`` that of the header's names; ``text`` says that the file is delimited text whatever it
-    looks like (it names a delimiter).
+    in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field of the lines that count, or
+    nothing; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter).
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -101,6 +106,8 @@ class Layout:
     text: bool = False
     decimal: str = "."
     encoding: str = "utf-8"
+    prefix: str = ""
+    skip_incomplete: bool = False
 
     @property
     def units(self) -> dict[str, str]:
@@ -114,15 +121,26 @@ class Layout:
 class Readings:
     """The columns of a file as its layout describes them, block by block: converted, and with their time."""
 
-    def __init__(self, layout: Layout) -> None:
-        self._layout = layout
+    def __init__(self, layout: Layout, name: str) -> None:
+        self._layout, self._name = layout, name
         self._last = np.nan
         self._carried = 0.0
+        self._dates: dict[str, tuple[int, int]] = {}
 
-    def of(self, columns: Mapping[str, Array], first_row: int) -> dict[str, Array]:
-        """Return the readings of a block that begins at row `first_row`; the arrays are changed in place."""
+    def of(self, columns: Mapping[str, Array], first_row: int, lines_before: int | None = None) -> dict[str, Array]:
+        """Return the readings of a block that begins at row `first_row`; the arrays are changed in place.
+
+        Raises
+        ------
+        ReadError
+            A date is before the one above it.
+        """
         for name, values in columns.items():
-            self._layout.columns[name].convert(values)
+            column = self._layout.columns[name]
+            if column.date and len(values):
+                self._count_from_first(name, values, first_row, lines_before)
+            else:
+                column.convert(values)
         rate = self._layout.sample_rate
         if rate is None:
             return dict(columns)
@@ -130,6 +148,25 @@ class Readings:
             return {**columns, "time": self._unwrapped(columns["time"]) / rate}
         count = len(next(iter(columns.values())))
         return {"time": np.arange(first_row - 1, first_row - 1 + count) / rate, **columns}
+
+    def _count_from_first(self, name: str, values: Array, first_row: int, lines_before: int | None) -> None:
+        """Turn dates, nanoseconds since 1970 in the bits of `values`, into seconds since the first of the file."""
+        stamps = values.view(np.int64)
+        first, last = self._dates.get(name, (int(stamps[0]), int(stamps[0])))
+        back = np.diff(stamps, prepend=last) < 0
+        if back.any():
+            index = int(np.argmax(back))
+            row = first_row + index
+            place = f"row {row}" if lines_before is None else f"row {row} (line {row + lines_before})"
+            above = stamps[index - 1] if index else last
+            dates = (np.datetime_as_string(np.datetime64(int(stamp), "ns")) for stamp in (above, stamps[index]))
+            raise ReadError(
+                "{}: {}, column {}: time runs backwards: expected {} UTC or later, found {}".format(
+                    self._name, place, name, *dates
+                )
+            )
+        self._dates[name] = first, int(stamps[-1])
+        values[:] = (stamps - first) / 1e9
 
     def _unwrapped(self, numbers: Array) -> Array:
         """Carry a counter on where it begins again, having come near to 2^8, 2^16 or 2^32."""
@@ -187,8 +224,9 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
     skip_lines = table.get("skip_lines", 0)
     if type(skip_lines) is not int or skip_lines < 0:
         raise ReadError(f"{path}: skip_lines = {skip_lines!r}; expected a number of lines")
-    if not isinstance(table.get("header", False), bool):
-        raise ReadError(f"{path}: header = {table['header']!r}; expected true or false")
+    for key in ("header", "skip_incomplete"):
+        if not isinstance(table.get(key, False), bool):
+            raise ReadError(f"{path}: {key} = {table[key]!r}; expected true or false")
     sample_rate = _sample_rate(table.get("sample_rate"), path)
     columns = _with_tables(columns, table, path)
     parsed = {name: _column(name, entry, path, counted=sample_rate is not None) for name, entry in columns.items()}
@@ -210,6 +248,8 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
         name=path,
         text="delimiter" in table,
         decimal=decimal,
+        prefix=_prefix(table["prefix"], _DELIMITERS[delimiter], path) if "prefix" in table else "",
+        skip_incomplete=table.get("skip_incomplete", False),
         encoding=_encoding(table.get("encoding", "utf-8"), path),
     )
 
@@ -242,6 +282,12 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
     scale = number_of(entry.get("scale", 1.0), f"{place}: scale")
     if scale == 0:
         raise ReadError(f"{place}: scale = {entry['scale']!r}; expected a number other than 0")
+    if entry["unit"] == "iso":
+        check_unit(name, "s", path)
+        converts = sorted(set(entry) & {"scale", "zero", "scale_factor"})
+        if converts:
+            raise ReadError(f"{place}: {converts[0]}: expected none for dates, whose seconds are counted")
+        return LayoutColumn(origin, "s", date=True)
     try:
         unit = parse_unit(str(entry["unit"]))
     except UnitError as error:
@@ -276,6 +322,12 @@ def _zero(entry: Any, unit: Unit, place: str) -> float:
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
     return number_of(entry["value"], place) * factor
+
+
+def _prefix(prefix: Any, delimiter: str, path: str) -> str:
+    if not isinstance(prefix, str) or prefix.strip() != prefix or not prefix or {delimiter, "\n"} & set(prefix):
+        raise ReadError(f'{path}: prefix = {prefix!r}; expected the first field of the lines that count, such as "IMU"')
+    return prefix
 
 
 def _encoding(name: Any, path: str) -> str:

@@ -35,7 +35,7 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             there = file.schema_arrow.names
             columns, units = _columns(there, name, layout)
             stored = file.schema_arrow.metadata or {}
-            readings = Readings(layout) if layout else None
+            readings = Readings(layout, name) if layout else None
             metadata = {**_metadata(stored), **((layout and layout.metadata) or {})}
             corrected = tuple(stored.get(CORRECTED_BY.encode(), b"").decode("utf-8", "replace").splitlines())
             for batch in file.iter_batches(

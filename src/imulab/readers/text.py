@@ -6,15 +6,10 @@ The numbers are read by the C module `_text` in blocks of whole lines.
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
-import stat
-from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import BinaryIO
 
@@ -23,66 +18,37 @@ import numpy as np
 from imulab.errors import ReadError
 from imulab.readers import _text
 from imulab.readers.layout import Layout, Readings
+from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Crew, Lines
 from imulab.recording import CORRECTED_BY, Recording, parse_column_title
 from imulab.tens import powers_of_five
 from imulab.verdict import Note
 
-_BLOCK_BYTES = 1 << 21
-_WORTH_SHARING = 1 << 19
-_MOST_THREADS = 8
-
 _text.prepare(powers_of_five())
-_LONGEST_LINE = 1 << 20
-
-
-class _Crew:
-    """Threads to parse with, as many as there are processors; started when there is work for them.
-
-    OMP_NUM_THREADS limits them as it does the linear algebra, so that workers beside each other do not compete.
-    """
-
-    def __init__(self) -> None:
-        processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
-        allowed = os.environ.get("OMP_NUM_THREADS", "")
-        self.size = min(_MOST_THREADS, processors, int(allowed) if allowed.isdecimal() and int(allowed) else processors)
-        self._pool: ThreadPoolExecutor | None = None
-
-    def begin(self, job: Callable[[], tuple[int, int, int]]) -> Callable[[], tuple[int, int, int]]:
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.size)
-        return self._pool.submit(job).result
-
-    def __enter__(self) -> _Crew:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-
+_DATE = 1 << 30
+_NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 
 
-class _Hash:
-    """SHA-256 of what is read, taken in a thread of its own where there is much of it."""
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """A block of lines that is being parsed.
 
-    def __init__(self) -> None:
-        self._hash = hashlib.sha256()
-        self._pool: ThreadPoolExecutor | None = None
+    Attributes
+    ----------
+    lines
+        As they stand in the file.
+    rows
+        The rows among them: the same lines, but for what a layout's prefix and skip_incomplete leave out.
+    out
+        Where the numbers will be, a row of the array for each column.
+    answer
+        What the parser says, once it has finished.
+    """
 
-    def update(self, data: bytes) -> None:
-        if self._pool is None and len(data) < _WORTH_SHARING:
-            self._hash.update(data)
-            return
-        self._pool = self._pool or ThreadPoolExecutor(1)
-        self._pool.submit(self._hash.update, data)
-
-    def stop(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
-
-    def hexdigest(self) -> str:
-        return self._hash.hexdigest()
+    lines: bytes
+    rows: bytes
+    out: np.ndarray
+    answer: Callable[[], tuple[int, int, int]]
 
 
 class TextFile:
@@ -91,141 +57,90 @@ class TextFile:
     def __init__(
         self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True, whole: bool = False
     ) -> None:
-        self._live = _is_pipe(stream)
-        self._read = getattr(stream, "read1", stream.read) if self._live else stream.read
         self._name = name
         self._layout = layout
-        self._readings = Readings(layout) if layout else None
-        self._hash = _Hash() if hashed else None
-        self._rest = b""
-        self._ended = self._unended = False
-        self._taken = 0
-        self._size = os.fstat(stream.fileno()).st_size if whole and not self._live and _is_file(stream) else 0
+        self._readings = Readings(layout, name) if layout else None
         self._room: np.ndarray | None = None
         self._used = 0
         self._corrected_by: list[str] = []
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
-        self._lines_before = 0
-        self._read_more()
-        while len(self._rest) < len(BOM_UTF8) and not self._ended:
-            self._read_more()
-        self._rest = self._rest.removeprefix(BOM_UTF8)
-        while not self._rest.strip() and not self._ended:
-            self._read_more()
-        if not self._rest.strip():
-            raise ReadError(f"{name}: the file is empty")
-        if b"\0" in self._rest[:4096]:
-            wide = " (UTF-16? expected UTF-8)" if self._rest.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ""
-            raise ReadError(f"{name}: expected text, found binary data{wide}")
+        self._lines = Lines(stream, name, hashed=hashed, whole=whole)
+        self.sha256, self.drain = self._lines.sha256, self._lines.drain
         self._delimiter = layout.delimiter if layout else ","
         self._blanks = b" \r\n" if self._delimiter == "\t" else b" \t\r\n"
+        self._prefix = (layout.prefix if layout else "").encode()
+        self._skips = layout is not None and layout.skip_incomplete
+        self._chooses = bool(self._prefix) or self._skips
+        self._most_fields = 0
+        self._passed = self._incomplete = 0
         self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
-
-    def sha256(self) -> str:
-        """Return the SHA-256 of the bytes read so far, hexadecimal."""
-        if self._hash is None:
-            return ""
-        self._hash.stop()
-        return self._hash.hexdigest()
-
-    def drain(self) -> None:
-        """Read on to the end, so that the hash is that of the whole file."""
-        while not self._ended:
-            self._read_more()
-            self._rest = b""
 
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
+        last, told = None, False
+        for block in self._blocks():
+            if not self._skips:
+                yield block
+                continue
+            if self._lines.live:
+                first, told = self._incomplete > 0 and not told, told or self._incomplete > 0
+                yield replace(block, notes=(*block.notes, self._skipped())) if first else block
+                continue
+            if last is not None:
+                yield last
+            last = block
+        if last is not None:
+            note = (self._skipped(),) if self._incomplete else ()
+            yield replace(last, notes=(*last.notes, *note))
+
+    def _blocks(self) -> Iterator[Recording]:
         row = 1
-        waiting: deque[tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]] = deque()
-        with _Crew() as crew:
+        waiting: deque[_Job] = deque()
+        live = self._lines.live
+        with Crew() as crew:
             while True:
-                block = self._next_lines()
-                if block is not None:
-                    waiting.append(self._begin(block, crew))
+                lines = self._lines.block(self._blanks)
+                if lines is not None:
+                    waiting.append(self._begin(lines, crew))
                 # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
-                while waiting and (block is None or self._live or len(waiting) > crew.size):
-                    recording = self._finish(*waiting.popleft(), row)
-                    if self._unended and not waiting:
+                while waiting and (lines is None or live or len(waiting) > crew.size):
+                    job = waiting.popleft()
+                    rows, problem, field = job.answer()
+                    recording = self._finish(job.out[:, :rows], row)
+                    if self._lines.unended and not waiting:
                         recording = replace(recording, notes=(*recording.notes, _UNENDED))
-                    row += len(recording)
-                    yield recording
-                if block is None:
+                    # The good rows of a stream are not lost with the bad one behind them.
+                    if rows and (live or not problem):
+                        yield recording
+                    if problem:
+                        self._refuse(job, row, rows, problem, field)
+                    row += rows
+                    self._passed += job.lines.count(b"\n") + (not job.lines.endswith(b"\n")) if self._chooses else rows
+                if lines is None:
                     break
+        if self._lines.overlong:
+            raise ReadError(
+                f"{self._name}: row {row} (line {self._lines.before + self._passed + 1}): expected a line of text, "
+                f"found more than {LONGEST_LINE} bytes without an end"
+            )
+        if row == 1 and self._incomplete:
+            raise ReadError(f"{self._name}: no rows of data: {self._skipped()}")
         if row == 1:
             raise ReadError(f"{self._name}: no rows of data below the header")
 
-    # --- bytes -------------------------------------------------------------------------------------------------
-
-    def _read_more(self) -> None:
-        self._rest += self._next_bytes()
-
-    def _next_bytes(self) -> bytes:
-        try:
-            data = self._read(_BLOCK_BYTES)
-        except OSError as error:
-            raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
-        self._ended = not data
-        self._taken += len(data)
-        if self._hash:
-            self._hash.update(data)
-        return data
-
-    def _next_lines(self) -> bytes | None:
-        """Return whole lines of about a block's size, without blank lines at the end of the file."""
-        while not self._ended:
-            end = self._rest.rfind(b"\n") + 1
-            if end:
-                lines, self._rest = self._rest[:end], self._rest[end:]
-                # Blank lines may be the end of the file: they wait for what follows.
-                kept = lines.rstrip(self._blanks)
-                if kept:
-                    self._rest = lines[len(kept) :].partition(b"\n")[2] + self._rest
-                    return kept
-                self._rest = lines + self._rest
-                self._read_more()
-                continue
-            data = self._next_bytes()
-            end = data.rfind(b"\n")
-            if data[max(end - 2, 0) : max(end, 0)].strip(self._blanks) and data[end - 1] not in b" \t\n":
-                # As almost always: the last whole line is none of blanks, and nothing need be moved but the lines.
-                lines = b"".join((self._rest, memoryview(data)[:end]))
-                self._rest = data[end + 1 :]
-                return lines
-            self._rest += data
-        self._unended |= bool(self._rest) and not self._rest.endswith(b"\n")
-        lines, self._rest = self._rest.rstrip(self._blanks), b""
-        return lines or None
-
-    def _fill_line(self) -> None:
-        """Read on until a whole line is there, or the end of the file."""
-        while b"\n" not in self._rest and not self._ended and len(self._rest) < _LONGEST_LINE:
-            self._read_more()
-
-    def _line(self, encoding: str = "utf-8", errors: str = "strict") -> str | None:
-        """Take one line of the head; comments may be of any encoding."""
-        self._fill_line()
-        if not self._rest:
-            return None
-        line, _, self._rest = self._rest.partition(b"\n")
-        self._lines_before += 1
-        if len(line) > _LONGEST_LINE:
-            place = f"{self._name}: line {self._lines_before}"
-            raise ReadError(f"{place}: expected a line of text, found more than {_LONGEST_LINE} bytes without an end")
-        try:
-            return line.decode(encoding, errors).rstrip("\r")
-        except UnicodeDecodeError:
-            if line.startswith(b"#"):
-                return line.decode("latin-1").rstrip("\r")
-            hint = '; the layout says otherwise with encoding = "gbk", or another' if self._layout else ""
-            shown = "UTF-8" if encoding == "utf-8" else encoding
-            raise ReadError(f"{self._name}: line {self._lines_before}: expected {shown} text{hint}") from None
+    def _skipped(self) -> str:
+        what = "rows were" if self._incomplete > 1 else "row was"
+        what = f"{what} so far" if self._lines.live else what
+        return (
+            f"{self._incomplete} {what} skipped that lack a reading of {' '.join(self._titles)} (skip_incomplete in "
+            f"{self._layout.name if self._layout else 'the layout'})"
+        )
 
     # --- head --------------------------------------------------------------------------------------------------
 
     def _comments(self) -> str | None:
         """Take the comment lines and return the first line that is none."""
-        while (line := self._line()) is not None:
+        while (line := self._lines.line()) is not None:
             if line.startswith("#"):
                 self._note(line)
             elif line.strip():
@@ -251,7 +166,7 @@ class TextFile:
             raise ReadError(f"{self._name}: an ArduPilot log as text; expected the binary log (.bin) it was made from")
         if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
             raise ReadError(
-                f"{self._name}: line {self._lines_before}: expected titles such as 'time [s],accel_x [m/s^2]', "
+                f"{self._name}: line {self._lines.before}: expected titles such as 'time [s],accel_x [m/s^2]', "
                 "found numbers; describe a foreign file with --layout FILE.toml (imulab show --formats has an example)"
             )
         titles, units = [], {}
@@ -259,16 +174,16 @@ class TextFile:
             name, unit = parse_column_title(title, self._name)
             if not name:
                 at_end = " (a comma at the end of the line?)" if line.rstrip().endswith(",") else ""
-                raise ReadError(f"{self._name}: line {self._lines_before}: a column without a name{at_end}")
+                raise ReadError(f"{self._name}: line {self._lines.before}: a column without a name{at_end}")
             if name in units:
-                raise ReadError(f"{self._name}: line {self._lines_before}: column {name} appears twice")
+                raise ReadError(f"{self._name}: line {self._lines.before}: column {name} appears twice")
             titles.append(name)
             units[name] = unit
         return titles, units, np.arange(len(titles), dtype=np.int32)
 
     def _layout_head(self, layout: Layout) -> tuple[list[str], dict[str, str], np.ndarray]:
         for _ in range(layout.skip_lines):
-            line = self._line(layout.encoding, "replace")
+            line = self._lines.line(layout.encoding, "replace")
             if line is None:
                 break
             if line.startswith("#"):
@@ -276,14 +191,10 @@ class TextFile:
         if layout.header:
             present = self._layout_titles(layout)
         else:
-            self._fill_line()
-            while self._rest.startswith(b"#"):
-                self._note(self._line() or "")
-                self._fill_line()
-            first = self._rest.partition(b"\n")[0].decode("utf-8", "replace")
-            present = [str(number) for number in range(len(_fields(first, layout.delimiter)))]
-        if not self._rest.strip():
+            present = [str(number) for number in range(self._first_fields(layout))]
+        if self._lines.is_blank():
             raise ReadError(f"{self._name}: no rows of data below the header")
+        self._most_fields = len(present) if layout.header else 0
         slots = np.full(len(present), -1, dtype=np.int32)
         for slot, (name, column) in enumerate(layout.columns.items()):
             origin = column.origin
@@ -297,100 +208,125 @@ class TextFile:
                 found = f"{len(present)} columns" if isinstance(origin, int) else " ".join(present)
                 raise ReadError(f"{self._name}: {layout.name} takes {name} from {what}, found {found}")
             if slots[index] >= 0:
-                other = list(layout.columns)[slots[index]]
+                other = list(layout.columns)[slots[index] & ~_DATE]
                 raise ReadError(f"{self._name}: {layout.name} takes both {other} and {name} from column {origin}")
-            slots[index] = slot
+            slots[index] = slot | _DATE if column.date else slot
+        if self._skips:
+            slots = slots[: int(np.flatnonzero(slots >= 0)[-1]) + 1]
         return list(layout.columns), layout.units, slots
+
+    def _first_fields(self, layout: Layout) -> int:
+        """Return how many fields the rows have: as the first, or as many as are asked for where rows may lack some."""
+        line = self._lines.next_line()
+        while self._lines.waiting and (line.startswith(b"#") or not self._has_prefix(line)):
+            comment = self._lines.line(layout.encoding, "replace") or ""
+            if comment.startswith("#"):
+                self._note(comment)
+            line = self._lines.next_line()
+        if self._skips:
+            return 1 + max(column.origin for column in layout.columns.values() if isinstance(column.origin, int))
+        if self._prefix and not self._lines.waiting:
+            raise ReadError(
+                f"{self._name}: no line whose first field is {layout.prefix!r}, the prefix in {layout.name}"
+            )
+        return len(_fields(line.decode("utf-8", "replace"), layout.delimiter)) - bool(self._prefix)
+
+    def _has_prefix(self, line: bytes) -> bool:
+        return (
+            not self._prefix
+            or _text.choose(line, self._delimiter, bytearray(len(line) + 1), self._prefix, b"", False)[1] == 1
+        )
 
     def _layout_titles(self, layout: Layout) -> list[str]:
         """Take the line of titles, which may itself begin with #; comments above it are kept."""
         wanted = {column.origin for column in layout.columns.values() if isinstance(column.origin, str)}
+        hint = '; the layout says of which encoding it is, such as encoding = "gbk"'
         while True:
-            line = self._line(layout.encoding) or ""
+            line = self._lines.line(layout.encoding, hint=hint) or ""
             titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), layout.delimiter)]
             if not (wanted and line.startswith("#") and wanted.isdisjoint(titles)):
-                return titles
+                return titles[1:] if self._prefix else titles
             self._note(line)
 
     # --- rows --------------------------------------------------------------------------------------------------
 
-    def _begin(self, block: bytes, crew: _Crew) -> tuple[bytes, np.ndarray, Callable[[], tuple[int, int, int]]]:
-        """Begin to parse a block of whole lines; return it, where its numbers will be, and the answer to wait for."""
+    def _begin(self, lines: bytes, crew: Crew) -> _Job:
+        """Begin to parse a block of whole lines."""
+        rows = lines
         if self._layout and self._layout.decimal == ",":
-            block = block.replace(b",", b".")
+            rows = rows.replace(b",", b".")
+        if self._chooses:
+            rows, _ = self._chosen(rows, -1)
         # A whole row has at least a sign for each of its fields; the first that has not is refused.
-        capacity = min(block.count(b"\n"), len(block) // len(self._slots) + 1) + 1
-        room, first = self._place_for(capacity, len(block))
-        job = partial(_text.parse, block, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
-        return block, room[:, first : first + capacity], crew.begin(job) if len(block) >= _WORTH_SHARING else job
+        capacity = min(rows.count(b"\n"), len(rows) // len(self._slots) + 1) + 1
+        room, first = self._place_for(capacity, len(lines))
+        job = partial(_text.parse, rows, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
+        answer = crew.begin(job) if len(rows) >= WORTH_SHARING else job
+        return _Job(lines, rows, room[:, first : first + capacity], answer)
+
+    def _chosen(self, lines: bytes, most: int) -> tuple[bytes, int]:
+        """Return the rows that prefix and skip_incomplete leave, at most so many, and how many lines that took."""
+        out = bytearray(len(lines) + 1)
+        size, _, count, incomplete = _text.choose(
+            lines, self._delimiter, out, self._prefix, self._slots, self._skips, self._most_fields, most
+        )
+        self._incomplete += incomplete if most < 0 else 0
+        return bytes(memoryview(out)[:size]), count
 
     def _place_for(self, rows: int, size: int) -> tuple[np.ndarray, int]:
         """Return an array of columns, and the row of it where a block of so many rows and bytes goes.
 
         A file that is read as a whole goes into one array, made for as many rows as its first block foretells.
         """
-        if self._size and self._room is None:
-            left = max(self._size - self._taken + len(self._rest), 0)
+        if self._lines.size and self._room is None:
+            left = max(self._lines.size - self._lines.taken + self._lines.waiting, 0)
             self._room = np.empty((len(self._titles), rows + int(1.02 * rows * left / size) + 16))
         if self._room is None or self._used + rows > self._room.shape[1]:
             return np.empty((len(self._titles), rows)), 0
         first, self._used = self._used, self._used + rows
         return self._room, first
 
-    def _finish(self, block: bytes, out: np.ndarray, answer: Callable[[], tuple[int, int, int]], row: int) -> Recording:
-        """Wait for a block and return its rows, which begin at row `row` of the file."""
-        rows, problem, field = answer()
-        if problem:
-            self._refuse(block, row, rows, problem, field)
-        columns = dict(zip(self._titles, out[:, :rows], strict=True))
+    def _finish(self, out: np.ndarray, row: int) -> Recording:
+        """Return the rows of a block, which begin at row `row` of the file."""
+        columns = dict(zip(self._titles, out, strict=True))
+        before = None if self._chooses else self._lines.before
         if self._readings is not None:
-            columns = self._readings.of(columns, row)
+            columns = self._readings.of(columns, row, before)
         return Recording(
             columns=columns,
             units=self._units,
             metadata=self._metadata,
             name=self._name,
             first_row=row,
-            lines_before=self._lines_before,
+            lines_before=before,
             corrected_by=tuple(self._corrected_by),
         )
 
-    def _refuse(self, block: bytes, row: int, index: int, problem: int, field: int) -> None:
-        number = row + index
-        place = f"{self._name}: row {number} (line {number + self._lines_before})"
-        line = block.split(b"\n", index + 1)[index].decode("utf-8", "replace").rstrip("\r")
+    def _refuse(self, job: _Job, row: int, index: int, problem: int, field: int) -> None:
+        above = self._chosen(job.lines, index + 1)[1] if self._chooses else index + 1
+        place = f"{self._name}: row {row + index} (line {self._lines.before + self._passed + above})"
+        line = job.rows.split(b"\n", index + 1)[index].decode("utf-8", "replace").rstrip("\r")
+        expected = self._most_fields or len(self._slots)
         if not line.strip(" \t"):
-            raise ReadError(f"{place}: expected {len(self._slots)} fields, found an empty line")
-        if problem == 2:
-            raise ReadError(f"{place}: expected {len(self._slots)} fields, found {field}")
+            raise ReadError(f"{place}: expected {expected} fields, found an empty line")
+        if problem == _WRONG_COUNT:
+            raise ReadError(f"{place}: expected {expected} fields, found {field}")
         found = _fields(line, self._delimiter)[field].strip(" \t\r")
-        slot = int(self._slots[field])
+        column = self._titles[int(self._slots[field]) & ~_DATE]
         shown = found if len(found) <= 40 else found[:37] + "..."
+        if problem == _NOT_A_DATE:
+            raise ReadError(
+                f"{place}, column {column}: expected a date and time such as 2026-11-22T15:04:05.250Z, found {shown!r}"
+            )
         comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", found) else ""
         if comma and self._layout:
             comma += '; decimal = "," in the layout reads it'
-        raise ReadError(f"{place}, column {self._titles[slot]}: expected a number, found {shown!r}{comma}")
+        raise ReadError(f"{place}, column {column}: expected a number, found {shown!r}{comma}")
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
     """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
     return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
-
-
-def _is_file(stream: BinaryIO) -> bool:
-    """Whether the stream is an open file, whose size is known."""
-    try:
-        return stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
-    except (OSError, ValueError):
-        return False
-
-
-def _is_pipe(stream: BinaryIO) -> bool:
-    """Whether lines come as they are made, so that none may be held back."""
-    try:
-        return not stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
-    except (OSError, ValueError):
-        return False
 
 
 def _is_number(text: str) -> bool:
