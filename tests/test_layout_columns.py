@@ -179,7 +179,7 @@ REFUSED = {
     ),
     "misspelt key": (
         "skip_incompleet = true\n" + FOG % "scale = 1",
-        "unknown key 'skip_incompleet' (did you mean 'skip_incomplete'?); known keys: ",
+        "unknown key 'skip_incompleet'; known keys: columns delimiter header",
     ),
     "dates of a rate": (
         '[columns]\nfog = { from = 0, unit = "iso" }\n',
