@@ -84,3 +84,23 @@ def test_the_command_says_what_is_lost(tmp_path, imulab):
     assert done.returncode == 0
     assert "left out (lossy): k2_x" in done.stderr
     assert "bias, scale factor and misalignment were fitted anew" in done.stderr
+
+
+def test_too_few_attitudes_to_fit_anew_are_called_so(tmp_path):
+    record, _, _ = made()
+    few = {key: value[:5] for key, value in record.data["attitudes"].items() if value is not None}
+    told = []
+    with_few = replace(record, data={**record.data, "attitudes": few})
+    export("kalibr", [with_few], tmp_path, ExportOptions(lossy=True, tell=told.append))
+    (line,) = [line for line in told if "whole model" in line]
+    assert "the record's 5 attitudes are too few, or not the ones, to fit them to anew" in line
+
+
+@pytest.mark.parametrize("target", ["px4", "ardupilot", "kalibr", "openvins", "ros"])
+def test_every_lossy_target_says_on_standard_error_what_it_leaves_out(imulab, tmp_path, target):
+    made(misalignment=True)[0].save(tmp_path / "unit.json")
+    done = imulab("export", "--to", target, "unit.json", "-o", "out", "--lossy")
+    assert done.returncode == 0, done.stderr
+    assert f"imulab: warning: {target}: left out (lossy): " in done.stderr
+    assert "k2_x" in done.stderr
+    assert "fitted anew to the record's 30 attitudes" in done.stderr

@@ -12,8 +12,9 @@ from typing import Any
 from imulab.arraytable import Fusion
 from imulab.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.errors import RecordError
-from imulab.packing import TEXT, Table, pack
+from imulab.packing import KINDS, TEXT, Table, pack
 from imulab.printable import first_hidden
+from imulab.recordshape import check_blob_text
 from imulab.runtime import Unit
 from imulab.tables import tables_of
 
@@ -101,6 +102,11 @@ def load_blob(path: str | Path) -> Blob:
             raise ValueError
     except (ValueError, KeyError, TypeError):
         raise RecordError(f"{path}: the blob has no description of its units: it is for firmware only") from None
+    names = {number: name for name, number in KINDS.items()}
+    try:
+        check_blob_text(content, [names[kind] for kind, _ in _sections(data) if kind != TEXT])
+    except RecordError as error:
+        raise RecordError(f"{path}: {error}") from None
     if place := first_hidden(content):
         raise RecordError(f"{path}: {place} holds a control or bidirectional character; expected plain text")
     return Blob(str(path), data, content)

@@ -26,12 +26,14 @@ from imulab.jsontext import content_sha256, sealed_text
 from imulab.jsontext import json_text as json_text
 from imulab.printable import first_hidden, has_hidden, printable
 from imulab.recording import Source
+from imulab.recordshape import check_shape
 from imulab.verdict import UNJUDGED, Verdict, as_judged, verdict_of
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
 BLOB_MAGIC = b"\x89IMULAB\n"
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
+_ROUNDING = 1.0 + 1e-6
 PROCEDURES = ("tumble", "gyro_array", "warmup", "centrifuge")
 
 
@@ -295,7 +297,30 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
     size = len(record.covariance.names)
     if len(record.covariance.matrix) != size or any(len(row) != size for row in record.covariance.matrix):
         raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
+    try:
+        _check_numbers(record)
+        check_shape(content, record.procedure)
+    except RecordError as error:
+        raise RecordError(f"{name}: {error}") from None
     return replace(record, warnings=as_judged(record.warnings, record.verdict))
+
+
+def _check_numbers(record: Calibration) -> None:
+    """Check that uncertainties are none below zero, and that the covariance is one of known parameters."""
+    for key, p in record.parameters.items():
+        for value in (p.standard_uncertainty, p.standard_uncertainty_given_order):
+            if value is not None and value < 0:
+                raise RecordError(f"parameters.{key}: a standard uncertainty of {value:g}; expected 0 or more")
+    names, matrix = record.covariance.names, record.covariance.array()
+    unknown = [key for key in names if key not in record.parameters]
+    if unknown or len(set(names)) < len(names):
+        found = unknown[0] if unknown else next(key for key in names if names.count(key) > 1)
+        raise RecordError(f"covariance.names: expected each a parameter, once, found {found!r}")
+    spread = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    if (np.diag(matrix) < 0).any() or (np.abs(matrix) > _ROUNDING * np.outer(spread, spread)).any():
+        raise RecordError("covariance.matrix: a correlation beyond 1, or a variance below 0")
+    if (np.abs(matrix - matrix.T) > (_ROUNDING - 1) * np.outer(spread, spread)).any():
+        raise RecordError("covariance.matrix: expected a symmetric matrix")
 
 
 def plain_values(value: Any, where: str) -> Any:

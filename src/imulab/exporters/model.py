@@ -230,7 +230,13 @@ def held_accelerometers(
     what = "bias, scale factor and misalignment" if misalignment else "bias and scale factor"
     record = linear_record(unit.record, misalignment=misalignment)
     if record is None:
-        return accel, error, [f"{what} are those of the whole model: the record holds no attitudes to fit them to anew"]
+        held = unit.record.data.get("attitudes")
+        why = (
+            f"the record's {len(held['mean'])} attitudes are too few, or not the ones, to fit them to anew"
+            if held
+            else "the record holds no attitudes to fit them to anew"
+        )
+        return accel, error, [f"{what} are those of the whole model: {why}"]
     held = _accelerometers(record)
     uncertain = {name: p.standard_uncertainty or 0.0 for name, p in record.parameters.items()}
     bias = max(uncertain[f"bias_{axis}"] for axis in AXES)

@@ -193,6 +193,20 @@ def check_calibration(record: Calibration, name: str = "the record") -> None:
     if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
         what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
         raise RecordError(f"{name}: expected the record of an array calibration, found one of a {what}")
+    parts: list[tuple[str, Any, tuple[str, ...]]]
+    parts = [("model", record.model, ("axes", "aligned")), ("the record", record.sections, ("elements", "correlation"))]
+    parts += [("correlation", record.sections.get("correlation", {}), ("covariance", "averaging_time", "weights"))]
+    aligned = record.model.get("aligned")
+    for number, element in enumerate(record.sections.get("elements", ())):
+        keys = ("bias", "angle_random_walk", "rate_random_walk", *(("matrix",) if aligned else ()))
+        if aligned and "scale_factor" in element:
+            keys = keys[:-1]
+        parts.append((f"elements[{number}]", element, keys))
+        parts += [(f"elements[{number}].{key}", element[key], ("value",)) for key in keys if key in element]
+    for place, part, keys in parts:
+        missing = [key for key in keys if key not in part]
+        if missing:
+            raise RecordError(f"{name}: {place} lacks {missing[0]}")
 
 
 def array_calibration(record: Calibration, elements: Elements, recording: str = "recording") -> ArrayCalibration:
