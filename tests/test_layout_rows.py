@@ -269,10 +269,12 @@ def pipe(monkeypatch):
         end, start = os.pipe()
         process = os.fork()
         if process == 0:
-            os.close(end)
-            with os.fdopen(start, "wb") as stream:
-                stream.write(content)
-            os._exit(0)
+            try:
+                os.close(end)
+                with os.fdopen(start, "wb") as stream:
+                    stream.write(content)
+            finally:
+                os._exit(0)
         os.close(start)
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(os.fdopen(end, "rb")))
 
@@ -286,3 +288,20 @@ def test_a_bad_line_of_a_stream_does_not_lose_the_good_rows_before_it(pipe):
     assert block.time.tolist() == [0, 1]
     with pytest.raises(ReadError, match=r"standard input: row 3 \(line 4\), column accel_x: expected a number"):
         next(rows)
+
+
+@pytest.mark.parametrize("above", [b"", b"0,1\n1,2\n"])
+def test_a_line_of_fifty_megabytes_is_refused_at_once(pipe, above):
+    pipe(HEAD + above + b"7" * 50_000_000)
+    row = 1 + above.count(b"\n")
+    with pytest.raises(
+        ReadError, match=rf"row {row} \(line {row + 1}\): expected a line of text, found more than 1048576"
+    ):
+        read("-")
+
+
+def test_two_hundred_thousand_comment_lines_are_read(file):
+    recording = read(file(b"".join(b"# key %d: %d\n" % (k, k) for k in range(200_000)) + HEAD + b"0,1\n"))
+    assert len(recording.metadata) == 200_000
+    assert recording.metadata["key 199999"] == "199999"
+    assert recording.place(0) == "row 1 (line 200002)"
