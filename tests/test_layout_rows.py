@@ -247,7 +247,7 @@ def test_other_kinds_of_file_refuse_what_belongs_to_text(file, tmp_path):
     with pytest.raises(ReadError, match="prefix is for text, and this is a Parquet file"):
         read(tmp_path / "f.parquet", layout)
     layout = file('[columns]\ntime = { from = "t", unit = "iso" }\n', "l.toml")
-    with pytest.raises(ReadError, match='column time: unit "iso" is for text and JSON, this is a Parquet file'):
+    with pytest.raises(ReadError, match='column time: unit "iso" is for text, and this is a Parquet file'):
         read(tmp_path / "f.parquet", layout)
 
 

@@ -37,7 +37,7 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
             )
         if entry.date and kind != "JSON":
             raise ReadError(
-                f'{name}: {layout.name}: column {column}: unit "iso" is for text and JSON, this is a {kind} file'
+                f'{name}: {layout.name}: column {column}: unit "iso" is for text, and this is a {kind} file'
             )
         match = _INDEXED.fullmatch(entry.origin)
         found[column] = (match[1], int(match[2])) if match else (entry.origin, None)
