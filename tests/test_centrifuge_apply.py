@@ -252,8 +252,8 @@ def test_the_table_of_runs_says_what_differs_between_them():
     half = len(test.runs)
     assert [row[table.columns.index("spin axis")] for row in table.rows] == ["up"] * half + ["down"] * half
     page = render(record, exhibits_of(record))
-    assert '<th class="text">file</th>' in page
-    assert "<th>g</th>" in page
+    assert '<th scope="col" class="text">file</th>' in page
+    assert '<th scope="col">g</th>' in page
 
 
 # --- plan --------------------------------------------------------------------------------------------------------

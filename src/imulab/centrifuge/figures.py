@@ -90,8 +90,9 @@ def _headline(record: Calibration, prefix: str) -> str:
     K, _ = curve_at(record, prefix, np.array([_force(record, last)]))
     fitted = _change(float(K[0]) / record.value(f"{prefix}K0") - 1, curved)
     return (
-        f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}; at {top} the factor is "
-        f"{measured} measured against K_{levels[0]}, and {fitted} by the fitted curve."
+        f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}, its drift factor; "
+        f"at {top} the factor is {measured} measured directly against {first}, and {fitted} by the curve through all "
+        "levels."
     )
 
 
@@ -219,11 +220,10 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
             )  # fmt: skip
     return Figure(
         title="Change of the drift factor with specific force",
-        caption="zeta rests on K_1, the weakest run, so that all its points share one error; the fitted curve uses "
-        "every level and "
-        "is what apply subtracts. Black points are the same K_i against the curve's K0. Points off the band by more "
-        "than their bars "
-        "are what the curve does not describe.",
+        caption="K is the drift per specific force, zeta its change from K_1, the lowest level and the weakest run, "
+        "so that all zeta share one error; the fitted curve uses every level and is what apply subtracts. Filled "
+        "points are the same K_i against the curve's K0. Points off the band by more than their bars are not "
+        "described by the curve.",
         traces=traces,
         layout=_panels([f"{_label(p)}: change of K, %" for p in shown], "specific force, g"),
         height=430,
@@ -325,7 +325,7 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
                          error_y={"type": "data", "array": bars, "thickness": 1, "width": 3, "color": QUIET},
                          showlegend=number == 0)
             )  # fmt: skip
-    layout = _panels([f"{axis.upper()}: K of the run / K of the level − 1, %" for axis in axes], "level (number)")
+    layout = _panels([f"{axis.upper()}: K off its level, %" for axis in axes], "level (number)")
     ticks = [row["level"] for row in record.sections["levels"]]
     texts = [
         f"{row['level']}<br>{from_si(row['specific_force']['value'], 'g'):.3g} g" for row in record.sections["levels"]
@@ -345,11 +345,8 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
         if size
     ]
     text = "; ".join(words) + ": in the uncertainties" if words else "The scatter is explained by the noise"
-    caption = (
-        f"Bars are one standard uncertainty of a run. {text}."
-        if len(cycles) > 1
-        else ("Bars are one standard uncertainty of a run. One power cycle only: nothing is known of repeatability.")
-    )
+    said = f"{text}." if len(cycles) > 1 else "One power cycle only: nothing is known of repeatability."
+    caption = f"K of each run, relative to that of its level; bars are one standard uncertainty of a run. {said}"
     return Figure("Repeatability over power cycles", caption, traces, layout, height=400)
 
 

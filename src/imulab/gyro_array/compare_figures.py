@@ -129,7 +129,12 @@ def _allan_methods(record: Calibration, a: int) -> Figure:
     traces = [
         allan_trace(curves[m][a], m, _PALETTE[m], 1.0, _width(m), number=_NUMBER[m]) for m in order if m in curves
     ]
+    first = {m: next(d for d in curves[m][a]["deviation"] if d > 0) for m in curves if any(curves[m][a]["deviation"])}
+    quiet = min(first, key=first.__getitem__, default="")
     return Figure(
+        message=f"At the shortest time {quiet} is the quietest, {plain_number(first[quiet], 2)} {unit}."
+        if quiet
+        else "",
         title=f"Allan deviation of each method{of_axis(record.model['axes'][a])}",
         caption="On the left, how quiet a sample is: a curve that bends down there is low-pass filtered. On the "
         "right, what the angle drifts by: no weighting changes the bias that all gyros share.",
@@ -159,7 +164,11 @@ def _angles(record: Calibration, a: int) -> Figure:
         }
         for method, rows in sorted(record.data["angle"].items(), key=lambda item: item[0] == "robust")
     ]
+    ends = {method: abs(factor * rows[a][-1]) for method, rows in record.data["angle"].items()}
+    least, most = min(ends, key=ends.__getitem__), max(ends, key=ends.__getitem__)
     return Figure(
+        message=f"At the end {least} is off by {plain_number(ends[least], 2)} {angle}, {most} by "
+        f"{plain_number(ends[most], 2)} {angle}.",
         title=f"Angle error over time{of_axis(record.model['axes'][a])}",
         caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in nothing "
         "that counts for an attitude.",

@@ -151,7 +151,12 @@ def _correlation(record: Calibration, a: int) -> Figure:
     matrix = np.array(shared["matrix"][a])
     text = [[f"{value:.2f}" for value in row] for row in matrix]
     noise = float(np.median(shared["standard_uncertainty"][a]))
+    off = np.where(np.eye(len(names), dtype=bool), 0.0, matrix)
+    i, j = np.unravel_index(int(np.argmax(np.abs(off))), off.shape)
     return Figure(
+        message=f"The pair that goes together most: {names[i]} and {names[j]}, {off[i, j]:+.2f}."
+        if len(names) > 1
+        else "",
         title=f"Correlation of the noise{of_axis(record.model['axes'][a])}",
         caption=f"At {shared['averaging_time']['value']:g} s, ± {noise:.2f} each. What all share, no weights remove; "
         "a pair that goes together counts for less than two.",

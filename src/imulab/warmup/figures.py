@@ -293,11 +293,13 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
                     "hovertemplate": f"{name}<br>%{{x:g}} degC: %{{y:.3g}} {label}<extra></extra>",
                 }
             )
+    after = [(_rms(row, index) * factor, at) for row, at in zip(chosen["by_temperature"], knots, strict=True)]
+    worst, at = max((pair for pair in after if pair[0] > 0), default=(0.0, 0.0))
     return Figure(
+        message=f"The chosen table is farthest off at {at:g} degC: {plain_number(worst, 2)} {label}.",
         title=f"Error by power-on temperature, {kind}",
-        caption="Root mean square over all axes and the time up to T_M, on a logarithmic scale. Left out: the "
-        "temperature predicted from its neighbours alone. Nothing can lie much below the repeatability. A point that "
-        "is missing lies in the noise.",
+        caption="Root mean square over all axes and the time up to T_M. Left out: predicted from the neighbouring "
+        "temperatures alone. Nothing lies far below the repeatability; what is lost in the noise has no point.",
         traces=traces,
         layout={
             "xaxis": axis_style("power-on temperature, degC", tickvals=knots),

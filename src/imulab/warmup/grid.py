@@ -10,7 +10,7 @@ from imulab.exhibit import Figure
 from imulab.recording import Array
 
 _ACROSS = 3
-_DECADES = [1, 3, 10, 30, 100, 300, 1000, 3000]
+_DECADES = [1, 10, 100, 1000]
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross")
 _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
 """Cold to warm; distinct in lightness too."""
