@@ -80,6 +80,10 @@ unsigned il_tumble_apply(const il_tumble *settings, const il_real output[3], il_
 unsigned il_tumble_block(const il_tumble *settings, size_t n, const il_real *const output[3], size_t stride,
                          il_real *const force[3], size_t force_stride);
 
+/* The s of each axis at which s + k2 s^2 + ... is a, between the turning points next to zero, and the slope there; not a
+ * number where there is none. k[0] holds k2 of the axes, k[1] k3. Order 2 in closed form, 2 a / (1 + sqrt(1 + 4 k2 a)). */
+void il_tumble_solve(int32_t order, const il_real (*k)[3], const il_real a[3], il_real s[3], il_real slope[3]);
+
 /* ---- gyroscope triad: w = T^-1 (M / S - b - G f) ------------------------------------------------------------------ */
 
 typedef struct {

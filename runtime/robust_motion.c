@@ -15,11 +15,11 @@
 #define MOST_LATE IL_C(2.0)  /* 20 ms, and */
 #define MOST_SCALE IL_C(5.0) /* 5 %: beyond, it is a fault */
 
-enum { KNOWN = SETTLING, MOVED }; /* rates so far, until the noise is known; motion was found */
+enum { KNOWN = IL_SETTLING, MOVED }; /* rates so far, until the noise is known; motion was found */
 
-int il_robust_move(const il_array *a, const il_array_axis *s, il_real rate, sample *p) {
+int il_robust_move(const il_array *a, const il_array_axis *s, il_real rate, il_sample *p) {
     il_real turn = s->motion ? rate - s->slow : IL_C(0.0), share = SHARE * rate;
-    const il_real least = s->motion == MOVED ? MOST : LEAST;
+    const il_real least = s->motion == MOVED ? IL_MOST : LEAST;
     if (s->motion >= KNOWN && turn * turn + share * share > least * least * p->noise) {
         p->motion[0] = turn;
         p->motion[1] = share;
@@ -34,7 +34,7 @@ int il_robust_move(const il_array *a, const il_array_axis *s, il_real rate, samp
 }
 
 static il_real within(il_real x, il_real limit) {
-    return smaller(larger(x, -limit), limit);
+    return il_smaller(il_larger(x, -limit), limit);
 }
 
 /* What is known of the motion tells nothing more. */
@@ -44,10 +44,10 @@ static void rest(il_array_axis *s) {
     s->motion = KNOWN;
 }
 
-void il_robust_learn_motion(const il_array *a, il_array_axis *s, const sample *p, const il_real *f) {
+void il_robust_learn_motion(const il_array *a, il_array_axis *s, const il_sample *p, const il_real *f) {
     il_real gain = IL_C(1.0), *mean = s->motion_mean, *square = s->motion_square, away[2];
     for (int32_t i = 0; i < a->elements; i++) {
-        if (p->gain[i] > IL_C(0.0)) gain = smaller(gain, p->gain[i]);
+        if (p->gain[i] > IL_C(0.0)) gain = il_smaller(gain, p->gain[i]);
     }
     for (int32_t j = 0; j < 2; j++) {
         away[j] = p->motion[j] - mean[j];
@@ -56,10 +56,10 @@ void il_robust_learn_motion(const il_array *a, il_array_axis *s, const sample *p
     square[0] = (IL_C(1.0) - gain) * (square[0] + gain * away[0] * away[0]);
     square[1] = (IL_C(1.0) - gain) * (square[1] + gain * away[1] * away[1]);
     square[2] = (IL_C(1.0) - gain) * (square[2] + gain * away[0] * away[1]);
-    const il_real ridge = larger(p->noise, ROUNDING * (square[0] + square[1]));
+    const il_real ridge = il_larger(p->noise, IL_ROUNDING * (square[0] + square[1]));
     const il_real first = square[0] + ridge, second = square[1] + ridge;
     /* the determinant, which rounding may make less than it can be */
-    const il_real det = larger(first * second - square[2] * square[2], ridge * (square[0] + second));
+    const il_real det = il_larger(first * second - square[2] * square[2], ridge * (square[0] + second));
     const il_real scale = (IL_C(1.0) - gain) / det;
     const il_real late = scale * (second * away[0] - square[2] * away[1]);
     const il_real share = scale * (first * away[1] - square[2] * away[0]);

@@ -6,41 +6,63 @@
 enum { NEWTON_STEPS = 12, CROSS_STEPS = 30 };
 static const il_real SOLVED = IL_C(64.0) * IL_EPSILON; /* last step, relative, below which a solution stands */
 
-/* Solve s + k2 s^2 + ... = a for one axis. */
-static il_real unbent(const il_tumble *t, int axis, il_real a, unsigned *flags) {
-    il_real s = a, step = IL_C(0.0), slope = IL_C(1.0);
-    if (!(a >= t->low[axis] && a <= t->high[axis])) {
-        *flags |= il_finite(a) ? (unsigned)IL_BEYOND : (unsigned)IL_NOT_FINITE;
-        return il_nan();
+/* The axes step together: each step waits for a division, and a processor may have three to wait for at once. */
+void il_tumble_solve(int32_t order, const il_real (*k)[3], const il_real a[3], il_real s[3], il_real slope[3]) {
+    il_real step[3] = {IL_C(0.0), IL_C(0.0), IL_C(0.0)};
+    int moves[3] = {order > 2, order > 2, order > 2};
+    for (int i = 0; i < 3; i++) {
+        s[i] = a[i];
+        slope[i] = IL_C(1.0);
+        if (order != 2) continue;
+        const il_real square = IL_C(1.0) + IL_C(4.0) * k[0][i] * a[i];
+        slope[i] = il_finite(square) && square > SOLVED ? il_sqrt(square) : il_nan(); /* less is nothing but rounding */
+        s[i] = a[i] / (IL_C(0.5) + IL_C(0.5) * slope[i]); /* in which nothing cancels where k2 is small */
     }
-    for (int k = 0; k < NEWTON_STEPS; k++) {
-        il_real value = IL_C(0.0), tilt = IL_C(0.0);
-        for (int p = t->order - 2; p >= 0; p--) {
-            tilt = tilt * s + value;
-            value = value * s + t->nonlinearity[p][axis];
+    for (int number = 0; number < NEWTON_STEPS && (moves[0] | moves[1] | moves[2]); number++) {
+        for (int i = 0; i < 3; i++) {
+            if (!moves[i]) continue;
+            il_real value = k[order - 2][i], tilt = IL_C(0.0);
+            for (int32_t p = order - 3; p >= 0; p--) {
+                tilt = tilt * s[i] + value;
+                value = value * s[i] + k[p][i];
+            }
+            slope[i] = IL_C(1.0) + s[i] * (IL_C(2.0) * value + s[i] * tilt);
+            step[i] = (s[i] * (IL_C(1.0) + s[i] * value) - a[i]) / slope[i];
+            s[i] -= step[i];
+            moves[i] = il_fabs(step[i]) > IL_C(4.0) * IL_EPSILON * il_fabs(s[i]); /* else the next one would move nothing */
         }
-        slope = IL_C(1.0) + s * (IL_C(2.0) * value + s * tilt);
-        step = (s * (IL_C(1.0) + s * value) - a) / slope;
-        s -= step;
-        if (il_fabs(step) <= IL_EPSILON * il_fabs(s)) break; /* the next one would move nothing */
     }
-    if (slope > IL_C(0.0) && il_fabs(step) <= SOLVED * (il_fabs(s) + IL_C(1.0))) return s;
-    *flags |= IL_BEYOND;
-    return il_nan();
+    for (int i = 0; i < 3; i++) {
+        const int solved = slope[i] > IL_C(0.0) && il_fabs(step[i]) <= SOLVED * (il_fabs(s[i]) + IL_C(1.0));
+        if (!solved) s[i] = slope[i] = il_nan();
+    }
+}
+
+/* The same for a unit, whose polynomials have limits. */
+static unsigned unbent(const il_tumble *t, const il_real a[3], il_real s[3]) {
+    il_real slope[3];
+    unsigned flags = 0;
+    il_tumble_solve(t->order, t->nonlinearity, a, s, slope);
+    for (int i = 0; i < 3; i++) {
+        if (!(a[i] >= t->low[i] && a[i] <= t->high[i])) s[i] = il_nan();
+        if (s[i] != s[i]) flags |= il_finite(a[i]) ? (unsigned)IL_BEYOND : (unsigned)IL_NOT_FINITE;
+    }
+    return flags;
 }
 
 /* Solve the axes together where products of two enter: each by itself, with the products at the last solution taken off,
  * again and again. An error shrinks by twice the product of cross term and specific force at a step: three or four reach the
  * last bit at 1000 ug/g^2 and 1 g. What does not come to rest lies beyond what these terms are for. */
-static unsigned crossed(const il_tumble *t, il_real s[3]) {
-    const il_real a[3] = {s[0], s[1], s[2]};
+static unsigned crossed(const il_tumble *t, const il_real a[3], il_real s[3]) {
     unsigned flags = 0;
-    il_real step = IL_C(0.0), size = IL_C(0.0);
+    il_real step = IL_C(0.0), size = IL_C(0.0), rest[3];
+    memcpy(s, a, sizeof rest);
     for (int k = 0; k < CROSS_STEPS && flags == 0; k++) {
         const il_real last[3] = {s[0], s[1], s[2]};
+        for (int i = 0; i < 3; i++) rest[i] = a[i] - t->cross[i] * last[i] * last[(i + 1) % 3];
+        flags = unbent(t, rest, s);
         step = size = IL_C(0.0);
         for (int i = 0; i < 3; i++) {
-            s[i] = unbent(t, i, a[i] - t->cross[i] * last[i] * last[(i + 1) % 3], &flags);
             step += il_fabs(s[i] - last[i]);
             size += il_fabs(s[i]);
         }
@@ -56,16 +78,13 @@ static inline unsigned tumble_sample(const il_tumble *t, il_real mx, il_real my,
                                      il_real *fz) {
     il_real x = mx * t->gain[0] - t->bias[0], y = my * t->gain[1] - t->bias[1], z = mz * t->gain[2] - t->bias[2];
     unsigned flags = il_finite(x + y + z) ? 0u : (unsigned)IL_NOT_FINITE;
-    if (t->has_cross) {
-        il_real s[3] = {x, y, z};
-        flags |= crossed(t, s);
+    if (t->has_cross || t->order > 1) {
+        const il_real a[3] = {x, y, z};
+        il_real s[3];
+        flags |= t->has_cross ? crossed(t, a, s) : unbent(t, a, s);
         x = s[0];
         y = s[1];
         z = s[2];
-    } else if (t->order > 1) {
-        x = unbent(t, 0, x, &flags);
-        y = unbent(t, 1, y, &flags);
-        z = unbent(t, 2, z, &flags);
     }
     y = y - t->misalignment[0] * x;
     z = z - t->misalignment[1] * x - t->misalignment[2] * y;

@@ -3,51 +3,15 @@
 #include <float.h>
 #include <math.h>
 
-enum { NEWTON_STEPS = 12 };
-static const double CLOSE = 1e-15;
-
-/* Value and slope of s + k2 s^2 + ... by Horner's scheme; k[3 j] is the coefficient of s^(j + 2). */
-static void polynomial(double s, const double *k, int count, double *value, double *slope) {
-    double v = k[3 * (count - 1)], d = 0.0;
-    for (int j = count - 2; j >= 0; j--) {
-        d = d * s + v;
-        v = v * s + k[3 * j];
-    }
-    *value = s * (1.0 + s * v);
-    *slope = 1.0 + s * (2.0 * v + s * d);
-}
-
-/* The s at which each axis's polynomial is a, and the slopes there, by Newton's method; NaN where it turns back before.
- *
- * The three axes step together: each step waits for a division, and the processor has three to wait for at once. */
-static void inverted(const double *a, const double *k, int count, double *s, double *slope) {
-    double value, size[3];
-    int on_its_way[3] = {count > 0, count > 0, count > 0};
-    for (int i = 0; i < 3; i++) {
-        s[i] = a[i];
-        slope[i] = 1.0;
-        size[i] = CLOSE * fmax(fabs(a[i]), 1.0);
-    }
-    for (int number = 0; number < NEWTON_STEPS && (on_its_way[0] | on_its_way[1] | on_its_way[2]); number++) {
-        for (int i = 0; i < 3; i++) {
-            polynomial(s[i], k + i, count, &value, &slope[i]);
-            const double step = (value - a[i]) / slope[i];
-            on_its_way[i] = fabs(step) > size[i];
-            s[i] -= on_its_way[i] || isnan(step) ? step : 0.0;
-        }
-    }
-    for (int i = 0; i < 3; i++) {
-        if (on_its_way[i] || isnan(s[i]) || !(slope[i] > 0.0)) s[i] = slope[i] = (double)NAN;
-    }
-}
+#include "imulab.h"
 
 static const double ALIGNED[3] = {0.0, 0.0, 0.0}; /* order 0 has no misalignment */
 
 double length(const double *theta, const double *reading, int order, double *derivative, double *f) {
-    const double *scale = theta + 3, *m = order > 0 ? theta + 6 : ALIGNED, *k = theta + 9;
+    const double *scale = theta + 3, *m = order > 0 ? theta + 6 : ALIGNED;
     double a[3], s[3], slope[3];
     for (int i = 0; i < 3; i++) a[i] = (reading[i] - theta[i]) / scale[i];
-    inverted(a, k, order - 1, s, slope);
+    il_tumble_solve(order, (const double(*)[3])(theta + 9), a, s, slope);
     f[0] = s[0];
     f[1] = s[1] - m[0] * f[0];
     f[2] = s[2] - m[1] * f[0] - m[2] * f[1];
