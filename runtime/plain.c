@@ -78,7 +78,7 @@ static il_real support(const il_array *a, il_array_axis *s, const il_real *z, in
 }
 
 /* Residuals about the mean to biases, variances and inverse-variance weights. Two gyros at a time, as in feedback.c. */
-static il_real recursion(int32_t n, il_real mean, const il_real *restrict z, const il_real *restrict gain,
+static il_real squares_loop(int32_t n, il_real mean, const il_real *restrict z, const il_real *restrict gain,
                          const il_real *restrict least, il_real *restrict bias, il_real *restrict variance,
                          il_real *restrict weight, il_real *total) {
     il_real all[2] = {IL_C(0.0), IL_C(0.0)}, sum[2] = {IL_C(0.0), IL_C(0.0)};
@@ -100,7 +100,7 @@ static il_real recursion(int32_t n, il_real mean, const il_real *restrict z, con
 }
 
 /* Gains and floors of the variances, and one more residual seen. A gyro without a reading has no gain and no weight. */
-static void experience(const il_array *a, il_array_axis *s, int32_t count, il_real *gain, il_real *least) {
+static void gains_of(const il_array *a, il_array_axis *s, int32_t count, il_real *gain, il_real *least) {
     const int32_t n = a->elements;
     il_real shared = IL_C(1.0);
     uint32_t known = 0; /* nearly always all have seen the same: one division serves */
@@ -126,13 +126,13 @@ static il_real least_squares(const il_array *a, il_array_axis *s, const il_real 
     int32_t count;
     const il_real mean = finite_mean(a, s, z, &count, want_health);
     if (count > 1) {
-        experience(a, s, count, gain, least);
+        gains_of(a, s, count, gain, least);
         if (n % 2 || count < n) {
             for (int32_t i = 0; i < n; i++) y[i] = count < n && s->flags[i] ? mean + s->bias[i] : z[i];
             y[n] = mean;
             z = y;
         }
-        const il_real rate = recursion(n, mean, z, gain, least, s->bias, s->variance, s->weight, &total);
+        const il_real rate = squares_loop(n, mean, z, gain, least, s->bias, s->variance, s->weight, &total);
         /* equal weights until every variance rests on two residuals */
         if (s->count - a->start >= 2) {
             if (total == IL_C(0.0)) return il_nan();

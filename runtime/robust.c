@@ -15,22 +15,16 @@
 #define DEVIATION IL_C(1.4826)    /* median absolute deviation to standard deviation */
 enum { MOST_CLEAN = 1 << 16 };    /* samples between two counts of each gyro */
 
-/* The chosen values, one after the other; returns how many. */
-static int32_t pick(int32_t n, const uint8_t *chosen, const il_real *values, il_real *picked) {
-    int32_t count = 0;
-    for (int32_t i = 0; i < n; i++) {
-        if (chosen[i]) picked[count++] = values[i];
-    }
-    return count;
-}
-
 /* Median of the chosen values, and their typical distance from it as a standard deviation. */
 static il_real median_of(int32_t n, const uint8_t *chosen, const il_real *values, il_real *typical) {
-    il_real picked[IL_ARRAY_ELEMENTS] = {IL_C(0.0)};
-    const int32_t count = pick(n, chosen, values, picked);
-    const il_real middle = il_median(picked, count);
-    for (int32_t i = 0; i < count; i++) picked[i] = il_fabs(picked[i] - middle);
-    *typical = DEVIATION * il_median(picked, count);
+    il_real sorted[IL_ARRAY_ELEMENTS] = {IL_C(0.0)};
+    int32_t count = 0;
+    for (int32_t i = 0; i < n; i++) {
+        if (chosen[i]) sorted[count++] = values[i];
+    }
+    const il_real middle = il_median(sorted, count);
+    for (int32_t i = 0; i < count; i++) sorted[i] = il_fabs(sorted[i] - middle);
+    *typical = DEVIATION * il_median(sorted, count);
     return middle;
 }
 
@@ -111,19 +105,6 @@ static void weigh(const il_array *a, il_array_axis *s, const il_sample *p, int32
     for (int32_t i = 0; i < a->elements; i++) s->weight[i] = i == top ? cap : s->weight[i] / rest * (IL_C(1.0) - cap);
 }
 
-/* Whether the means of a second are so near to each other that none can have jumped: half of the limit of a jump, because
- * one sample moves a variance a little. */
-static int agree(const il_array *a, const il_robust_terms *t, const il_array_axis *s, const il_sample *p) {
-    il_real picked[IL_ARRAY_ELEMENTS];
-    const il_real usual = il_median(picked, pick(a->elements, p->learns, s->fast, picked));
-    int all = 1;
-    for (int32_t i = 0; i < a->elements; i++) {
-        const il_real far = s->fast[i] - usual;
-        all &= !p->learns[i] | (far * far <= IL_C(2.0) * t->jump * p->trust[i]);
-    }
-    return all;
-}
-
 /* A jump too small for the gate shows in the mean of a second, where the others' means agree. Not while the array as a
  * whole is finding its biases; but a gyro that came back is watched at once. */
 static void find_small_jumps(const il_array *a, const il_robust_terms *t, il_array_axis *s, il_sample *p) {
@@ -196,7 +177,7 @@ static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s,
         s->variance[i] = (IL_C(1.0) - p->gain[i]) * (s->variance[i] + p->gain[i] * grubbs);
         s->fast[i] = t->keep * s->fast[i] + t->recent * (p->r_still[i] - p->rate); /* as it came */
     }
-    if (!agree(a, t, s, p)) find_small_jumps(a, t, s, p);
+    find_small_jumps(a, t, s, p);
 }
 
 /* Who is trusted, who is inside, who is used, who teaches. Returns the number used. */
@@ -291,13 +272,11 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         memset(s->flags, 0, (size_t)a->elements);
     }
     if (il_robust_learn_well(a, t, s, &p)) {
-        memset(p.learns, 1, (size_t)a->elements);
-        if (!agree(a, t, s, &p)) {
-            il_robust_settle(a, s);
-            p.learnt = il_most_seen(a, s) - 1;
-            find_small_jumps(a, t, s, &p);
-            il_robust_muster(a, s);
-        }
+        il_robust_settle(a, s);
+        p.learnt = il_most_seen(a, s) - 1;
+        memset(p.learns, 1, sizeof p.learns);
+        find_small_jumps(a, t, s, &p);
+        il_robust_muster(a, s);
     }
     il_robust_pass(t, s, p.rate);
     return p.rate;

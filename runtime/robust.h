@@ -27,7 +27,6 @@ typedef struct {
     uint8_t usable[IL_ARRAY_ELEMENTS], core[IL_ARRAY_ELEMENTS], held[IL_ARRAY_ELEMENTS], inside[IL_ARRAY_ELEMENTS];
     uint8_t excused[IL_ARRAY_ELEMENTS], learns[IL_ARRAY_ELEMENTS], used[IL_ARRAY_ELEMENTS];
     il_real r[IL_ARRAY_ROOM];        /* reading less bias */
-    il_real r_still[IL_ARRAY_ROOM];  /* the same less what moves with the rate */
     il_real trust[IL_ARRAY_ROOM];    /* variance as far as it can be trusted */
     il_real gain[IL_ARRAY_ROOM];     /* of bias and variance in this sample */
     il_real pull[IL_ARRAY_ROOM];     /* of the mean variance on this one */
@@ -42,6 +41,7 @@ typedef struct {
     il_real squares, total; /* sums of squared residuals and of weights, */
     il_real top;           /* largest weight, */
     il_real outside, bent; /* by how much a squared residual is beyond the gate, and beyond full teaching */
+    il_real r_still[IL_ARRAY_ROOM]; /* r less what moves with the rate */
     uint32_t learnt;       /* residuals of the most experienced gyro */
     int moves;             /* r_still is not r */
     int waived;            /* nobody is trusted: the quiet period does not count */

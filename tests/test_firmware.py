@@ -423,4 +423,5 @@ def test_double_never_occurs_in_the_float_build(exported, tmp_path):
         ["arm-none-eabi-nm", "-u", tmp_path / "imulab.o"], capture_output=True, text=True, check=True
     ).stdout.split()
     assert {"expf", "log1pf"} <= set(symbols)
-    assert not {name for name in symbols if name.startswith("__aeabi_") or name in ("exp", "log1p", "sqrt")}
+    counts = {"__aeabi_ul2f"}  # whole numbers of 64 bits to float
+    assert not {n for n in symbols if n.startswith("__aeabi_") or n in ("exp", "log1p", "sqrt")} - counts

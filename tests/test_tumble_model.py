@@ -1,9 +1,15 @@
 """The inverse model and its derivatives against equations transcribed apart."""
 
+from dataclasses import replace
+from decimal import Decimal, getcontext
+
 import numpy as np
 import pytest
 
+import madeup
 from imulab.estimate import levenberg_marquardt
+from imulab.runtime import Unit
+from imulab.tables import tables_of
 from imulab.tumble.model import (
     fit_lengths,
     invert,
@@ -49,6 +55,34 @@ def test_an_axis_that_gives_no_such_output_leaves_the_others_alone():
     found = invert(np.array([[0.3, -0.7, 0.9], [0.3, -0.7, 1.1]]), np.zeros(3), k).force
     np.testing.assert_allclose(found[0], [0.3, -0.7, 2 - 2 * np.sqrt(0.1)], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(found[1], [0.3, -0.7, np.nan])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+def test_the_unit_inverts_the_law_that_was_fitted_to_the_last_bit(order):
+    record = madeup.tumble(order)
+    flat = {
+        name: 1.0 if name.startswith("scale") else 0.0 for name in record.parameters if name[:4] in ("scal", "bias")
+    }
+    parameters = {n: replace(p, value=flat.get(n, p.value)) for n, p in record.parameters.items()}
+    unit = Unit.of(*tables_of(replace(record, parameters=parameters)))
+    reading = np.random.default_rng(order).uniform(-25.0, 25.0, (20_000, 3))
+    k = np.array([[parameters[f"k{j}_{a}"].value for a in "xyz"] for j in range(2, order + 1)]).reshape(order - 1, 3)
+    fitted = invert(reading, np.array([parameters[f"misalignment_{p}"].value for p in ("yx", "zx", "zy")]), k).force
+    applied, _ = unit.tumble(list(reading.T))
+    assert np.isfinite(fitted).all()
+    np.testing.assert_array_equal(np.column_stack(applied), fitted)
+
+
+def test_the_second_order_is_inverted_to_the_last_digits_up_to_the_turning_point():
+    """Against 50 digits. Where the slope is small, rounding of the reading is worth 1 / slope of it in the force."""
+    k = np.concatenate([[-0.25, 0.0, 1e-300, 1e-9], np.random.default_rng(2).uniform(-0.3, 0.3, 200)])
+    share = np.concatenate([[0.999999, 0.5, -3.0, 1.0], np.random.default_rng(3).uniform(-1.0, 0.9999, 200)])
+    reading = np.where(np.abs(k) > 1e-6, -share / np.where(k == 0.0, 1.0, 4 * k), share)
+    found = invert(np.repeat(reading[:, None], 3, axis=1), np.zeros(3), np.repeat(k[:, None, None], 3, axis=2)).force
+    getcontext().prec = 50
+    for a, k2, s in zip(reading.tolist(), k.tolist(), found[:, 0].tolist(), strict=True):
+        slope = (1 + 4 * Decimal(k2) * Decimal(a)).sqrt()
+        assert s == pytest.approx(float(2 * Decimal(a) / (1 + slope)), rel=4e-16 / float(slope))
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])

@@ -158,6 +158,44 @@ static void outputs_beyond_a_turning_point_have_no_force(void) {
     CHECK(isnan(force[0]));
 }
 
+/* s + k2 s^2 = a: with small whole numbers and a power of two a is exact, and the closed form must give s back. */
+static void second_order_is_solved_in_closed_form(void) {
+    const il_real k2 = REAL(-0.0078125), top = REAL(32); /* turns at s = 64, where it is 32 */
+    for (int i = -2000; i < 64; i++) {
+        const il_real s = REAL(i), a[3] = {s + k2 * s * s, -(s + k2 * s * s), REAL(0)}, k[1][3] = {{k2, -k2, k2}};
+        const il_real slope = REAL(1) + REAL(2) * k2 * s;
+        il_real found[3], slopes[3];
+        il_tumble_solve(2, k, a, found, slopes);
+        CHECK_CLOSE(found[0], s, ROUNDING_LIMIT * REAL(1 + abs(i)));
+        CHECK(found[1] == -found[0] && found[2] == REAL(0) && slopes[2] == REAL(1));
+        CHECK_CLOSE(slopes[0], slope, ROUNDING_LIMIT * REAL(100));
+        /* Newton's method, which orders above the second take, finds the same where it has steps enough. */
+        const il_real more[2][3] = {{k2, -k2, k2}, {REAL(0), REAL(0), REAL(0)}};
+        il_real newton[3];
+        il_tumble_solve(3, more, a, newton, slopes);
+        if (i > -1000 && i < 60) CHECK_CLOSE(newton[0], found[0], ROUNDING_LIMIT * REAL(1000));
+    }
+    /* Without a second order the output is the solution, to the last bit. */
+    const il_real straight[1][3] = {{REAL(0), REAL(0), REAL(0)}}, any[3] = {REAL(0.1), REAL(-3e30), REAL(1e-30)};
+    il_real found[3], slopes[3];
+    il_tumble_solve(2, straight, any, found, slopes);
+    CHECK_SAME(found, any, 3);
+    /* At the turning point, beyond it, where the square is beyond all numbers, and for what is not a number. */
+    const il_real huge[1][3] = {{REAL(1e30), REAL(0), REAL(0)}};
+    const il_real far[3] = {IS_FLOAT ? REAL(1e30) : REAL(1e300), NAN_REAL, INF_REAL};
+    const il_real bends[1][3] = {{k2, k2, k2}}, beyond[3] = {top, REAL(33), INF_REAL};
+    il_tumble_solve(2, huge, far, found, slopes);
+    for (int i = 0; i < 3; i++) CHECK(isnan(found[i]) && isnan(slopes[i]));
+    il_tumble_solve(2, bends, beyond, found, slopes);
+    for (int i = 0; i < 3; i++) CHECK(isnan(found[i]) && isnan(slopes[i]));
+    const il_tumble t = bent(2, k2, REAL(-1e30), top);
+    il_real force[3];
+    const il_real at_top[3] = {top, REAL(0), REAL(0)}, none[3] = {NAN_REAL, REAL(0), REAL(0)}, below[3] = {REAL(31.99), REAL(0), REAL(0)};
+    CHECK(il_tumble_apply(&t, at_top, force) == (unsigned)IL_BEYOND && isnan(force[0]));
+    CHECK(il_tumble_apply(&t, none, force) == (unsigned)IL_NOT_FINITE && isnan(force[0]));
+    CHECK(il_tumble_apply(&t, below, force) == 0 && force[0] < REAL(64) && force[0] > REAL(62));
+}
+
 static il_gyro golden_gyro(int sensitive) {
     il_gyro g;
     g.has_sensitivity = sensitive;
@@ -292,6 +330,7 @@ void test_triads(void) {
     tumble_blocks_equal_single_samples();
     what_is_not_a_number_stays_where_it_reaches();
     outputs_beyond_a_turning_point_have_no_force();
+    second_order_is_solved_in_closed_form();
     gyro_equals_the_equations();
     gyro_corners();
     centrifuge_equals_the_equations();

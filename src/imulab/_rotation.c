@@ -1,9 +1,7 @@
 /* Turns: rotations composed step by step, and what they make of errors of the rate (rotation.py has the equations). */
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "buffers.h"
+
 #include <math.h>
-#include <stdint.h>
 
 typedef struct {
     double w, x, y, z;
@@ -62,11 +60,10 @@ static PyObject *turns(PyObject *module, PyObject *args) {
     if (!PyArg_ParseTuple(args, "y*y*y*y*w*w*", &v[ANGLE], &v[WEIGHTS], &v[START], &v[STOP], &v[MATRIX], &v[SUMS])) {
         return NULL;
     }
-    const Py_ssize_t one = (Py_ssize_t)sizeof(double), n = v[ANGLE].len / one / 3, m = v[START].len / (Py_ssize_t)sizeof(int64_t);
-    const Py_ssize_t k = n > 0 ? v[WEIGHTS].len / one / n : 0;
+    const Py_ssize_t n = v[ANGLE].len / ONE / 3, m = v[START].len / INDEX, k = n > 0 ? v[WEIGHTS].len / ONE / n : 0;
     const int64_t *start = v[START].buf, *stop = v[STOP].buf;
-    int fits = v[ANGLE].len == 3 * n * one && v[WEIGHTS].len == n * k * one && v[STOP].len == v[START].len &&
-               v[MATRIX].len == 9 * m * one && v[SUMS].len == 9 * m * k * one;
+    int fits = v[ANGLE].len == 3 * n * ONE && v[WEIGHTS].len == n * k * ONE && v[STOP].len == v[START].len &&
+               v[MATRIX].len == 9 * m * ONE && v[SUMS].len == 9 * m * k * ONE;
     for (Py_ssize_t i = 0; fits && i < m; i++) fits = 0 <= start[i] && start[i] <= stop[i] && stop[i] <= n;
     if (fits) {
         const double *angle = v[ANGLE].buf, *weights = v[WEIGHTS].buf;
@@ -78,17 +75,8 @@ static PyObject *turns(PyObject *module, PyObject *args) {
         }
         Py_END_ALLOW_THREADS
     }
-    for (int i = 0; i < BUFFERS; i++) PyBuffer_Release(&v[i]);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "buffers that do not go together, or a segment beyond the steps");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    static const char wrong[] = "buffers that do not go together, or a segment beyond the steps";
+    return released(v, BUFFERS, fits, wrong) ? Py_NewRef(Py_None) : NULL;
 }
 
-static PyMethodDef methods[] = {{"turns", turns, METH_VARARGS, turns_doc}, {NULL, NULL, 0, NULL}};
-
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_rotation", "Rotations composed step by step.", 0, methods, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__rotation(void) { return PyModule_Create(&definition); }
+MODULE(_rotation, "Rotations composed step by step.", METHOD(turns))

@@ -1,15 +1,11 @@
-/* Python face of the C core: buffers in, buffers out, the interpreter's lock released, no arithmetic.
- *
- * Written on the limited API, so that one binary serves every Python from 3.11 on.
- */
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+/* Python face of the C core: buffers in, buffers out, the interpreter's lock released, no arithmetic. */
+#include "buffers.h"
 
 #include "imulab.h"
 
 enum { MOST = 512 }; /* columns in one call */
 #define CAPSULE "imulab.unit"
+#define READ(columns) ((const il_real *const *)(columns)) /* which are not written to */
 
 typedef struct {
     il_unit unit;
@@ -133,10 +129,9 @@ static PyObject *tumble(PyObject *self, PyObject *args) {
     if (!PyArg_ParseTuple(args, "OOO", &capsule, &outputs, &forces)) return NULL;
     il_unit *unit = unit_of(capsule, IL_HAS_TUMBLE);
     if (unit != NULL && columns_of(&b, outputs, 3, &n, 0, 0, in) && columns_of(&b, forces, 3, &n, 1, 0, out)) {
-        const il_real *from[3] = {in[0], in[1], in[2]};
         unsigned flags;
         Py_BEGIN_ALLOW_THREADS
-        flags = il_tumble_block(&unit->tumble, (size_t)n, from, 1, out, 1);
+        flags = il_tumble_block(&unit->tumble, (size_t)n, READ(in), 1, out, 1);
         Py_END_ALLOW_THREADS
         result = PyLong_FromUnsignedLong(flags);
     }
@@ -155,10 +150,9 @@ static PyObject *gyro(PyObject *self, PyObject *args) {
     int given = forces != Py_None;
     if (unit != NULL && columns_of(&b, outputs, 3, &n, 0, 0, in) &&
         (!given || columns_of(&b, forces, 3, &n, 0, 0, force)) && columns_of(&b, rates, 3, &n, 1, 0, out)) {
-        const il_real *from[3] = {in[0], in[1], in[2]}, *with[3] = {force[0], force[1], force[2]};
         unsigned flags;
         Py_BEGIN_ALLOW_THREADS
-        flags = il_gyro_block(&unit->gyro, (size_t)n, from, given ? with : NULL, 1, out, 1);
+        flags = il_gyro_block(&unit->gyro, (size_t)n, READ(in), given ? READ(force) : NULL, 1, out, 1);
         Py_END_ALLOW_THREADS
         result = PyLong_FromUnsignedLong(flags);
     }
@@ -175,10 +169,9 @@ static PyObject *centrifuge(PyObject *self, PyObject *args) {
     if (!PyArg_ParseTuple(args, "OOO", &capsule, &forces, &rates)) return NULL;
     il_unit *unit = unit_of(capsule, IL_HAS_CENTRIFUGE);
     if (unit != NULL && columns_of(&b, forces, 2, &n, 0, 0, force) && columns_of(&b, rates, 2, &n, 1, 1, rate)) {
-        const il_real *under[2] = {force[0], force[1]};
         unsigned flags;
         Py_BEGIN_ALLOW_THREADS
-        flags = il_centrifuge_block(&unit->centrifuge, (size_t)n, under, rate);
+        flags = il_centrifuge_block(&unit->centrifuge, (size_t)n, READ(force), rate);
         Py_END_ALLOW_THREADS
         result = PyLong_FromUnsignedLong(flags);
     }
@@ -192,7 +185,6 @@ static PyObject *warmup(PyObject *self, PyObject *args) {
     double temperature, tick;
     buffers b = {.count = 0};
     il_real *in[MOST], *out[MOST];
-    const il_real *from[MOST];
     if (!PyArg_ParseTuple(args, "OddOOOO", &capsule, &temperature, &tick, &ticks, &inputs, &factors, &outputs)) return NULL;
     il_unit *unit = unit_of(capsule, IL_HAS_WARMUP);
     if (unit == NULL) return NULL;
@@ -207,12 +199,9 @@ static PyObject *warmup(PyObject *self, PyObject *args) {
     if (factor != NULL && columns_of(&b, inputs, axes, &n, 0, 1, in) && columns_of(&b, outputs, axes, &n, 1, 1, out)) {
         il_warmup_state state;
         il_status status = il_warmup_start(&unit->warmup, &state, temperature, tick);
-        for (int i = 0; i < axes; i++) {
-            from[i] = in[i];
-            if (in[i] == NULL) out[i] = NULL;
-        }
+        for (int i = 0; i < axes; i++) out[i] = in[i] == NULL ? NULL : out[i];
         Py_BEGIN_ALLOW_THREADS
-        if (status == IL_OK) il_warmup_block(&unit->warmup, &state, (size_t)n, when, from, factor, out);
+        if (status == IL_OK) il_warmup_block(&unit->warmup, &state, (size_t)n, when, READ(in), factor, out);
         Py_END_ALLOW_THREADS
         if (status != IL_OK) PyErr_SetString(PyExc_ValueError, il_status_text(status));
         else result = PyBool_FromLong(state.active);
@@ -273,21 +262,12 @@ static PyObject *array_block(PyObject *self, PyObject *args) {
     return result;
 }
 
-static PyMethodDef METHODS[] = {
-    {"load", load, METH_VARARGS, "load(bytes): a checked table; ValueError says what is wrong with it."},
-    {"has", has, METH_O, "has(unit): bits of the sections that a table holds."},
-    {"tumble", tumble, METH_VARARGS, "tumble(unit, outputs, forces): flags; tuples of three float64 columns."},
-    {"gyro", gyro, METH_VARARGS, "gyro(unit, outputs, forces or None, rates): flags."},
-    {"centrifuge", centrifuge, METH_VARARGS, "centrifuge(unit, forces, rates): flags; rates are changed in place."},
-    {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, inputs, factors, outputs): whether the table covers it."},
-    {"array_start", array_start, METH_O, "array_start(unit): the state of a stream, as a bytearray."},
-    {"array_block", array_block, METH_VARARGS, "array_block(unit, state, readings, still, rates, flags, weights): flags met."},
-    {NULL, NULL, 0, NULL},
-};
-
-static struct PyModuleDef MODULE = {
-    PyModuleDef_HEAD_INIT, "_runtime", "The C core of imulab.", 0, METHODS, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__runtime(void) {
-    return PyModule_Create(&MODULE);
-}
+MODULE(_runtime, "The C core of imulab.",
+       {"load", load, METH_VARARGS, "load(bytes): a checked table; ValueError says what is wrong with it."},
+       {"has", has, METH_O, "has(unit): bits of the sections that a table holds."},
+       {"tumble", tumble, METH_VARARGS, "tumble(unit, outputs, forces): flags; tuples of three float64 columns."},
+       {"gyro", gyro, METH_VARARGS, "gyro(unit, outputs, forces or None, rates): flags."},
+       {"centrifuge", centrifuge, METH_VARARGS, "centrifuge(unit, forces, rates): flags; rates are changed in place."},
+       {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, inputs, factors, outputs): whether the table covers it."},
+       {"array_start", array_start, METH_O, "array_start(unit): the state of a stream, as a bytearray."},
+       {"array_block", array_block, METH_VARARGS, "array_block(unit, state, readings, still, rates, flags, weights): flags met."})

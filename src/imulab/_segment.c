@@ -4,24 +4,13 @@
  * What each is for stands there. A sweep of the threshold passes a few times over a few thousand blocks: as calls on
  * arrays of that size it took longer than as loops. The plain form is tests/reference/segment.py.
  */
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "buffers.h"
+
 #include <math.h>
-#include <stdint.h>
 #include <string.h>
 
 enum { AXES = 3, MOMENTS = 9, COEFFICIENTS = 9, FEWEST_ATTITUDES = 11 };
 static const double DEFINED = 1e-6, LEAST_LEFT = 1e-9;
-static const Py_ssize_t ONE = (Py_ssize_t)sizeof(double), INDEX = (Py_ssize_t)sizeof(int64_t);
-
-/* Release the buffers and return None, or raise where they do not go together. */
-static PyObject *done(Py_buffer *buffers, int count, int fits) {
-    for (int i = 0; i < count; i++) PyBuffer_Release(&buffers[i]);
-    if (fits) Py_RETURN_NONE;
-    PyErr_SetString(PyExc_ValueError, "buffers that do not go together");
-    return NULL;
-}
 
 /* Mean and mean squared scatter of each block, from its first sample on: equal samples have a scatter of exactly 0.
  * Even and odd samples have sums of their own, since a sum cannot go on before the last is there. */
@@ -158,10 +147,7 @@ static PyObject *stretches(PyObject *module, PyObject *args) {
             stop[found++] = end - trim;
         }
     }
-    PyObject *nothing = done(v, BUFFERS, fits);
-    if (nothing == NULL) return NULL;
-    Py_DECREF(nothing);
-    return PyLong_FromSsize_t(found);
+    return released(v, BUFFERS, fits, APART) ? PyLong_FromSsize_t(found) : NULL;
 }
 
 /* Mean of the blocks from start to stop. */
@@ -231,10 +217,7 @@ static PyObject *attitudes(PyObject *module, PyObject *args) {
             for (int axis = 0; axis < AXES; axis++) mean[AXES * found + axis] = total[axis] / size;
         }
     }
-    PyObject *nothing = done(v, BUFFERS, fits);
-    if (nothing == NULL) return NULL;
-    Py_DECREF(nothing);
-    return PyLong_FromSsize_t(found);
+    return released(v, BUFFERS, fits, APART) ? PyLong_FromSsize_t(found) : NULL;
 }
 
 /* Q of a QR decomposition of (n, 9) in place, by Gram and Schmidt's method twice over; false if the columns depend. */
@@ -439,16 +422,5 @@ static PyObject *motion(PyObject *module, PyObject *args) {
     return done(v, BUFFERS, fits);
 }
 
-static PyMethodDef methods[] = {{"blocks", blocks, METH_VARARGS, blocks_doc},
-                                {"windows", windows, METH_VARARGS, windows_doc},
-                                {"stretches", stretches, METH_VARARGS, stretches_doc},
-                                {"attitudes", attitudes, METH_VARARGS, attitudes_doc},
-                                {"ellipsoid_error", ellipsoid_error, METH_VARARGS, ellipsoid_error_doc},
-                                {"batches", batches, METH_VARARGS, batches_doc},
-                                {"motion", motion, METH_VARARGS, motion_doc},
-                                {NULL, NULL, 0, NULL}};
-
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_segment", "The inner loops of segmentation.", 0, methods, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__segment(void) { return PyModule_Create(&definition); }
+MODULE(_segment, "The inner loops of segmentation.", METHOD(blocks), METHOD(windows), METHOD(stretches), METHOD(attitudes),
+       METHOD(ellipsoid_error), METHOD(batches), METHOD(motion))

@@ -20,12 +20,16 @@ from imulab.files import replacing
 from imulab.packing import KINDS, Field, Table
 from imulab.printable import printable
 
+_HEADERS = ("real.h", "array.h", "robust.h")
 _CORE = (
     "tumble.c",
     "centrifuge.c",
     "warmup.c",
     "array.c",
+    "plain.c",
+    "feedback.c",
     "robust.c",
+    "robust_standing.c",
     "robust_well.c",
     "robust_motion.c",
     "table.c",
@@ -95,7 +99,7 @@ def _header(tables: Sequence[Table]) -> str:
 def _amalgamation() -> str:
     """The core's sources as one file, so that a project has one to add."""
     parts = ["/* The core of imulab in one file; the same for every unit. */\n", '#include "imulab.h"\n']
-    for name in ("real.h", "array.h", "robust.h", *_CORE):
+    for name in (*_HEADERS, *_CORE):
         parts += [f"\n/* ==== {name} ==== */\n", _OWN_INCLUDE.sub("", _source(name))]
     return "".join(parts)
 

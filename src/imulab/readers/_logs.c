@@ -3,10 +3,8 @@
  * A log is a chain of records, each known only from the one before. The chain is followed here; NumPy then takes
  * the fixed-size payloads out at the offsets found. Every length is checked against the end of the block first.
  */
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
-#include <stdint.h>
+#include "buffers.h"
+
 #include <string.h>
 
 enum { ULOG = 0, DATAFLASH = 1, MCAP = 2, ROSBAG = 3 };
@@ -111,20 +109,23 @@ PyDoc_STRVAR(walk_doc,
              "status 0: the rest is no whole record, 1: the arrays are full, 2: what is there is no record.");
 
 static PyObject *walk(PyObject *module, PyObject *args) {
-    Py_buffer block, lengths, offsets, sizes, keys;
+    enum { BLOCK, LENGTHS, OFFSETS, SIZES, KEYS, BUFFERS };
+    Py_buffer v[BUFFERS];
     int kind;
     Py_ssize_t start;
     (void)module;
-    if (!PyArg_ParseTuple(args, "iy*nw*w*w*w*", &kind, &block, &start, &lengths, &offsets, &sizes, &keys)) return NULL;
-    Py_ssize_t capacity = offsets.len < sizes.len ? offsets.len : sizes.len;
-    if (keys.len < capacity) capacity = keys.len;
-    capacity /= (Py_ssize_t)sizeof(int64_t);
-    int64_t *offset = offsets.buf, *size = sizes.buf, *key = keys.buf;
-    const int fits = start >= 0 && start <= block.len && lengths.len >= 256 && kind >= ULOG && kind <= ROSBAG;
+    if (!PyArg_ParseTuple(args, "iy*nw*w*w*w*", &kind, &v[BLOCK], &start, &v[LENGTHS], &v[OFFSETS], &v[SIZES], &v[KEYS])) {
+        return NULL;
+    }
+    Py_ssize_t capacity = v[OFFSETS].len < v[SIZES].len ? v[OFFSETS].len : v[SIZES].len;
+    if (v[KEYS].len < capacity) capacity = v[KEYS].len;
+    capacity /= INDEX;
+    int64_t *offset = v[OFFSETS].buf, *size = v[SIZES].buf, *key = v[KEYS].buf;
+    const int fits = start >= 0 && start <= v[BLOCK].len && v[LENGTHS].len >= 256 && kind >= ULOG && kind <= ROSBAG;
     Py_ssize_t count = 0;
     int status = MORE;
     if (fits) {
-        const Block b = {block.buf, (uint64_t)block.len};
+        const Block b = {v[BLOCK].buf, (uint64_t)v[BLOCK].len};
         uint64_t at = (uint64_t)start;
         Record r = {0, 0, 0, 0};
         for (;;) {
@@ -133,7 +134,7 @@ static PyObject *walk(PyObject *module, PyObject *args) {
                 break;
             }
             status = kind == ULOG        ? ulog(b, at, &r)
-                     : kind == DATAFLASH ? dataflash(b, at, lengths.buf, &r)
+                     : kind == DATAFLASH ? dataflash(b, at, v[LENGTHS].buf, &r)
                      : kind == MCAP      ? mcap(b, at, &r)
                                          : rosbag(b, at, &r);
             if (status != FULL) break;
@@ -145,21 +146,8 @@ static PyObject *walk(PyObject *module, PyObject *args) {
         }
         start = (Py_ssize_t)at;
     }
-    PyBuffer_Release(&block);
-    PyBuffer_Release(&lengths);
-    PyBuffer_Release(&offsets);
-    PyBuffer_Release(&sizes);
-    PyBuffer_Release(&keys);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "no such kind of log, a start outside the block, or a short table of lengths");
-        return NULL;
-    }
-    return Py_BuildValue("nni", count, start, status);
+    static const char wrong[] = "no such kind of log, a start outside the block, or a short table of lengths";
+    return released(v, BUFFERS, fits, wrong) ? Py_BuildValue("nni", count, start, status) : NULL;
 }
 
-static PyMethodDef methods[] = {{"walk", walk, METH_VARARGS, walk_doc}, {NULL, NULL, 0, NULL}};
-
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_logs", "Where the messages are in a log.", 0, methods, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__logs(void) { return PyModule_Create(&definition); }
+MODULE(_logs, "Where the messages are in a log.", METHOD(walk))

@@ -7,12 +7,10 @@
  * help: N. Mushtak and D. Lemire, "Fast number parsing without fallback", 2023). Everything else goes through Python's
  * own correctly rounded conversion. The interpreter is let go while a block is read, so that threads can share a file.
  */
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "buffers.h"
+
 #include <float.h>
 #include <math.h>
-#include <stdint.h>
 #include <string.h>
 
 enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 400 }; /* 3: NOT_A_DATE */
@@ -294,26 +292,27 @@ PyDoc_STRVAR(parse_doc,
              "line from `start`. The interpreter is released: threads may fill different rows.");
 
 static PyObject *parse(PyObject *module, PyObject *args) {
-    Py_buffer block, slots, out;
+    enum { BLOCK, SLOTS, OUT, BUFFERS };
+    Py_buffer v[BUFFERS];
     int delimiter;
     Py_ssize_t capacity, start = 0, last = -1, row = 0;
     (void)module;
-    if (!PyArg_ParseTuple(args, "y*Cy*w*n|nnn", &block, &delimiter, &slots, &out, &capacity, &start, &last, &row)) {
+    if (!PyArg_ParseTuple(args, "y*Cy*w*n|nnn", &v[BLOCK], &delimiter, &v[SLOTS], &v[OUT], &capacity, &start, &last, &row)) {
         return NULL;
     }
-    if (last < 0) last = block.len;
-    Task t = {NULL, slots.buf, out.buf, slots.len / (Py_ssize_t)sizeof(int32_t), capacity, (char)delimiter, 0, NULL};
+    if (last < 0) last = v[BLOCK].len;
+    Task t = {NULL, v[SLOTS].buf, v[OUT].buf, v[SLOTS].len / (Py_ssize_t)sizeof(int32_t), capacity, (char)delimiter, 0, NULL};
     Py_ssize_t rows = 0, found = 0;
     int problem = OK, fits = prepared && capacity >= 0 && delimiter > 0 && delimiter < 128 && start >= 0 &&
-                             start <= last && last <= block.len && row >= 0;
+                             start <= last && last <= v[BLOCK].len && row >= 0;
     for (Py_ssize_t i = 0; fits && i < t.fields; i++) {
-        const Py_ssize_t columns = out.len / (Py_ssize_t)sizeof(double) / (capacity > 0 ? capacity : 1);
+        const Py_ssize_t columns = v[OUT].len / ONE / (capacity > 0 ? capacity : 1);
         fits = t.slots[i] < 0 || (t.slots[i] & ~DATE) < columns;
         t.dated |= t.slots[i] >= 0 && (t.slots[i] & DATE);
     }
     if (fits) {
-        const char *p = (const char *)block.buf + start;
-        t.end = (const char *)block.buf + last;
+        const char *p = (const char *)v[BLOCK].buf + start;
+        t.end = (const char *)v[BLOCK].buf + last;
         t.thread = PyEval_SaveThread();
         while (p < t.end) {
             if (row + rows >= capacity) {
@@ -334,14 +333,8 @@ static PyObject *parse(PyObject *module, PyObject *args) {
         PyEval_RestoreThread(t.thread);
         if (problem == OK && rows > 0) found = t.fields;
     }
-    PyBuffer_Release(&block);
-    PyBuffer_Release(&slots);
-    PyBuffer_Release(&out);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the output buffer is too small for the block, or the delimiter is not ASCII");
-        return NULL;
-    }
-    return Py_BuildValue("nin", rows, problem, found);
+    static const char wrong[] = "the output buffer is too small for the block, or the delimiter is not ASCII";
+    return released(v, BUFFERS, fits, wrong) ? Py_BuildValue("nin", rows, problem, found) : NULL;
 }
 
 PyDoc_STRVAR(prepare_doc, "prepare(fives)\n\n5^q for q = -342 .. 308, scaled to 128 bits: high and low half of each (uint64).");
@@ -355,20 +348,7 @@ static PyObject *prepare(PyObject *module, PyObject *args) {
         memcpy(fives, table.buf, sizeof fives);
         prepared = 1;
     }
-    PyBuffer_Release(&table);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "expected 651 numbers of 128 bits");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return released(&table, 1, fits, "expected 651 numbers of 128 bits") ? Py_NewRef(Py_None) : NULL;
 }
 
-static PyMethodDef methods[] = {{"parse", parse, METH_VARARGS, parse_doc},
-                                {"choose", choose, METH_VARARGS, choose_doc},
-                                {"prepare", prepare, METH_VARARGS, prepare_doc},
-                                {NULL, NULL, 0, NULL}};
-
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_text", "Numbers out of delimited text.", 0, methods, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__text(void) { return PyModule_Create(&definition); }
+MODULE(_text, "Numbers out of delimited text.", METHOD(parse), METHOD(choose), METHOD(prepare))

@@ -161,12 +161,12 @@ PyObject *fit(PyObject *module, PyObject *args) {
                           &tolerance, &most, &v[RESIDUALS], &v[JACOBIAN], &v[ITERATIONS], &v[CONVERGED])) {
         return NULL;
     }
-    const Py_ssize_t one = (Py_ssize_t)sizeof(double), problems = v[CONVERGED].len, p = 3 * ((Py_ssize_t)order + 2);
-    const Py_ssize_t n = problems > 0 ? v[WEIGHTS].len / one / problems : 0;
-    const int fits = order >= 0 && v[THETA].len == problems * p * one && v[WEIGHTS].len == problems * n * one &&
+    const Py_ssize_t problems = v[CONVERGED].len, p = 3 * ((Py_ssize_t)order + 2);
+    const Py_ssize_t n = problems > 0 ? v[WEIGHTS].len / ONE / problems : 0;
+    const int fits = order >= 0 && v[THETA].len == problems * p * ONE && v[WEIGHTS].len == problems * n * ONE &&
                      v[LENGTHENING].len == v[WEIGHTS].len && v[RESIDUALS].len == v[WEIGHTS].len &&
-                     v[JACOBIAN].len == v[WEIGHTS].len * p && v[ITERATIONS].len == problems * (Py_ssize_t)sizeof(int64_t) &&
-                     (v[READING].len == 3 * n * one || v[READING].len == 3 * v[WEIGHTS].len);
+                     v[JACOBIAN].len == v[WEIGHTS].len * p && v[ITERATIONS].len == problems * INDEX &&
+                     (v[READING].len == 3 * n * ONE || v[READING].len == 3 * v[WEIGHTS].len);
     double *room = fits ? PyMem_Malloc(sizeof(double) * needed((size_t)n, (size_t)p)) : NULL;
     if (room != NULL) {
         const Py_ssize_t next = v[READING].len == 3 * v[WEIGHTS].len ? 3 * n : 0;
@@ -189,13 +189,8 @@ PyObject *fit(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS
         PyMem_Free(room);
     }
-    for (int i = 0; i < BUFFERS; i++) PyBuffer_Release(&v[i]);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "buffers that do not go together");
-        return NULL;
-    }
-    if (room == NULL) return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    if (!released(v, BUFFERS, fits, APART)) return NULL;
+    return room == NULL ? PyErr_NoMemory() : Py_NewRef(Py_None);
 }
 
 /* Fit all attitudes but one, for each of them, from the common start `all`, and take the residual of the one.
@@ -239,8 +234,8 @@ PyObject *left_out(PyObject *module, PyObject *args) {
                           &most, &v[ERRORS])) {
         return NULL;
     }
-    const Py_ssize_t one = (Py_ssize_t)sizeof(double), p = 3 * ((Py_ssize_t)order + 2), n = v[ERRORS].len / one;
-    const int fits = order >= 0 && v[THETA].len == p * one && v[READING].len == 3 * n * one && v[ERRORS].len == n * one &&
+    const Py_ssize_t p = 3 * ((Py_ssize_t)order + 2), n = v[ERRORS].len / ONE;
+    const int fits = order >= 0 && v[THETA].len == p * ONE && v[READING].len == 3 * n * ONE && v[ERRORS].len == n * ONE &&
                      v[WEIGHTS].len == v[ERRORS].len && v[LENGTHENING].len == v[ERRORS].len;
     double *room = fits ? PyMem_Malloc(sizeof(double) * (2 * needed((size_t)n, (size_t)p) + (size_t)n)) : NULL;
     if (room != NULL) {
@@ -256,11 +251,6 @@ PyObject *left_out(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS
         PyMem_Free(room);
     }
-    for (int i = 0; i < BUFFERS; i++) PyBuffer_Release(&v[i]);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "buffers that do not go together");
-        return NULL;
-    }
-    if (room == NULL) return PyErr_NoMemory();
-    Py_RETURN_NONE;
+    if (!released(v, BUFFERS, fits, APART)) return NULL;
+    return room == NULL ? PyErr_NoMemory() : Py_NewRef(Py_None);
 }

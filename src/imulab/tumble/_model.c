@@ -45,38 +45,29 @@ PyDoc_STRVAR(lengths_doc,
              "f (b, n, 3); float64 buffers without gaps.");
 
 static PyObject *lengths(PyObject *module, PyObject *args) {
-    Py_buffer theta, reading, norm, jacobian, force;
+    enum { THETA, READING, NORM, JACOBIAN, FORCE, BUFFERS };
+    Py_buffer v[BUFFERS];
     int order;
     (void)module;
-    if (!PyArg_ParseTuple(args, "y*y*iw*w*w*", &theta, &reading, &order, &norm, &jacobian, &force)) return NULL;
-    const Py_ssize_t one = (Py_ssize_t)sizeof(double), p = 3 * ((Py_ssize_t)order + 2);
-    const Py_ssize_t problems = order >= 0 ? theta.len / one / p : 0;
-    const Py_ssize_t n = problems > 0 ? norm.len / one / problems : 0;
-    const int fits = order >= 0 && theta.len == problems * p * one && norm.len == problems * n * one &&
-                     jacobian.len == norm.len * p && force.len == norm.len * 3 &&
-                     (reading.len == n * 3 * one || reading.len == force.len);
+    if (!PyArg_ParseTuple(args, "y*y*iw*w*w*", &v[THETA], &v[READING], &order, &v[NORM], &v[JACOBIAN], &v[FORCE])) return NULL;
+    const Py_ssize_t p = 3 * ((Py_ssize_t)order + 2), problems = order >= 0 ? v[THETA].len / ONE / p : 0;
+    const Py_ssize_t n = problems > 0 ? v[NORM].len / ONE / problems : 0;
+    const int fits = order >= 0 && v[THETA].len == problems * p * ONE && v[NORM].len == problems * n * ONE &&
+                     v[JACOBIAN].len == v[NORM].len * p && v[FORCE].len == v[NORM].len * 3 &&
+                     (v[READING].len == n * 3 * ONE || v[READING].len == v[FORCE].len);
     if (fits) {
-        const Py_ssize_t next = reading.len == force.len ? 3 * n : 0;
-        const double *t = theta.buf, *r = reading.buf;
-        double *length_of = norm.buf, *derivative = jacobian.buf, *f = force.buf;
+        const Py_ssize_t next = v[READING].len == v[FORCE].len ? 3 * n : 0;
+        const double *theta = v[THETA].buf, *reading = v[READING].buf;
+        double *norm = v[NORM].buf, *derivative = v[JACOBIAN].buf, *force = v[FORCE].buf;
         Py_BEGIN_ALLOW_THREADS
-        for (Py_ssize_t b = 0; b < problems; b++, t += p, r += next) {
-            for (Py_ssize_t i = 0; i < n; i++, derivative += p, f += 3) {
-                *length_of++ = length(t, r + 3 * i, order, derivative, f);
+        for (Py_ssize_t b = 0; b < problems; b++, theta += p, reading += next) {
+            for (Py_ssize_t i = 0; i < n; i++, derivative += p, force += 3) {
+                *norm++ = length(theta, reading + 3 * i, order, derivative, force);
             }
         }
         Py_END_ALLOW_THREADS
     }
-    PyBuffer_Release(&theta);
-    PyBuffer_Release(&reading);
-    PyBuffer_Release(&norm);
-    PyBuffer_Release(&jacobian);
-    PyBuffer_Release(&force);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "buffers that do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return done(v, BUFFERS, fits);
 }
 
 PyDoc_STRVAR(noise_doc,
@@ -104,16 +95,16 @@ static PyObject *noise(PyObject *module, PyObject *args) {
     if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &v[THETA], &v[JACOBIAN], &v[COVARIANCE], &v[LENGTHENING], &v[VARIANCE])) {
         return NULL;
     }
-    const Py_ssize_t one = (Py_ssize_t)sizeof(double), all = v[VARIANCE].len / one;
-    const Py_ssize_t p = all > 0 ? v[JACOBIAN].len / one / all : 0, problems = p > 0 ? v[THETA].len / one / p : 0;
+    const Py_ssize_t all = v[VARIANCE].len / ONE;
+    const Py_ssize_t p = all > 0 ? v[JACOBIAN].len / ONE / all : 0, problems = p > 0 ? v[THETA].len / ONE / p : 0;
     const Py_ssize_t n = problems > 0 ? all / problems : 0;
     const int size = v[LENGTHENING].len == 0 ? MOMENTS : AXES;
     const Py_ssize_t square = size * size;
-    const int fits = p >= 6 && n > 0 && v[THETA].len == problems * p * one && all == problems * n &&
-                     v[JACOBIAN].len == all * p * one && (size == MOMENTS || v[LENGTHENING].len == v[VARIANCE].len) &&
-                     (v[COVARIANCE].len == square * n * one || v[COVARIANCE].len == square * all * one);
+    const int fits = p >= 6 && n > 0 && v[THETA].len == problems * p * ONE && all == problems * n &&
+                     v[JACOBIAN].len == all * p * ONE && (size == MOMENTS || v[LENGTHENING].len == v[VARIANCE].len) &&
+                     (v[COVARIANCE].len == square * n * ONE || v[COVARIANCE].len == square * all * ONE);
     if (fits) {
-        const Py_ssize_t next = v[COVARIANCE].len == square * all * one ? square * n : 0;
+        const Py_ssize_t next = v[COVARIANCE].len == square * all * ONE ? square * n : 0;
         const double *theta = v[THETA].buf, *derivative = v[JACOBIAN].buf, *covariance = v[COVARIANCE].buf;
         double *lengthening = v[LENGTHENING].buf, *variance = v[VARIANCE].buf;
         for (Py_ssize_t b = 0; b < problems; b++, theta += p, covariance += next) {
@@ -145,21 +136,7 @@ static PyObject *noise(PyObject *module, PyObject *args) {
             }
         }
     }
-    for (int i = 0; i < BUFFERS; i++) PyBuffer_Release(&v[i]);
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "buffers that do not go together");
-        return NULL;
-    }
-    Py_RETURN_NONE;
+    return done(v, BUFFERS, fits);
 }
 
-static PyMethodDef methods[] = {{"lengths", lengths, METH_VARARGS, lengths_doc},
-                                {"noise", noise, METH_VARARGS, noise_doc},
-                                {"fit", fit, METH_VARARGS, fit_doc},
-                                {"left_out", left_out, METH_VARARGS, left_out_doc},
-                                {NULL, NULL, 0, NULL}};
-
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_model", "The inverse error model of a triad.", 0, methods, NULL, NULL, NULL, NULL};
-
-PyMODINIT_FUNC PyInit__model(void) { return PyModule_Create(&definition); }
+MODULE(_model, "The inverse error model of a triad.", METHOD(lengths), METHOD(noise), METHOD(fit), METHOD(left_out))

@@ -2,9 +2,7 @@
 #ifndef IMULAB_MODEL_H
 #define IMULAB_MODEL_H
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "buffers.h"
 
 /* |f| in one attitude, its derivatives (3 (order + 2) of them), and f. */
 double length(const double *theta, const double *reading, int order, double *derivative, double *f);
