@@ -1,6 +1,8 @@
 """Layouts that come with imulab: files in each format, made here from what is documented of it."""
 
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +20,12 @@ ROWS = 5
 TIME = np.arange(ROWS) * 0.01
 ACCEL = np.random.default_rng(1).normal(0, 5, (ROWS, 3))
 GYRO = np.random.default_rng(2).normal(0, 2, (ROWS, 3))
+CELSIUS = 20 + np.arange(ROWS) / 4
 
 
-def lines(*columns, delimiter=","):
+def lines(*columns, delimiter=",", before=""):
     """Rows of numbers; a column may be texts."""
-    return "".join(f"{delimiter.join(map(str, row))}\n" for row in zip(*columns, strict=True))
+    return "".join(f"{before}{delimiter.join(map(str, row))}\n" for row in zip(*columns, strict=True))
 
 
 def stamps(factor, start=0):
@@ -44,6 +47,54 @@ def blackbox(accel, gyro, units):
     return head + lines(*counts, *gyro.T, *accel.T, ["ANGLE_MODE|HORIZON_MODE"] * ROWS, ["0"] * ROWS, delimiter=", ")
 
 
+def microstrain():
+    head = "FILE_INFO\nListSeparator=comma\nDecimalSeparator=period\n\nSESSION_INFO\nStartTime,02/10/2017 16:13:52\n\n"
+    head += "DEVICE_INFO\nModelName,3DM-GX3-35\nSerialNumber,6225-01353\n\nDATA_START\n"
+    head += "GPS TFlags,GPS Week,GPS TOW,Roll [x800C],X Accel [x8004],Y Accel [x8004],Z Accel [x8004],"
+    head += "X Gyro [x8005],Y Gyro [x8005],Z Gyro [x8005],Lat [x8103],Flags [x8103],Flags [x8108]\n"
+    empty = [""] * ROWS
+    week = [[5] * ROWS, [1969] * ROWS, 137649.863104 + TIME, [0.01] * ROWS]
+    return head + lines(*week, *(ACCEL / G).T, *GYRO.T, empty, empty, empty)
+
+
+def movella():
+    head = (
+        "sep=,\nDeviceTag:,bei\nFirmwareVersion:,1.6.0\nAppVersion:,2021.0\nStartTime: ,2021-08-30_17:05:05_000 GMT+8\n"
+    )
+    head += "© Xsens Technologies B. V. 2005-2021\n\n"
+    head += "PacketCounter,SampleTimeFine,Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n"
+    euler = [[-179.9] * ROWS, [0.25] * ROWS, [-136.1] * ROWS]
+    return head + lines(range(ROWS), stamps(1e6, 2974023062), *euler, *ACCEL.T, *np.degrees(GYRO).T)
+
+
+def gnsslogger():
+    head = "# \n# Header Description:\n# \n# Version: v3.0.6.4 Platform: 13 Manufacturer: Google Model: Pixel 6\n# \n"
+    head += "# Raw,utcTimeMillis,TimeNanos,LeapSecond\n# \n"
+    head += "# UncalAccel,utcTimeMillis,elapsedRealtimeNanos,UncalAccelXMps2,UncalAccelYMps2,UncalAccelZMps2,"
+    head += "BiasXMps2,BiasYMps2,BiasZMps2\n# \n# UncalGyro,utcTimeMillis,elapsedRealtimeNanos,UncalGyroXRadPerSec,"
+    head += "UncalGyroYRadPerSec,UncalGyroZRadPerSec,DriftXRadPerSec,DriftYRadPerSec,DriftZRadPerSec\n# \n"
+    head += "Fix,GPS,28.14,-82.29,-14.2,0.09,5.8,108.3,1663712656000,,,445420306913617,11.1,0\n"
+    zero = [[0.0] * ROWS] * 3
+    clocks = stamps(1e3, 1663164669190), stamps(1e9, 65972054923181)
+    accel = lines(*clocks, *ACCEL.T, *zero, before="UncalAccel,").splitlines()
+    gyro = lines(*clocks, *GYRO.T, *zero, before="UncalGyro,").splitlines()
+    mixed = [line for pair in zip(accel, gyro, strict=True) for line in pair]
+    return head + "\n".join(mixed) + "\nRaw,1663707711608,32083712000000,18,,\n"
+
+
+def flysight():
+    head = "$FLYS,1\n$VAR,FIRMWARE_VER,v2023.09.22\n$COL,BARO,time,pressure,temperature\n$UNIT,BARO,s,Pa,deg C\n"
+    head += "$COL,IMU,time,wx,wy,wz,ax,ay,az,temperature\n$UNIT,IMU,s,deg/s,deg/s,deg/s,g,g,g,deg C\n$DATA\n"
+    imu = lines(TIME + 59970.376, *np.degrees(GYRO).T, *(ACCEL / G).T, CELSIUS, before="$IMU,").splitlines()
+    return head + "".join(f"{line}\n$BARO,59970.4,98123.1,25.1\n" for line in imu)
+
+
+def kitti():
+    dates = [f"2011-09-26T13:02:25.{nanoseconds:09d}" for nanoseconds in stamps(1e9, 900_000_000)]
+    filler = [[0.5] * ROWS]
+    return lines(dates, *filler * 11, *ACCEL.T, *filler * 3, *GYRO.T, *filler * 10, delimiter=" ")
+
+
 def xyz(pattern):
     return [pattern.format(axis, axis.upper()) for axis in "xyz"]
 
@@ -62,6 +113,12 @@ FILES = {
     "betaflight": lambda: blackbox(ACCEL / G, np.degrees(GYRO), (" (g)", " (deg/s)")),
     "betaflight-raw": lambda: blackbox(ACCEL, GYRO, ("", "")),
     "euroc": euroc,
+    "flysight": flysight,
+    "gnsslogger-accel": gnsslogger,
+    "gnsslogger-gyro": gnsslogger,
+    "kitti-oxts": kitti,
+    "microstrain": microstrain,
+    "movella-dot": movella,
     "phyphox": lambda: (
         quoted("Time (s)", *xyz("Acceleration {0} (m/s^2)"), "Absolute acceleration (m/s^2)")
         + lines(TIME, *ACCEL.T, np.linalg.norm(ACCEL, axis=1))
@@ -86,6 +143,9 @@ FILES = {
 ALIKE = {
     "sensorlogger-accel": ["sensorlogger-accel", "sensorlogger-gyro"],
     "sensorlogger-gyro": ["sensorlogger-accel", "sensorlogger-gyro"],
+    "gnsslogger-accel": ["gnsslogger-accel", "gnsslogger-gyro"],
+    "gnsslogger-gyro": ["gnsslogger-accel", "gnsslogger-gyro"],
+    "kitti-oxts": [],
 }
 """Which layouts fit a file of each, where that is not just its own."""
 
@@ -117,6 +177,8 @@ def test_a_file_is_read_by_the_name_of_its_layout(tmp_path, name):
         read = np.column_stack([found.si(f"{sensor}_{axis}") for axis in "xyz"])
         np.testing.assert_allclose(read, of[sensor], rtol=1e-14)
         assert (found.triad_unit(sensor) == "count") == (name == "betaflight-raw")
+    if "temperature" in found:
+        np.testing.assert_allclose(found.si("temperature"), CELSIUS)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -145,6 +207,24 @@ def test_the_wrong_layout_gets_one_line_that_names_the_right_one(imulab, tmp_pat
     assert imulab("show", "f.csv", "--layout", "phyphox").returncode == 0
 
 
+def test_titles_may_stand_below_any_comments_and_a_hundred_other_lines(tmp_path):
+    path = tmp_path / "f.csv"
+    path.write_text("# a comment\n" * 300 + "a line of its own\n\n" * 49 + FILES["phyphox"]())
+    assert len(il.read(path, "phyphox")) == ROWS
+    path.write_text("a line of its own\n" * 101 + FILES["phyphox"]())
+    with pytest.raises(
+        ReadError, match=r"phyphox takes time from a column named 'Time \(s\)', found a line of its own"
+    ):
+        il.read(path, "phyphox")
+    path.write_text("# only comments\n" * 3)
+    with pytest.raises(ReadError, match="found no titles"):
+        il.read(path, "phyphox")
+    numbered = tmp_path / "l.toml"
+    numbered.write_text('header = true\nskip_lines = 9\n[columns]\naccel_x = { from = 0, unit = "g" }\n')
+    with pytest.raises(ReadError, match="no rows of data"):
+        il.read(path, numbered)
+
+
 def test_a_name_that_is_none_lists_those_that_are(tmp_path):
     (tmp_path / "f.csv").write_text(FILES["phyphox"]())
     with pytest.raises(ReadError, match=r"^phypox: no such layout file; .* androsensor .*did you mean 'phyphox'"):
@@ -156,6 +236,18 @@ def test_titles_that_nothing_fits_call_for_a_layout(imulab, tmp_path):
     done = imulab("show", "f.csv")
     assert done.returncode == 2
     assert "; a layout says where columns of other titles are: --layout (imulab show --formats" in done.stderr
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="the command in the docs is for a shell")
+def test_kitti_is_put_into_one_file_by_the_command_in_the_docs(tmp_path):
+    (tmp_path / "oxts" / "data").mkdir(parents=True)
+    rows = [line.partition(" ") for line in kitti().splitlines()]
+    (tmp_path / "oxts" / "timestamps.txt").write_text("".join(row[0].replace("T", " ") + "\n" for row in rows))
+    for i, row in enumerate(rows):
+        (tmp_path / "oxts" / "data" / f"{i:010d}.txt").write_text(row[2] + "\n" * (i % 2))
+    (command,) = re.findall(r"^    (tr .*)$", (DOCS / "recordings.md").read_text(), re.M)
+    subprocess.run(["bash", "-c", command], cwd=tmp_path, check=True)
+    assert (tmp_path / "oxts.txt").read_text() == kitti()
 
 
 def test_formats_lists_them_and_prints_one(imulab):

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from imulab.readers.layout import Layout, load_layout, shipped_file, shipped_names
-from imulab.readers.text import _fields
+from imulab.readers.text import titles_of
 
 _MOST_LINES = 200
 
@@ -44,8 +44,8 @@ def shipped() -> tuple[Shipped, ...]:
 def fitting(head: bytes) -> list[str]:
     """Return the names of the layouts that fit a text file by its first lines.
 
-    A layout fits where one line holds all titles that it wants. One that wants only some of the titles of another that
-    fits is not named.
+    A layout fits where one line holds all titles that it wants, or begins with its prefix. One that wants only some of
+    the titles of another that fits is not named. Layouts that count columns without a prefix cannot be recognised.
     """
     lines = head.decode("utf-8-sig", "replace").splitlines()[:_MOST_LINES]
     fits = [entry for entry in shipped() if any(_fits(entry, line) for line in lines)]
@@ -53,8 +53,10 @@ def fitting(head: bytes) -> list[str]:
 
 
 def _fits(entry: Shipped, line: str) -> bool:
-    titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), entry.layout.delimiter)]
-    return bool(entry.titles) and entry.titles.issubset(titles)
+    layout = entry.layout
+    if layout.prefix:
+        return line.startswith(layout.prefix + layout.delimiter)
+    return bool(entry.titles) and entry.titles.issubset(titles_of(line, layout.delimiter))
 
 
 def advice(head: bytes, layout: str | None = None) -> str:

@@ -26,6 +26,7 @@ from imulab.verdict import Note
 _text.prepare(powers_of_five())
 _DATE = 1 << 30
 _NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3
+_MOST_ABOVE = 100  # lines above the titles
 _UNENDED = Note("the last line has no line end: if the file was cut there, its last number is short")
 
 
@@ -238,15 +239,33 @@ class TextFile:
         )
 
     def _layout_titles(self, layout: Layout) -> list[str]:
-        """Take the line of titles, which may itself begin with #; comments above it are kept."""
+        """Take the line of titles, which may itself begin with #, and lines above it; comments among these are kept."""
         wanted = {column.origin for column in layout.columns.values() if isinstance(column.origin, str)}
         hint = '; the layout says of which encoding it is, such as encoding = "gbk"'
-        while True:
-            line = self._lines.line(layout.encoding, hint=hint) or ""
-            titles = [title.strip().strip('"') for title in _fields(line.lstrip("# "), layout.delimiter)]
-            if not (wanted and line.startswith("#") and wanted.isdisjoint(titles)):
+        best: list[str] = []
+        above = 0
+        while above < _MOST_ABOVE:
+            line = self._lines.line(layout.encoding, hint=hint)
+            if line is None:
+                break
+            titles = titles_of(line, layout.delimiter)
+            if wanted.issubset(titles):
                 return titles[1:] if self._prefix else titles
-            self._note(line)
+            if line.startswith("#") and wanted.isdisjoint(titles):
+                self._note(line)
+                continue
+            above += 1
+            if line.strip() and (not best or len(wanted.intersection(titles)) > len(wanted.intersection(best))):
+                best = titles
+        if not wanted:
+            return best
+        name, origin = next(
+            (name, column.origin) for name, column in layout.columns.items() if column.origin in wanted.difference(best)
+        )
+        raise ReadError(
+            f"{self._name}: {layout.name} takes {name} from a column named {origin!r}, "
+            f"found {' '.join(best) or 'no titles'}"
+        )
 
     # --- rows --------------------------------------------------------------------------------------------------
 
@@ -327,6 +346,11 @@ class TextFile:
 def _fields(line: str, delimiter: str) -> list[str]:
     """Split a line as the C module does: blanks are spaces and tabs, nothing else."""
     return re.split(r"[ \t]+", line.strip(" \t\r")) if delimiter == " " else line.split(delimiter)
+
+
+def titles_of(line: str, delimiter: str) -> list[str]:
+    """Split a line of titles, which may begin with # and hold them in quotes."""
+    return [title.strip().strip('"') for title in _fields(line.lstrip("# "), delimiter)]
 
 
 def _is_number(text: str) -> bool:
