@@ -149,7 +149,7 @@ def test_folders_in_place_of_files_are_named(tmp_path):
         il.read(tmp_path / "cycles")
     with pytest.raises(ReadError, match="expected a layout file, found a folder"):
         load_layout(tmp_path / "cycles")
-    with pytest.raises(ReadError, match="expected a manifest, found a folder"):
+    with pytest.raises(ReadError, match="expected a manifest file, found a folder"):
         il.load_manifest(tmp_path / "cycles")
 
 
