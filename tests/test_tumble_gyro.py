@@ -266,8 +266,8 @@ def test_a_clock_that_is_off_is_said(case, late, words):
 def test_a_fit_that_has_not_settled_is_no_result(case, monkeypatch):
     recording, attitudes, record = case
     module = sys.modules["imulab.tumble.gyrosolve"]
-    settled = module.levenberg_marquardt
-    monkeypatch.setattr(module, "levenberg_marquardt", partial(settled, max_iterations=1))
+    settled = module.least_squares
+    monkeypatch.setattr(module, "least_squares", partial(settled, max_evaluations=1))
     with pytest.raises(DataError, match=r"does not converge on these \d+ turns \(condition number \d+\)"):
         fit_gyro(record, attitudes, recording)
 

@@ -1,9 +1,9 @@
-"""Weighted nonlinear least squares for many small problems at once, and what can be said of their results.
+"""Weighted nonlinear least squares, and what can be said of its results.
 
-The leading axis of every array counts independent problems: one fit is a batch of one, leave-one-out is a batch of
-n with one weight each set to zero, Monte Carlo a batch of trials. There is no Python loop over problems.
+The leading axis of every array counts independent problems, of which one fit is a batch of one and Monte Carlo a batch
+of trials. There is no Python loop over problems; batches of tumbles are solved in C (tumble/_fit.c).
 
-Sources: Moré, The Levenberg-Marquardt algorithm, LNM 630 (1978) 105; Huber, Robust Statistics (1981), 7.6-7.10;
+Sources: Huber, Robust Statistics (1981), 7.6-7.10;
 Mandel and Paule, Analytical Chemistry 42 (1970) 1194 (excess variance); Birge, Physical Review 40 (1932) 207, and
 Gelman, Bayesian Analysis 1 (2006) 515 (how much of it is plausible); Belsley, Kuh, Welsch, Regression
 Diagnostics (1980) (scaled condition number).
@@ -13,24 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.recording import Array
 
-Index = NDArray[np.intp]
-Model = Callable[[Array, Index], tuple[Array, Array]]
-"""(parameters (k, p), indices of the k problems) -> residuals (k, n), Jacobian (k, n, p)."""
+Model = Callable[[Array], tuple[Array, Array]]
+"""Parameters (p,) -> residuals (n,), Jacobian (n, p)."""
 
 _HUBER = 1.345
 """95 % efficiency for normal errors (Huber 1981)."""
-_MAX_DAMPING = 1e12
-_NEAR = 100.0
-"""Steps of so many tolerances are taken where the cost changes by no more than rounding."""
-_LEAST_DAMPING = 1e-12
-"""Keeps combinations that nothing determines in place; slows no others."""
 _PEAK, _PER_DEGREE, _PER_SQUARE = 0.25, 40.0, 19.0
 """Exponent b of the prior of an excess variance: the smaller, the more is thought of none."""
 _TOLD = 0.5  # degrees of freedom below which nothing is left to tell an excess from
@@ -66,94 +59,46 @@ class Fit:
     converged: NDArray[np.bool_]
 
 
-def levenberg_marquardt(
-    model: Model, start: Array, weights: Array, *, tolerance: float = 1e-9, max_iterations: int = 60
+def least_squares(
+    model: Model, start: Array, weights: Array, *, tolerance: float = 1e-10, max_evaluations: int = 100
 ) -> Fit:
-    """Minimise ``sum_i w_i r_i(p)^2`` for each problem of a batch.
-
-    A Gauss-Newton step is tried first; damping enters only when a step does not lower the cost, so that convergence
-    stays quadratic where residuals are small.
+    """Minimise ``sum_i w_i r_i(p)^2`` of one problem by scipy's trust regions, as a batch of one.
 
     Parameters
     ----------
     model
-        Residuals and Jacobian; parameters must be scaled so that steps of `tolerance` do not matter.
+        Residuals and Jacobian.
     start
-        Start parameters, shape (b, p).
+        Start parameters, shape (p,), scaled so that steps of `tolerance` do not matter.
     weights
-        Inverse variances, shape (b, n); zero leaves an observation out.
+        Inverse variances, shape (n,); zero leaves an observation out.
     tolerance
-        Largest step of any parameter that counts as converged.
-    max_iterations
-        Steps tried before a problem is given up as not converged.
-
-    Returns
-    -------
-    Fit
+        Length of a step that counts as converged, relative to the parameters.
+    max_evaluations
+        Evaluations of the residuals before the problem is given up as not converged.
     """
-    parameters = np.array(start, dtype=np.float64)
-    count = len(parameters)
-    everything = np.arange(count)
-    residuals, jacobian = model(parameters, everything)
-    residuals, jacobian = np.array(residuals), np.array(jacobian)
-    cost = np.einsum("bn,bn,bn->b", weights, residuals, residuals)
-    damping = np.zeros(count)
-    iterations = np.zeros(count, dtype=np.int64)
-    converged = np.zeros(count, dtype=np.bool_)
-    active = everything
-    for _ in range(max_iterations):
-        rows: Any = slice(None) if active.size == count else active  # views, not copies, while all are active
-        weighted = jacobian[rows] * weights[rows, :, None]
-        normal = np.matmul(weighted.transpose(0, 2, 1), jacobian[rows])
-        gradient = np.einsum("bnp,bn->bp", weighted, residuals[rows])
-        step = _damped_step(normal, gradient, damping[rows])
-        trial = parameters[rows] + step
+    from scipy import optimize
+
+    root = np.sqrt(weights)
+    solution, evaluations, converged = np.asarray(start), 1, False
+    if np.isfinite(root * model(start)[0]).all():
         with np.errstate(all="ignore"):
-            new_residuals, new_jacobian = model(trial, active)
-            new_cost = np.einsum("bn,bn,bn->b", weights[rows], new_residuals, new_residuals)
-        small = np.abs(step).max(axis=1) <= tolerance
-        # Near the minimum the cost is flat to rounding, which must not turn a step towards it away.
-        near = np.abs(step).max(axis=1) <= _NEAR * tolerance
-        better = new_cost <= cost[rows] * (1 + 1e-12 * near)
-        iterations[rows] += 1
-        if better.all():
-            parameters[rows], residuals[rows], jacobian[rows], cost[rows] = trial, new_residuals, new_jacobian, new_cost
-            if damping.any():
-                relaxed = damping[rows] / 10
-                damping[rows] = np.where(relaxed < 1e-9, 0.0, relaxed)
-            converged[rows] = small
-            active = active[~small]
-            if not active.size:
-                break
-            continue
-        taken = active[better]
-        parameters[taken], residuals[taken] = trial[better], new_residuals[better]
-        jacobian[taken], cost[taken] = new_jacobian[better], new_cost[better]
-        relaxed = damping[taken] / 10
-        damping[taken] = np.where(relaxed < 1e-9, 0.0, relaxed)
-        failed = active[~better]
-        damping[failed] = np.maximum(10 * damping[failed], 1e-6)
-        converged[active] = small & (better | (damping[active] <= 1e-6))
-        active = active[~converged[active] & (damping[active] < _MAX_DAMPING)]
-        if not active.size:
-            break
-    return Fit(parameters, residuals, jacobian, np.asarray(weights), iterations, converged)
-
-
-def _damped_step(normal: Array, gradient: Array, damping: Array) -> Array:
-    """Solve ``(H + damping diag H) step = -g`` in scaled parameters; what nothing senses stays where it is."""
-    scale = np.sqrt(np.einsum("bpp->bp", normal))
-    idle = ~(scale > _SENSED * scale.max(axis=1, keepdims=True))
-    scale = np.where(idle, 1.0, scale)
-    scaled = normal / (scale[:, :, None] * scale[:, None, :])
-    size = scaled.shape[1]
-    diagonal = np.where(idle, 1.0, np.maximum(damping, _LEAST_DAMPING)[:, None])
-    if idle.any():
-        scaled = np.where(idle[:, :, None] | idle[:, None, :], 0.0, scaled)
-        gradient = np.where(idle, 0.0, gradient)
-    scaled[:, range(size), range(size)] += diagonal
-    step: Array = np.linalg.solve(scaled, (-gradient / scale)[:, :, None])[:, :, 0] / scale
-    return step
+            found = optimize.least_squares(
+                lambda p: root * model(p)[0],
+                start,
+                lambda p: root[:, None] * model(p)[1],
+                x_scale="jac",
+                ftol=None,
+                xtol=tolerance,
+                gtol=None,
+                max_nfev=max_evaluations,
+            )
+        solution, evaluations, converged = found.x, int(found.nfev), bool(found.status > 0)
+    residuals, jacobian = model(solution)
+    return Fit(
+        solution[None], residuals[None], jacobian[None], np.asarray(weights)[None], np.array([evaluations]),
+        np.array([converged]),
+    )  # fmt: skip
 
 
 def covariance(jacobian: Array, weights: Array) -> Array:

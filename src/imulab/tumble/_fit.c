@@ -1,14 +1,16 @@
 /* Least squares of |f| = 1, for many small problems one after the other.
  *
- * The steps are those of estimate.levenberg_marquardt, which says why each is taken. A choice of the order makes hundreds
+ * Levenberg-Marquardt. A Gauss-Newton step is tried first; damping enters only where a step does not lower the cost, so that
+ * convergence stays quadratic where residuals are small (Moré, LNM 630 (1978) 105). A choice of the order makes hundreds
  * of them on arrays of a few hundred numbers: in Python that time went into calls.
  */
 #include "_model.h"
 #include <math.h>
-#include <stdint.h>
 #include <string.h>
 
-static const double SENSED = 1e-9, LEAST_DAMPING = 1e-12, MAX_DAMPING = 1e12, NEAR = 100.0; /* as in estimate.py */
+static const double SENSED = 1e-9; /* columns shorter than this, relative to the longest, are of parameters that nothing senses */
+static const double LEAST_DAMPING = 1e-12, MAX_DAMPING = 1e12; /* the least keeps what nothing determines in place */
+static const double NEAR = 100.0; /* steps of so many tolerances are taken where the cost changes by no more than rounding */
 
 /* What the fit of one problem works on: n observations, p parameters, two evaluations that take turns. */
 typedef struct {

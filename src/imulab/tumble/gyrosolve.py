@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from imulab.attitudes import Attitudes
 from imulab.errors import DataError
-from imulab.estimate import Fit, Index, covariance, f_test, levenberg_marquardt
+from imulab.estimate import Fit, covariance, f_test, least_squares
 from imulab.recording import Array
 from imulab.tumble.gyrorest import Rest, at_rest, find_holds
 from imulab.tumble.gyroturns import COLUMNS, ROWS, Segments, find_turns, model, start_scale
@@ -146,12 +146,12 @@ def _solve(case: Case, segments: Segments, rest: Rest, notes: list[str]) -> Solv
 
 def _fitted(segments: Segments, scale: Array, theta: Array, weights: Array) -> Fit:
     """Return the fit of some turns, weighted (m,), from the parameters theta."""
-
-    def turns(parameters: Array, index: Index) -> tuple[Array, Array]:
-        residual, jacobian = model(segments, scale, parameters[0], theta.size > 9)
-        return residual[None], jacobian[None]
-
-    return levenberg_marquardt(turns, theta[None], np.repeat(weights, 3)[None], tolerance=1e-8)
+    return least_squares(
+        lambda parameters: model(segments, scale, parameters, theta.size > 9),
+        theta,
+        np.repeat(weights, 3),
+        tolerance=1e-8,
+    )
 
 
 def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bool_], Array]:

@@ -17,10 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.attitudes import POOL_DEGREES, Motion
-from imulab.estimate import Fit, levenberg_marquardt
+from imulab.estimate import Fit, least_squares
 from imulab.recording import Array
 from imulab.tumble import _model
 
@@ -213,7 +212,9 @@ def _carried(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, A
 def fit_lengths(
     start: Array, reading: Array, weights: Array, lengthening: Array, order: int, *, tolerance: float, most: int
 ) -> Fit:
-    """Minimise ``sum w (|f| - 1 - lengthening)^2`` of each problem, by the steps of `levenberg_marquardt` in C.
+    """Minimise ``sum w (|f| - 1 - lengthening)^2`` of each problem by Levenberg-Marquardt steps in C.
+
+    With cross terms there is one problem, which scipy solves.
 
     Parameters
     ----------
@@ -226,11 +227,11 @@ def fit_lengths(
     """
     if start.shape[1] > parameter_count(order):
 
-        def model(theta: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
-            norm, jacobian = norm_and_jacobian(theta, reading if len(reading) == 1 else reading[index], order)[:2]
-            return norm - 1 - lengthening[index], jacobian
+        def model(theta: Array) -> tuple[Array, Array]:
+            norm, jacobian = norm_and_jacobian(theta[None], reading, order)[:2]
+            return norm[0] - 1 - lengthening[0], jacobian[0]
 
-        return levenberg_marquardt(model, start, weights, tolerance=tolerance, max_iterations=most)
+        return least_squares(model, start[0], weights[0], tolerance=tolerance, max_evaluations=most)
     count, n = weights.shape
     theta = np.array(start, dtype=np.float64)
     residuals, jacobian = np.empty((count, n)), np.empty((count, n, theta.shape[1]))

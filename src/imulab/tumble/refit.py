@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.estimate import covariance, levenberg_marquardt, leverage, observability, plausible_excess
+from imulab.estimate import covariance, least_squares, leverage, observability, plausible_excess
 from imulab.recording import Array
 from imulab.tumble.model import gravity_slope, norm_and_jacobian, parameter_names
 
@@ -54,17 +53,17 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     stated = held["standard_uncertainty"]
     own: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
 
-    def model(parameters: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
-        theta = np.zeros((len(parameters), 9))
-        theta[:, free] = parameters
+    def model(parameters: Array) -> tuple[Array, Array]:
+        theta = np.zeros((1, 9))
+        theta[0, free] = parameters
         norm, jacobian = norm_and_jacobian(theta, reading, _LINEAR)[:2]
-        return norm - 1 - lengthening, jacobian[:, :, free]
+        return norm[0] - 1 - lengthening, jacobian[0][:, free]
 
-    start: Array = np.concatenate([[record.value(name) / g for name in names[:3]], np.ones(3), np.zeros(3)])[None, free]
+    start: Array = np.concatenate([[record.value(name) / g for name in names[:3]], np.ones(3), np.zeros(3)])[free]
     variance: Array = own
     for _ in range(_WEIGHED):
-        fit = levenberg_marquardt(model, start, 1 / variance)
-        start = fit.parameters
+        fit = least_squares(model, start, 1 / variance[0])
+        start = fit.parameters[0]
         if stated is not None:
             spare = 1 - leverage(fit.jacobian, 1 / variance)
             variance = own + plausible_excess(fit.residuals, own, spare)[0][:, None]
@@ -75,7 +74,7 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     if seen.rank < len(free) or not fit.converged[0]:
         return None
     theta = np.zeros(9)
-    theta[free] = start[0]
+    theta[free] = start
     zero, relative = theta[:3], theta[3:6]
     values = np.concatenate([g * zero / relative, nominal * relative, theta[6:]])
     slope = np.diag(np.concatenate([g / relative, nominal, np.ones(3)]))
