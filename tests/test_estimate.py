@@ -56,7 +56,9 @@ def test_the_solution_is_where_the_gradient_vanishes():
             return decay(p)[1].T @ (weights * (decay(p)[0] - data))
 
         exact = optimize.root(gradient, fit.parameters[0], tol=1e-14).x
-        np.testing.assert_allclose(fit.parameters[0], exact, rtol=0, atol=1e-9)
+        # scipy stops where the cost is flat to rounding, far within what the noise leaves open.
+        deviation = np.sqrt(np.diag(covariance(fit.jacobian, fit.weights)[0]))
+        np.testing.assert_allclose((fit.parameters[0] - exact) / deviation, 0, atol=1e-6)
 
 
 def test_the_covariance_is_that_of_scipys_curve_fit():
