@@ -80,7 +80,8 @@ def test_a_prior_of_another_sensor_leaves_a_result_that_must_not_be_used(run):
 def test_a_limit_below_the_noise_is_not_taken_for_a_change(run):
     status, out, _ = run("tumble", "check", "a.json", "a.csv", "--limit", "1ug", "--gravity", G)
     assert status == 1
-    assert "no change of the unit is shown; the limit is smaller than the uncertainty of the attitudes can tell" in out
+    assert "no change of the unit is shown, but an attitude is beyond the limit\n" in out
+    assert "the limit is smaller than the uncertainty of the attitudes can tell" in out
 
 
 def test_a_plan_for_the_noise_of_a_recording_takes_no_model_error_for_noise(run, tmp_path):

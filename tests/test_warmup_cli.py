@@ -323,7 +323,8 @@ def test_other_procedures_records_have_no_table_and_other_commands_know_this_one
     (tmp_path / "d.json").write_text(json.dumps(damaged))
     capsys.readouterr()
     file = chamber / "cycle_+0_1.csv"
-    assert "settling_time 0" in refused(capsys, "apply", tmp_path / "d.json", file, "-o", tmp_path / "o.csv")
+    said = "d.json: table.settling_time: expected a number above 0, found 0"
+    assert said in refused(capsys, "apply", tmp_path / "d.json", file, "-o", tmp_path / "o.csv")
 
 
 def test_fit_of_several_units_says_how_they_differ(tmp_path, capsys):
