@@ -1,5 +1,6 @@
 """Plans: as good as the published table, allowed by the fixture, and predicting what the bound says."""
 
+import json
 import re
 
 import numpy as np
@@ -76,6 +77,67 @@ def test_no_two_attitudes_have_the_same_axis_vertical():
     plan = plan_tumble(order=1, attitudes=60)
     cosine = plan.directions @ plan.directions.T - 2 * np.eye(60)
     assert np.degrees(np.arccos(cosine.max())) >= 2.999
+
+
+@pytest.mark.parametrize(
+    ("order", "attitudes", "candidates"),
+    [
+        (1, 20, None),
+        (3, 24, None),
+        (2, 18, fixture_candidates(np.radians(15))),
+        (2, 18, head_candidates(np.radians(5))),
+    ],
+)
+def test_a_plan_with_distinct_verticals_has_no_axis_vertical_twice(order, attitudes, candidates):
+    """Within 5 degrees, up or down; without the rule, or with z vertical before, plans differ as they must."""
+    plan = plan_tumble(order=order, attitudes=attitudes, candidates=candidates, distinct_verticals=True)
+    vertical = np.abs(plan.directions) > np.cos(np.radians(5))
+    assert vertical.sum(axis=0).max() <= 1
+    assert len(plan.directions) == attitudes
+    assert plan.again == []
+    free = plan_tumble(order=order, attitudes=attitudes, candidates=candidates)
+    assert np.trace(plan.covariance) < 1.3 * np.trace(free.covariance)
+
+
+def test_distinct_verticals_count_what_is_there_and_refuse_what_cannot_be():
+    up = np.array([[0.0, 0.0, 1.0]])
+    more = plan_tumble(order=1, attitudes=12, already=up, distinct_verticals=True)
+    assert np.abs(more.directions[:, 2]).max() < np.cos(np.radians(5))
+    cube = np.vstack([np.eye(3), -np.eye(3), separated(12)])
+    with pytest.raises(OptionError, match=r"list: 1\d candidate attitudes lie 3 deg apart and repeat no vertical axis"):
+        plan_tumble(order=1, attitudes=18, candidates=cube, source="list", distinct_verticals=True)
+
+
+def test_the_command_plans_for_the_linearised_method_and_says_when_attitudes_are_few(imulab, tmp_path):
+    plan = ["tumble", "plan", "--order", "1", "--noise", "1ug", "--from", "fixture:15"]
+
+    def vertical(*arguments):
+        done = imulab(*plan, *arguments, "-o", "p.csv")
+        assert done.returncode == 0, done.stderr
+        found = directions_of(il.read(tmp_path / "p.csv"))
+        return (np.abs(found) > np.cos(np.radians(5))).sum(axis=0).max(), done.stdout
+
+    few = "Too few to check the order: only 4 degrees of freedom: 13 attitudes hardly check whether order 1 is enough"
+    most, said = vertical("--attitudes", "13", "--method", "linearised")
+    assert most <= 1
+    assert "no two have the same of x, y and z vertical" in said
+    assert few in said
+    most, said = vertical("--attitudes", "14", "--distinct-verticals")
+    assert most <= 1
+    assert "Too few" not in said
+    most, said = vertical("--attitudes", "40", "--method", "linearised", "--repeated-verticals")
+    assert "vertical" not in said
+    shown = imulab(*plan, "--attitudes", "13", "--json")
+    (warning,) = json.loads(shown.stdout)["warnings"]
+    assert warning.startswith(few.partition(": ")[2])
+    for arguments, message in (
+        (["--method", "linearized"], "method 'linearized': expected one of norm linearised"),
+        (["--method", "linearised", "--order", "0"], "order 0 needs method norm, found method linearised"),
+    ):
+        refused = imulab(*plan, "--attitudes", "13", *arguments)
+        assert refused.returncode == 2
+        assert refused.stderr.startswith(f"imulab: {message}")
+        assert refused.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("make", [fixture_candidates, head_candidates])

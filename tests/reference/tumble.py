@@ -301,7 +301,11 @@ def linearised(outputs: ArrayLike, order: int, gravity: float, start: Mapping[st
 
 
 def linearised_passes(
-    outputs: ArrayLike, order: int, gravity: float, start: Mapping[str, float] | None = None
+    outputs: ArrayLike,
+    order: int,
+    gravity: float,
+    start: Mapping[str, float] | None = None,
+    threshold: tuple[float, float, float] = (5e-6, 2e-6, 3.0 * ARCSECOND),
 ) -> tuple[Parameters, int]:
     r"""Return the parameters by the source's own estimator, and the number of passes it took.
 
@@ -311,7 +315,7 @@ def linearised_passes(
         sum_i sum_{j=0..e} d_ji a_i^(j+1) + m_yx a_x a_y + m_zx a_z a_x + m_zy a_y a_z = (|B|^2 - 1) / 2.
 
     A pass solves them by least squares and updates S_i *= 1 + d_1i, b_i += d_0i and the misalignment by m,
-    until every change is below 5 ppm, 2e-6 g and 3 arcsec.  The nonlinearity is d_2 ... d_e of the last pass.
+    until every change is below the threshold (of d_1, d_0 and m).  The nonlinearity is d_2 ... d_e of the last pass.
     Start: half the span of each axis over g as scale factor, bias and misalignment zero, or those in `start`.
     """
     rows = np.asarray(outputs, dtype=float)
@@ -346,7 +350,8 @@ def linearised_passes(
         scale = scale * (1.0 + d1)
         yx, zx, zy = yx + m[0], zx + m[1], zy + m[2]
 
-        settled = bool(np.all(np.abs(d1) < 5e-6) and np.all(np.abs(d0) < 2e-6) and np.all(np.abs(m) < 3.0 * ARCSECOND))
+        changes = zip((d1, d0, m), threshold, strict=True)
+        settled = all(bool(np.all(np.abs(change) < limit)) for change, limit in changes)
 
     values = [*(bias * gravity), *scale, yx, zx, zy]
     for j in range(2, order + 1):

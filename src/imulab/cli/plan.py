@@ -18,8 +18,10 @@ from imulab.recording import Array
 from imulab.report import render_plan
 from imulab.segment import find_attitudes
 from imulab.tumble.engineering import predicted_rows
+from imulab.tumble.findings import freedom_finding
 from imulab.tumble.fit import fit_tumble
 from imulab.tumble.model import parameter_units
+from imulab.tumble.options import check_method
 from imulab.tumble.plan import Plan, fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
 from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.units import STANDARD_GRAVITY, from_si
@@ -36,20 +38,26 @@ def run(
     source: str,
     add: str | None,
     report: str | None,
+    method: str,
+    distinct_verticals: bool | None,
     json: bool,
 ) -> None:
     """Plan, print the prediction, and write what was asked for."""
     check_outputs([output, report], [name for name in (add, source) if name])
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
+    number = whole_number(order, "--order")
+    check_method(method, number)
     sigma, source_of_noise = _noise(noise)
+    distinct = method == "linearised" if distinct_verticals is None else distinct_verticals
     plan = plan_tumble(
-        order=whole_number(order, "--order"),
+        order=number,
         attitudes=whole_number(attitudes, "--attitudes"),
         criterion=criterion,
         candidates=_candidates(source),
         already=None if add is None else _already(add),
         source=source,
+        distinct_verticals=distinct,
     )
     predicted = predicted_rows(plan.uncertainties(sigma))
     there = f" with the {plan.already} already there" if plan.already else ""
@@ -67,6 +75,11 @@ def run(
             f" Put down twice: {pairs}. No more candidates lie 3 deg apart; the second time, after the others, lowers "
             "the noise and shows what drifts, but no new direction."
         )
+    if distinct:
+        lead += " Of the new attitudes no two have the same of x, y and z vertical, nor one that had it before."
+    few = freedom_finding(len(plan.directions) + plan.already, len(predicted), plan.order)
+    if few is not None:
+        lead += f" Too few to check the order: {few}."
     with ExitStack() as stack:
         to_csv = stack.enter_context(replacing(output)) if output else None
         to_sheet = stack.enter_context(replacing(report)) if report else None
@@ -75,7 +88,7 @@ def run(
         if to_sheet:
             to_sheet.write(render_plan("Tumble plan", lead, _pictures(plan), predicted).encode("utf-8"))
     if json:
-        print(_as_json(plan, criterion, sigma), end="")
+        print(_as_json(plan, criterion, sigma, few), end="")
         return
     print(lead)
     print("\n".join(aligned(["parameter", "predicted u", "unit"], [list(row) for row in predicted])))
@@ -84,7 +97,7 @@ def run(
             print(f"{what}: {name}")
 
 
-def _as_json(plan: Plan, criterion: str, sigma: float) -> str:
+def _as_json(plan: Plan, criterion: str, sigma: float, few: str | None) -> str:
     """Return the plan for scripts, in SI under the names of a record."""
     angles = roll_pitch(plan.directions)
     units = parameter_units(plan.order, "m/s^2")
@@ -98,6 +111,7 @@ def _as_json(plan: Plan, criterion: str, sigma: float) -> str:
             "condition_number": float(plan.condition_number),
             "noise": {"value": sigma * STANDARD_GRAVITY, "unit": "m/s^2"},
             "already": plan.already,
+            "warnings": [] if few is None else [few],
             "attitudes": [
                 {"up": up, "roll": {"value": roll, "unit": "rad"}, "pitch": {"value": pitch, "unit": "rad"}}
                 for up, (roll, pitch) in zip(plan.directions.tolist(), angles.tolist(), strict=True)

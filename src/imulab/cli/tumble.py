@@ -65,6 +65,17 @@ def plan(
         str | None, typer.Option(metavar="FILE", help="Attitudes already there: a plan, a record or a recording.")
     ] = None,
     report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
+    method: Annotated[
+        str, typer.Option(help="Method of the fit that the attitudes are for: norm or linearised.")
+    ] = "norm",
+    distinct_verticals: Annotated[
+        bool | None,
+        typer.Option(
+            "--distinct-verticals/--repeated-verticals",
+            help="Whether x, y and z are each vertical in one attitude at most, as the source of method linearised "
+            "demands; the default follows --method.",
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Choose the attitudes to measure, and predict the uncertainty of every parameter."""
@@ -79,6 +90,8 @@ def plan(
         source=source,
         add=add,
         report=report,
+        method=method,
+        distinct_verticals=distinct_verticals,
         json=json,
     )
 
@@ -158,6 +171,14 @@ def fit(
     cross: Annotated[
         bool, typer.Option("--cross", help="Fit cross terms k_xy, k_yz, k_zx: products of two axes.")
     ] = False,
+    threshold: Annotated[
+        str | None,
+        typer.Option(
+            metavar="5ppm,2ug,3arcsec",
+            help="Changes of scale factors, biases and misalignments at which --method linearised rests; "
+            'the source\'s "5 ppm, 2 ug, 3 arcsec" if not given.',
+        ),
+    ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -180,6 +201,7 @@ def fit(
         "prior": prior,
         "ageing": ageing,
         "cross": "yes" if cross else "no",
+        "threshold": threshold,
         "monte_carlo": monte_carlo,
         "layout": layout,
         "topic": topic,

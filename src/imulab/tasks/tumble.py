@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +16,12 @@ if TYPE_CHECKING:
     from imulab.recording import Recording
 
 
+_CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
+
+
 def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.gravity import gravity_option
-    from imulab.tumble.fit import check_options
+    from imulab.tumble.options import check_options
 
     order = texts.get("order", "auto")
     trials = texts.get("monte_carlo")
@@ -31,13 +35,14 @@ def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         "prior": texts.get("prior"),
         "ageing": _ageing(texts.get("ageing"), label.format("ageing")),
         "cross": _yes(texts.get("cross", "no"), label.format("cross")),
+        "threshold": _threshold(texts.get("threshold"), label.format("threshold")),
         "layout": texts.get("layout"),
         "part": chosen(*(texts.get(key) for key in ("topic", "instance", "window", "element")), label=label),
     }
     check_options(
         values["order"], values["method"], values["loss"],
         monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
-        nonlinearity=values["nonlinearity"], cross=values["cross"],
+        nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
     )  # fmt: skip
     return values
 
@@ -68,6 +73,7 @@ def _tumble_fit(
         ageing=values["ageing"],
         monte_carlo=values["monte_carlo"],
         cross=values["cross"],
+        threshold=values["threshold"],
         progress=progress,
     ).calibration
 
@@ -81,6 +87,22 @@ def _ageing(text: str | None, name: str) -> tuple[float, ...]:
     if len(parts) > len(kinds):
         raise OptionError(f"{name} {text!r}: expected up to three, as in 100ug,100ppm,50urad")
     return tuple(quantity(part, name, *kind) for part, kind in zip(parts, kinds, strict=False))
+
+
+def _threshold(text: str | None, name: str) -> tuple[float, ...] | None:
+    """Changes of scale factors, biases and misalignments at which method linearised rests, in SI."""
+    if text is None:
+        return None
+    parts = text.split(",")
+    if len(parts) != len(_CHANGES):
+        raise OptionError(
+            f"{name} {text!r}: expected three changes, of scale factors, biases and misalignments, such as "
+            "5ppm,2ug,3arcsec"
+        )
+    found = tuple(quantity(part.strip(), name, *kind) for part, kind in zip(parts, _CHANGES, strict=True))
+    if not all(0 < value < math.inf for value in found):
+        raise OptionError(f"{name} {text!r}: expected three finite changes above 0")
+    return found
 
 
 def _spread(text: str | None, option: str) -> tuple[float, float] | None:
@@ -127,6 +149,7 @@ TASK = Task(
         "prior",
         "ageing",
         "cross",
+        "threshold",
         "layout",
         "topic",
         "instance",

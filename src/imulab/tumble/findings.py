@@ -14,14 +14,20 @@ from imulab.calibration import Calibration
 from imulab.estimate import coverage_factor
 from imulab.recording import Array
 from imulab.tumble.blend import Blended
-from imulab.tumble.model import parameter_count
+from imulab.tumble.model import AXES, MISALIGNMENTS, parameter_count
+from imulab.tumble.optimal import CLOSEST, near_vertical
 from imulab.tumble.outliers import FREEDOM, HIGHEST_TESTED, Aside
-from imulab.tumble.solve import Problem, Solution
+from imulab.tumble.solve import Problem, Solution, forces
+from imulab.units import parse_unit
 from imulab.verdict import Note
 
 _SELDOM_MISSED = 6
 """Degrees of freedom at the highest order tested from which a knock is seldom missed."""
 _NEGLIGIBLE = 0.01
+FEW_DEGREES, _ENOUGH_DEGREES = 5, 9
+_WORST_SCALE = 0.1
+_WORST_MISALIGNMENT = 0.1
+_MOST_NAMED = 8
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,54 @@ def aside_warnings(found: Found, options: Mapping[str, Any]) -> list[str]:
             )
         )
     return named
+
+
+def freedom_finding(attitudes: int, size: int, order: int) -> str | None:
+    """Say that so many attitudes are few for the parameters of an order, where they are."""
+    freedom = attitudes - size
+    if freedom >= FEW_DEGREES:
+        return None
+    return (
+        f"only {freedom} degree{'' if freedom == 1 else 's'} of freedom: {attitudes} attitudes hardly check whether "
+        f"order {order} is enough, and the uncertainties hold only if it is; {size + _ENOUGH_DEGREES} or more would "
+        "tell"
+    )
+
+
+def vertical_warnings(found: Found, method: str) -> list[str]:
+    """Name the axes that are vertical, up or down, in more than one attitude, which the linearised's source forbids."""
+    if method != "linearised":
+        return []
+    vertical = near_vertical(forces(found.problem, found.solution)[0], CLOSEST)
+    warnings = []
+    for axis, column in zip(AXES, vertical.T, strict=True):
+        which = np.flatnonzero(column).tolist()
+        if len(which) > 1:
+            named = [found.attitudes.label(index) for index in which[:_MOST_NAMED]]
+            more = f" and {len(which) - _MOST_NAMED} more" if len(which) > _MOST_NAMED else ""
+            warnings.append(
+                f"axis {axis} is vertical within {np.degrees(CLOSEST):.0f} deg in {len(which)} attitudes ("
+                f"{', '.join(named)}{more}): the source of method linearised has no axis vertical in two; "
+                "tumble plan --method linearised chooses attitudes without such"
+            )
+    return warnings
+
+
+def size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
+    """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
+    theta, found = solution.theta[0], []
+    if parse_unit(attitudes.unit).quantity == "acceleration":
+        found += [
+            f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
+            for axis, value in zip(AXES, theta[3:6], strict=True)
+            if abs(value - 1) > _WORST_SCALE
+        ]
+    found += [
+        f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
+        for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
+        if abs(value) > _WORST_MISALIGNMENT
+    ]
+    return found
 
 
 def assumption_notes(stated: Stated | None) -> list[str]:

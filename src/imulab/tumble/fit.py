@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.attitudes import Attitudes
 from imulab.calibration import Calibration
-from imulab.errors import DataError, ObservabilityError, OptionError, listed
+from imulab.errors import DataError, ObservabilityError, OptionError
 from imulab.estimate import (
     Observability,
     covariance,
@@ -24,19 +24,17 @@ from imulab.tumble.axes import check_axes
 from imulab.tumble.blend import Blended, blend_orders, with_known_spread
 from imulab.tumble.checks import check_attitudes, check_residuals
 from imulab.tumble.findings import Found, Stated
-from imulab.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
-from imulab.tumble.montecarlo import check_trials, propagate
+from imulab.tumble.linearised import SOURCE_THRESHOLD, Threshold, solve_linearised
+from imulab.tumble.model import parameter_count, parameter_names
+from imulab.tumble.montecarlo import propagate
+from imulab.tumble.options import FROM_DATA, check_options
 from imulab.tumble.order_zero import with_assumed_alignment
 from imulab.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order, solve_orders
 from imulab.tumble.outliers import NONE_ASIDE, Aside, set_aside
 from imulab.tumble.prior import GROUPS, Aged, Known, entries, findings, known_of, put_together
 from imulab.tumble.record import Scaling, make_record
-from imulab.tumble.solve import Problem, Solution, evaluate, forces, informed_rows, solve_linearised, solve_norm
+from imulab.tumble.solve import Problem, Solution, evaluate, forces, informed_rows, solve_norm
 from imulab.units import parse_unit, to_si
-
-METHODS = ("norm", "linearised")
-LOSSES = ("square", "huber", "auto")
-FROM_DATA = ("auto", "blend")
 
 
 @dataclass(frozen=True)
@@ -79,6 +77,7 @@ def fit_tumble(
     ageing: Sequence[float] = (),
     monte_carlo: int | None = None,
     cross: bool = False,
+    threshold: Sequence[float] | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> TumbleFit:
     """Calibrate an accelerometer triad from static attitudes.
@@ -114,6 +113,9 @@ def fit_tumble(
         Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
     cross
         Whether the model has cross terms k_xy, k_yz, k_zx, at an order that is given; no attitude is set aside then.
+    threshold
+        Changes of scale factors (1), biases (m/s^2) and misalignments (rad) from one pass to the next below which
+        method linearised rests; the source's 5 ppm, 2 ug and 3 arcsec if not given.
     progress
         Called with the number of trials done so far.
 
@@ -130,7 +132,7 @@ def fit_tumble(
     """
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
-        nonlinearity=nonlinearity, cross=cross,
+        nonlinearity=nonlinearity, cross=cross, threshold=threshold,
     )  # fmt: skip
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
@@ -158,7 +160,11 @@ def fit_tumble(
     if known is not None:
         aged = put_together(problem, known, local, _scaled_ageing(ageing, local.value))
         problem = aged.problem
-    solution, seen = _solve(problem, kept, method, choice, aged.solution if aged else fitted.get(problem.order))
+    rest = SOURCE_THRESHOLD
+    if threshold is not None:
+        rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
+    solved = aged.solution if aged else fitted.get(problem.order)
+    solution, seen = _solve(problem, kept, rest if method == "linearised" else None, choice, solved)
     matrix, freedom = (aged.covariance, aged.freedom) if aged else _covariance(problem, solution)
     stated = None if matrix is None else Stated(matrix, freedom)
     if choice is not None and stated is not None:
@@ -192,7 +198,8 @@ def fit_tumble(
         options={"order": order, "method": method, "loss": loss, "gravity": local.value}
         | ({} if nonlinearity is None else {"nonlinearity": list(nonlinearity)})
         | ({} if monte_carlo is None else {"monte_carlo": monte_carlo})
-        | ({"cross": True} if cross else {}),
+        | ({"cross": True} if cross else {})
+        | ({"threshold": rest.in_si(local.value)} if method == "linearised" else {}),
         monte_carlo=trials,
         **_prior_found(prior, known, aged, scaling, local, kept),
     )
@@ -203,64 +210,6 @@ def fit_tumble(
         residuals=local.value * found.solution.deviations[0],
         down_weights=found.solution.down_weights[0],
     )
-
-
-def check_options(
-    order: int | str,
-    method: str,
-    loss: str,
-    *,
-    monte_carlo: int | None = None,
-    with_prior: bool = False,
-    ageing: Sequence[float] = (),
-    nonlinearity: tuple[float, float] | None = None,
-    cross: bool = False,
-) -> None:
-    """Check what can be checked before there is data.
-
-    Raises
-    ------
-    OptionError
-        An option has an unknown value, or does not go with another.
-    """
-    known = ("auto", *range(HIGHEST_ORDER + 1), "blend")
-    if order not in known or isinstance(order, bool):
-        raise OptionError(f"order {order!r}: expected one of {listed(map(str, known), order)}")
-    if method not in METHODS:
-        raise OptionError(f"method {method!r}: expected one of {listed(METHODS, method)}")
-    if loss not in LOSSES:
-        raise OptionError(f"loss {loss!r}: expected one of {listed(LOSSES, loss)}")
-    if loss == "huber" and method == "linearised":
-        raise OptionError("loss huber needs method norm, found method linearised")
-    if order == 0 and method == "linearised":
-        raise OptionError("order 0 needs method norm, found method linearised")
-    if with_prior and (method != "norm" or loss == "huber"):
-        raise OptionError(f"a prior needs method norm and loss square or auto, found method {method} and loss {loss}")
-    if ageing and not with_prior:
-        raise OptionError("ageing without a prior: expected both, it is that of the prior's unit")
-    if len(ageing) > len(GROUPS) or not all(0 <= value < np.inf for value in ageing):
-        raise OptionError(
-            f"ageing {' '.join(f'{value:g}' for value in ageing)}: expected up to three standard deviations of 0 or "
-            "more, of biases (m/s^2), scale factors (1) and misalignments (rad)"
-        )
-    if order == "blend" and (method != "norm" or with_prior or monte_carlo is not None):
-        raise OptionError("order blend needs method norm, and goes neither with a prior nor with monte-carlo")
-    if nonlinearity is not None:
-        if order not in FROM_DATA or with_prior:
-            raise OptionError(f"nonlinearity needs order auto or blend without a prior, found order {order}")
-        if not all(0 < value < np.inf for value in nonlinearity):
-            raise OptionError(f"nonlinearity {nonlinearity}: expected two standard deviations above 0, of k2 and k3")
-    if cross and (method != "norm" or order in (0, *FROM_DATA) or with_prior or monte_carlo is not None):
-        raise OptionError(
-            f"cross needs method norm and an order of 1 to {HIGHEST_ORDER}, and goes with no prior and no monte-carlo"
-        )
-    if monte_carlo is None:
-        return
-    check_trials(monte_carlo)
-    if method != "norm":
-        raise OptionError(f"monte-carlo needs method norm, found method {method}")
-    if with_prior:
-        raise OptionError("monte-carlo draws the attitudes anew, not a prior: expected one of the two options")
 
 
 def _prior_found(
@@ -333,14 +282,21 @@ def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
 
 
 def _solve(
-    problem: Problem, attitudes: Attitudes, method: str, choice: OrderChoice | None, solved: Solution | None
+    problem: Problem,
+    attitudes: Attitudes,
+    linearised: Threshold | None,
+    choice: OrderChoice | None,
+    solved: Solution | None,
 ) -> tuple[Solution, Observability]:
-    """Solve the problem, unless that has been done by norm, and see what it determines."""
+    """Solve the problem, unless that has been done by norm, and see what it determines.
+
+    `linearised` is where method linearised rests, None for method norm.
+    """
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
-    if method == "norm" and choice is not None:
+    if linearised is None and choice is not None:
         solution, seen = choice.solution, choice.observability
     else:
-        solution = solved or _solved(problem, attitudes, method)
+        solution = solved or _solved(problem, attitudes, linearised)
         seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
     if seen.rank < size:
         names = parameter_names(problem.order, problem.cross)
@@ -362,10 +318,10 @@ def _solve(
     return solution, seen
 
 
-def _solved(problem: Problem, attitudes: Attitudes, method: str) -> Solution:
+def _solved(problem: Problem, attitudes: Attitudes, linearised: Threshold | None) -> Solution:
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
-    if method == "linearised" and n >= size:
-        return solve_linearised(problem, attitudes.recording.name)
+    if linearised is not None and n >= size:
+        return solve_linearised(problem, attitudes.recording.name, linearised)
     return solve_norm(problem)
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.recording import Array
 from imulab.tumble.model import norm_and_jacobian, parameter_count
@@ -21,6 +22,8 @@ from imulab.tumble.solve import start_parameters
 CRITERIA = ("A", "D")
 CLOSEST = np.radians(3.0)
 """Two attitudes closer than this are the same attitude: the same axis vertical."""
+_KEPT_CLEAR = 2 * CLOSEST
+"""What a plan with distinct verticals keeps from a vertical axis, so that an attitude put down 3 deg off does too."""
 _STARTS = 12
 _ENOUGH = 600  # attitudes over all starts: with many attitudes the first start is as good as the best
 _SWEEPS = 40
@@ -42,6 +45,12 @@ def information_rows(directions: Array, order: int) -> Array:
     return rows
 
 
+def near_vertical(directions: Array, angle: float) -> NDArray[np.bool_]:
+    """Return which of x, y and z is vertical within `angle`, up or down, at each upward direction, shape (n, 3)."""
+    vertical: NDArray[np.bool_] = np.abs(directions) > np.cos(angle) * np.linalg.norm(directions, axis=1, keepdims=True)
+    return vertical
+
+
 def inverse(information: Array) -> Array:
     """Return the covariance that belongs to an information matrix."""
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
@@ -59,11 +68,14 @@ class Search:
         ``"A"``, least sum of variances, or ``"D"``, least volume of the confidence region.
     before
         Upward directions already measured, shape (k, 3).
+    distinct_verticals
+        Whether x, y and z are each to be vertical, up or down, in one attitude at most.
     """
 
     order: int
     criterion: str
     before: Array
+    distinct_verticals: bool = False
 
     @cached_property
     def base(self) -> Array:
@@ -89,10 +101,13 @@ class Search:
         gain: Array = (carried**2 * weight).sum(axis=1) / variance
         return gain
 
-    def taken(self, points: Array, others: Array) -> Array:
+    def taken(self, points: Array, others: Array) -> NDArray[np.bool_]:
         """Points that would repeat an attitude: it measures nothing new that a longer hold would not."""
         near = np.vstack([others, self.before])
-        repeated: Array = (points @ near.T).max(axis=1, initial=-1.0) > np.cos(CLOSEST)
+        repeated: NDArray[np.bool_] = (points @ near.T).max(axis=1, initial=-1.0) > np.cos(CLOSEST)
+        if self.distinct_verticals:
+            used = near_vertical(near, _KEPT_CLEAR).any(axis=0)
+            repeated |= (near_vertical(points, _KEPT_CLEAR) & used).any(axis=1)
         return repeated
 
 

@@ -6,7 +6,7 @@ every parameter, and the order of the attitudes that turns least.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -68,6 +68,7 @@ def plan_tumble(
     already: Array | None = None,
     source: str = "sphere",
     seed: int = 1,
+    distinct_verticals: bool = False,
 ) -> Plan:
     """Choose attitudes for a tumble test.
 
@@ -91,6 +92,9 @@ def plan_tumble(
         Name of the candidates, for messages.
     seed
         Of the random starts.
+    distinct_verticals
+        Whether x, y and z are each vertical, up or down, in one attitude at most, as the source of method linearised
+        has it; no attitude is put down again then.
 
     Raises
     ------
@@ -116,10 +120,15 @@ def plan_tumble(
     points = _sphere_candidates() if candidates is None else _distinct(candidates)
     if len(points) + len(before) < size:
         raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {size}")
-    search = Search(order, criterion, before)
+    search = Search(order, criterion, before, distinct_verticals)
     best = optimal_set(search, points, attitudes, seed, free=free) if len(points) >= attitudes else None
-    if not free and (best is None or len(_apart(best, before)) < attitudes):
-        apart = _apart(points, before)
+    if not free and (best is None or len(_apart(search, best)) < attitudes):
+        apart = _apart(search, points)
+        if distinct_verticals and len(apart) < attitudes:
+            raise OptionError(
+                f"{source}: {len(apart)} candidate attitudes lie 3 deg apart and repeat no vertical axis; expected at "
+                f"least {attitudes}: ask for fewer, or allow more candidates or --repeated-verticals"
+            )
         best = apart if len(apart) <= attitudes else optimal_set(search, apart, attitudes, seed, free=free)
     if best is None:
         raise ObservabilityError(
@@ -137,18 +146,18 @@ def plan_tumble(
     return Plan(paths, order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
 
 
-def _apart(points: Array, before: Array) -> Array:
-    """Candidates that are no two the same attitude, nor one already there, in their order, shape (k, 3)."""
-    found = list(before)
+def _apart(search: Search, points: Array) -> Array:
+    """Candidates that repeat neither one another nor an attitude already there, in their order, shape (k, 3)."""
+    found = np.empty((0, 3))
     for point in points:
-        if not found or (np.array(found) @ point).max() <= np.cos(CLOSEST):
-            found.append(point)
-    return np.array(found[len(before) :]).reshape(-1, 3)
+        if not search.taken(point[None], found)[0]:
+            found = np.vstack([found, point])
+    return found
 
 
 def _put_down_again(search: Search, points: Array, best: Array, attitudes: int) -> list[Array]:
     """Attitudes that make up the number, in rounds: no attitude is put down a third time before all were twice."""
-    everywhere = best if len(best) else _apart(points, np.empty((0, 3)))
+    everywhere = best if len(best) else _apart(replace(search, before=np.empty((0, 3))), points)
     rows, rounds = information_rows(everywhere, search.order), list[Array]()
     kept, left = information_rows(best, search.order), attitudes - len(best)
     while left > 0:

@@ -15,11 +15,20 @@ from imulab.estimate import Observability, chi_square_probability, coverage_fact
 from imulab.gravity import Gravity, gravity_findings
 from imulab.recording import Array
 from imulab.tumble.checks import shake_warnings
-from imulab.tumble.findings import Found, Stated, aside_warnings, assumption_notes, uncertainty_entries
+from imulab.tumble.findings import (
+    FEW_DEGREES,
+    Found,
+    Stated,
+    aside_warnings,
+    assumption_notes,
+    freedom_finding,
+    size_warnings,
+    uncertainty_entries,
+    vertical_warnings,
+)
 from imulab.tumble.model import (
     AXES,
     GAUGE,
-    MISALIGNMENTS,
     gravity_slope,
     parameter_names,
     parameter_units,
@@ -29,18 +38,13 @@ from imulab.tumble.montecarlo import MonteCarlo
 from imulab.tumble.orders import OrderRow
 from imulab.tumble.patterns import direction_findings, time_findings
 from imulab.tumble.solve import Problem, Solution, data_freedom, forces
-from imulab.units import parse_unit
 
 _STANDS_OUT = 5.0
 _TOO_GOOD = 1e-3
 _MOST_NAMED = 8
-_ENOUGH_DEGREES = 9
-_WORST_SCALE = 0.1
-_WORST_MISALIGNMENT = 0.1
 _DOWN_WEIGHTED = 0.5
 _NOT_BY_CHANCE = 0.01
 _HIGH_CONDITION = 300.0
-_FEW_DEGREES = 5
 _TO_MICRO = 1e6
 
 
@@ -152,6 +156,7 @@ def make_record(
             *_scatter_warnings(problem, solution, chi_square, freedom),
             *shake_warnings(problem.motion, solution),
             *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
+            *vertical_warnings(found, str(options["method"])),
             *aside_warnings(found, options),
             *assumption_notes(stated),
             *findings,
@@ -291,7 +296,7 @@ def _warnings(
         *gravity_findings(gravity, attitudes.recording),
         *_attitude_warnings(attitudes, problem, solution, options),
         *_freedom_warnings(problem, solution, observability),
-        *_size_warnings(attitudes, solution),
+        *size_warnings(attitudes, solution),
     ]
 
 
@@ -364,29 +369,9 @@ def _freedom_warnings(problem: Problem, solution: Solution, observability: Obser
         found.append(
             f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
         )
-    if n - size < _FEW_DEGREES and problem.prior is None:
-        left = f"{n - size} degree{'' if n - size == 1 else 's'} of freedom"
-        found.append(
-            f"only {left}: {n} attitudes hardly check whether order {problem.order} is enough, and the uncertainties "
-            f"hold only if it is; {size + _ENOUGH_DEGREES} or more would tell"
-        )
-    return found
-
-
-def _size_warnings(attitudes: Attitudes, solution: Solution) -> list[str]:
-    """Errors that no accelerometer in physical units has: more likely the columns are not what they are said to be."""
-    theta, found = solution.theta[0], []
-    if parse_unit(attitudes.unit).quantity == "acceleration":
-        found += [
-            f"scale factor of {axis} is off by {100 * (value - 1):+.0f} %: is the unit right?"
-            for axis, value in zip(AXES, theta[3:6], strict=True)
-            if abs(value - 1) > _WORST_SCALE
-        ]
-    found += [
-        f"misalignment_{pair} of {1e3 * value:+.0f} mrad: do the columns belong together?"
-        for pair, value in zip(MISALIGNMENTS, theta[6:9], strict=False)  # order 0 has none
-        if abs(value) > _WORST_MISALIGNMENT
-    ]
+    few = freedom_finding(n, size, problem.order)
+    if few is not None and problem.prior is None:
+        found.append(few)
     return found
 
 
@@ -398,7 +383,7 @@ def _outliers(problem: Problem, solution: Solution) -> dict[int, float]:
     """
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     freedom = n - size
-    if freedom < _FEW_DEGREES:
+    if freedom < FEW_DEGREES:
         return {}
     share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
     standard = np.abs(solution.residuals[0]) / np.sqrt(solution.own_variance[0] * share)

@@ -1,9 +1,9 @@
-"""The estimators of a tumble test, for batches of problems in units of g.
+"""The default estimator of a tumble test, for batches of problems in units of g.
 
-`solve_norm` minimises ``sum_p w_p (|f(M_p)| - 1)^2`` with the model inverted exactly; `solve_linearised` is the
-published first-order iteration. Both return the same `Solution`.
+`solve_norm` minimises ``sum_p w_p (|f(M_p)| - 1)^2`` with the model inverted exactly; the published first-order
+iteration (linearised.py) returns the same `Solution`.
 
-Sources: the method's patent (linearised); noise-length term: second-order expansion of |f + e|.
+Noise-length term: second-order expansion of |f + e|.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.attitudes import Motion
-from imulab.errors import DataError
 from imulab.estimate import (
     Fit,
     huber_weights,
@@ -26,14 +25,8 @@ from imulab.estimate import (
 from imulab.recording import Array
 from imulab.tumble.model import fit_lengths, left_out_lengths, length_noise, norm_and_jacobian, parameter_count
 
-_SCALE_CHANGE = 5e-6
-_BIAS_CHANGE = 2e-6
-_MISALIGNMENT_CHANGE = 3 / 3600 * np.pi / 180
-_LINEARISED_PASSES = 50
-_REWEIGHTING_PASSES = {False: 4, True: 30}
-_WEIGHTS_AT_REST = 1e-4
-_DIVERGED = 0.98
-"""A relative change of scale, or of bias in g, after which the linear step cannot be meant."""
+REWEIGHTING_PASSES = {False: 4, True: 30}
+WEIGHTS_AT_REST = 1e-4
 _FIT_STEPS = 40
 _REFIT_STEPS = 15  # without one attitude of many the solution is near; what wanders for longer is not determined
 _REFIT_AT_MOST = 150
@@ -189,17 +182,17 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
     count, n, _ = problem.reading.shape
     theta = start_parameters(problem.order, count, problem.cross) if start is None else start
     size = theta.shape[1]
-    lengthening, own = _noise(problem, theta)
+    lengthening, own = magnitude_noise(problem, theta)
     variance, down, scale = own, np.ones((count, n)), np.ones(count)
     excess, freedom = np.zeros(count), np.full(count, np.inf)
     iterations = np.zeros(count, dtype=np.int64)
     repeat = problem.robust or problem.covariance is not None
-    for number in range(_REWEIGHTING_PASSES[problem.robust] if repeat else 1):
+    for number in range(REWEIGHTING_PASSES[problem.robust] if repeat else 1):
         # The first pass only has to be good enough to weigh by.
         fit = _least_squares(problem, theta, down / variance, lengthening, 1e-9 if number or not repeat else 1e-4)
         iterations += fit.iterations
         theta, before = fit.parameters, down / variance
-        lengthening, own = _noise(problem, theta, fit.jacobian)
+        lengthening, own = magnitude_noise(problem, theta, fit.jacobian)
         residuals = fit.residuals
         if problem.covariance is not None and problem.excess and not problem.robust:
             excess, freedom = plausible_excess(residuals, own, 1 - leverage(fit.jacobian, 1 / variance))
@@ -209,7 +202,7 @@ def solve_norm(problem: Problem, start: Array | None = None) -> Solution:
             measured = robust_scale(residuals / np.sqrt(variance), size)
             scale = np.maximum(measured, 1.0) if problem.covariance is not None else measured
             down = huber_weights(standard / np.maximum(scale, 1e-12)[:, None])
-        if np.abs(down / variance / before - 1).max() < _WEIGHTS_AT_REST:
+        if np.abs(down / variance / before - 1).max() < WEIGHTS_AT_REST:
             break
     if problem.covariance is None:
         lengthening = np.repeat(_mean_square(fit, down, size)[:, None], n, axis=1)
@@ -262,8 +255,8 @@ def _mean_square(fit: Fit, down: Array, size: int) -> Array:
     return used
 
 
-def _noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tuple[Array, Array]:
-    """Lengthening of |f| by noise, and its variance, shapes (b, n)."""
+def magnitude_noise(problem: Problem, theta: Array, jacobian: Array | None = None) -> tuple[Array, Array]:
+    """Return by how much noise lengthens |f|, and the variance of |f|, shapes (b, n)."""
     if problem.covariance is None:
         return np.zeros(problem.reading.shape[:2]), np.ones(problem.reading.shape[:2])
     if jacobian is None:
@@ -277,7 +270,7 @@ def evaluate(problem: Problem, solution: Solution) -> Solution:
     The excess variance is the solution's; down-weights are ones.
     """
     norm, jacobian, _, _ = norm_and_jacobian(solution.theta, problem.reading, problem.order)
-    lengthening, own = _noise(problem, solution.theta, jacobian)
+    lengthening, own = magnitude_noise(problem, solution.theta, jacobian)
     if problem.covariance is None:
         lengthening = lengthening + solution.lengthening[:, :1]
     residuals = norm - 1 - lengthening
@@ -311,92 +304,3 @@ def leave_one_out(problem: Problem, solution: Solution) -> Array:
         solution.theta, problem.reading, solution.weights, solution.lengthening, problem.order,
         tolerance=_REFIT_TOLERANCE, most=_REFIT_STEPS,
     )  # fmt: skip
-
-
-def solve_linearised(problem: Problem, name: str) -> Solution:
-    """Run the published first-order iteration for a batch of one; weights and excess variance as for `solve_norm`.
-
-    ``sum_i sum_j d_ji a_i^(j+1) + m_1 a_x a_y + m_2 a_y a_z + m_3 a_z a_x = (|B|^2 - 1) / 2``, solved by linear least
-    squares until every change is below 5 ppm, 2 ug and 3 arcsec.
-
-    Raises
-    ------
-    DataError
-        The iteration does not converge, or ends where the model cannot be inverted.
-    """
-    lengthening, own = _noise(problem, start_parameters(problem.order))
-    theta, passes = _linearised_iteration(problem, lengthening[0], own[0], name)
-    solution = _evaluated(problem, theta, passes, name)
-    if problem.covariance is None:
-        return solution
-    for _ in range(_REWEIGHTING_PASSES[False]):
-        before = solution.excess
-        spare = 1 - leverage(solution.jacobian, solution.weights)
-        excess, freedom = plausible_excess(solution.residuals, solution.own_variance, spare)
-        theta, passes = _linearised_iteration(problem, solution.lengthening[0], solution.own_variance[0] + excess, name)
-        solution = _evaluated(problem, theta, passes, name)
-        variance = solution.own_variance + excess[:, None]
-        solution = replace(solution, variance=variance, excess=np.sqrt(excess), freedom=freedom)
-        if np.abs(solution.excess - before).max() <= _WEIGHTS_AT_REST * solution.excess.max():
-            break
-    return solution
-
-
-def _linearised_iteration(problem: Problem, lengthening: Array, variance: Array, name: str) -> tuple[Array, int]:
-    """Repeat the linear step until it rests; return theta, shape (1, p), and the number of passes."""
-    order = problem.order
-    root = 1 / np.sqrt(variance)
-    reading = problem.reading[0]
-    bias, scale, misalignment = np.zeros(3), np.ones(3), np.zeros(3)
-    for number in range(1, _LINEARISED_PASSES + 1):
-        a = reading / scale - bias
-        x = a[:, 0]
-        y = a[:, 1] - misalignment[0] * x
-        z = a[:, 2] - misalignment[1] * x - misalignment[2] * y
-        products = np.column_stack([a[:, 0] * a[:, 1], a[:, 2] * a[:, 0], a[:, 1] * a[:, 2]])
-        design = np.column_stack([*(a ** (j + 1) for j in range(order + 1)), products])
-        right = (x * x + y * y + z * z - 1) / 2 - lengthening
-        solution = np.linalg.lstsq(design * root[:, None], right * root, rcond=None)[0]
-        change = solution[: 3 * (order + 1)].reshape(order + 1, 3)
-        bias = bias + change[0]
-        scale = scale * (1 + change[1])
-        misalignment = misalignment + solution[3 * (order + 1) :]
-        if not (np.abs(change[:2]).max() < _DIVERGED and np.isfinite(solution).all()):
-            break
-        if (
-            np.abs(change[1]).max() < _SCALE_CHANGE
-            and np.abs(change[0]).max() < _BIAS_CHANGE
-            and np.abs(solution[3 * (order + 1) :]).max() < _MISALIGNMENT_CHANGE
-        ):
-            theta = np.concatenate([scale * bias, scale, misalignment, change[2:].ravel()])[None]
-            return theta, number
-    raise DataError(
-        f"{name}: method linearised does not converge on these attitudes (after {number} passes); use --method norm"
-    )
-
-
-def _evaluated(problem: Problem, theta: Array, iterations: int, name: str) -> Solution:
-    """Wrap parameters of the linearised iteration as a solution."""
-    norm, jacobian, _, _ = norm_and_jacobian(theta, problem.reading, problem.order)
-    if not np.isfinite(norm).all():
-        raise DataError(
-            f"{name}: method linearised ends at a nonlinearity under which no specific force leads to some of these "
-            "attitudes; use --method norm"
-        )
-    lengthening, own = _noise(problem, theta, jacobian)
-    n = norm.shape[1]
-    return Solution(
-        theta=theta,
-        residuals=norm - 1 - lengthening,
-        deviations=norm - 1 - (lengthening if problem.motion is not None else 0.0),
-        lengthening=lengthening,
-        jacobian=jacobian,
-        variance=own,
-        own_variance=own,
-        down_weights=np.ones((1, n)),
-        scale=np.ones(1),
-        excess=np.zeros(1),
-        freedom=np.full(1, np.inf),
-        iterations=np.array([iterations]),
-        converged=np.array([True]),
-    )
