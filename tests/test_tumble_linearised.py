@@ -27,6 +27,20 @@ def fit(data, **options):
     ).calibration
 
 
+def test_each_error_of_the_model_is_its_own_unknown_of_the_sources_equation():
+    """The signs and the pairing of products that docs/tumble.md states, from the forward model alone."""
+    names, size = reference.names(2), 1e-6
+    ups = reference.random_attitudes(np.random.default_rng(1), 40)
+    for place, name in enumerate(names):
+        truth = {each: float(each[0] == "s") for each in names}
+        truth[name] += size * {"b": G, "k": 1 / G}.get(name[0], 1.0)
+        x, y, z = a = np.array([reference.forward(G * up, truth, 2) for up in ups]).T / G
+        products = [x * y, z * x, y * z]  # for m_yx, m_zx and m_zy
+        design = np.array([*a, *a**2, *products, *a**3]).T
+        unknowns = np.linalg.lstsq(design, ((a**2).sum(axis=0) - 1) / 2, rcond=None)[0]
+        np.testing.assert_allclose(unknowns / size, np.eye(len(names))[place], rtol=0, atol=1e-4)
+
+
 def test_the_threshold_decides_how_many_passes_are_made():
     """As many as in the transcription of the source, which knows nothing of this one."""
     data = outputs(reference.random_attitudes(np.random.default_rng(1), 30))
@@ -115,9 +129,8 @@ def test_an_axis_vertical_in_two_attitudes_is_warned_of_by_name():
     twice = np.array([*once, tilted])
     (warning,) = [warning for warning in fit(outputs(twice)).warnings if "vertical" in warning]
     last = len(twice)
-    assert warning.startswith(
-        f"axis z is vertical within 3 deg in 2 attitudes (row 1 (line 2), row {last} (line {last + 1})): the source of method"
-    )
+    where = f"row 1 (line 2), row {last} (line {last + 1})"
+    assert warning.startswith(f"axis z is vertical within 3 deg in 2 attitudes ({where}): the source of method")
     norm = il.fit_tumble(il.find_attitudes(table(outputs(twice), "m/s^2", None)), order=2, gravity=G).calibration
     assert not [warning for warning in norm.warnings if "vertical" in warning]
     assert "threshold" not in norm.options

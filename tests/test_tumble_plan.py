@@ -83,7 +83,6 @@ def test_no_two_attitudes_have_the_same_axis_vertical():
     ("order", "attitudes", "candidates"),
     [
         (1, 20, None),
-        (3, 24, None),
         (2, 18, fixture_candidates(np.radians(15))),
         (2, 18, head_candidates(np.radians(5))),
     ],
