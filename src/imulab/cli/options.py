@@ -42,6 +42,7 @@ Window = Annotated[
 ]
 Element = Annotated[str | None, typer.Option("--element", metavar="N", help="One IMU of a file of several, from 1.")]
 _PAPER = (".pdf", ".png", ".svg", ".docx")
+_LARGEST_RECORD = 1 << 26
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
@@ -128,12 +129,18 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
 
 
 def is_json(file: str) -> bool:
-    """Return whether a file is a record rather than a recording, by its first character."""
+    """Return whether a file is a record rather than a recording: an object that holds one of two marks of records."""
+    from imulab.calibration import FORMAT
+
     if file == "-" or (Path(file).exists() and not Path(file).is_file()):
         return False  # a pipe can be read only once, as a recording
     try:
         with Path(file).open("rb") as stream:
-            return stream.read(64).lstrip().startswith(b"{")
+            if not stream.read(64).lstrip().startswith(b"{"):
+                return False
+            stream.seek(0)
+            content = stream.read(_LARGEST_RECORD)
+            return FORMAT.encode() in content or b'"content_sha256"' in content
     except FileNotFoundError:
         raise ReadError(f"{file}: no such file") from None
     except OSError as error:

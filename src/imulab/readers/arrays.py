@@ -33,7 +33,11 @@ def origins(layout: Layout, name: str, kind: str) -> dict[str, tuple[str, int | 
         if not isinstance(entry.origin, str):
             raise ReadError(
                 f"{name}: {layout.name} takes {column} from column {entry.origin}; in a {kind} file they have names: "
-                f'from = "variable" or "group/dataset", with [0] behind it for a column of a matrix'
+                + (
+                    'from = "key" or "object.key", with [0] behind it for a place in an array'
+                    if kind == "JSON"
+                    else 'from = "variable" or "group/dataset", with [0] behind it for a column of a matrix'
+                )
             )
         if entry.date and kind != "JSON":
             raise ReadError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -10,6 +11,7 @@ from typing import Any
 
 from imulab.errors import ReadError
 
+_JSON = re.compile(rb"(\xef\xbb\xbf)?\s*(\{|\[\s*[\[{\]])")  # a line of text may begin with [12.5]
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _MAT = b"MATLAB 5.0 MAT-file"
 _MAT73 = b"MATLAB 7.3 MAT-file"
@@ -61,6 +63,7 @@ FORMATS = (
     Format("PX4 ULog", ".ulg", "ulog", lambda h: h.startswith(b"ULog")),
     Format("MIMU4444 log", ".bin", "mimu", lambda h: _is_mimu(h)),
     Format("ArduPilot DataFlash", ".bin", "dataflash", lambda h: h.startswith(b"\xa3\x95")),
+    Format("JSON", ".json .jsonl", "jsonfile", lambda h: _JSON.match(h) is not None, layout="needed"),
 )
 TEXT = Format("text", ".csv, any", "text", lambda _: True, layout="possible", writes=True)
 

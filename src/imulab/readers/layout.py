@@ -117,6 +117,13 @@ class Layout:
             known if self.sample_rate is None else {**({} if "time" in known else {"time": "s"}), **known, "time": "s"}
         )
 
+    def skipped(self, count: int, *, so_far: bool = False) -> str:
+        """Say how many rows were skipped by ``skip_incomplete``."""
+        what = ("rows were" if count > 1 else "row was") + (" so far" if so_far else "")
+        return (
+            f"{count} {what} skipped that lack a reading of {' '.join(self.columns)} (skip_incomplete in {self.name})"
+        )
+
 
 class Readings:
     """The columns of a file as its layout describes them, block by block: converted, and with their time."""

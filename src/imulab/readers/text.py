@@ -130,12 +130,7 @@ class TextFile:
             raise ReadError(f"{self._name}: no rows of data below the header")
 
     def _skipped(self) -> str:
-        what = "rows were" if self._incomplete > 1 else "row was"
-        what = f"{what} so far" if self._lines.live else what
-        return (
-            f"{self._incomplete} {what} skipped that lack a reading of {' '.join(self._titles)} (skip_incomplete in "
-            f"{self._layout.name if self._layout else 'the layout'})"
-        )
+        return self._layout.skipped(self._incomplete, so_far=self._lines.live) if self._layout else ""
 
     # --- head --------------------------------------------------------------------------------------------------
 

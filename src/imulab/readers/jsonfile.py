@@ -1,0 +1,222 @@
+"""JSON through a layout: an array of records, one record a line, or an object of arrays; ``from = "acc.x"``.
+
+A name leads from key to key. The first array that it meets holds the rows; the rest of the name is looked up in each.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from imulab.calibration import FORMAT
+from imulab.errors import ReadError, meant
+from imulab.readers import _text
+from imulab.readers.arrays import origins, recordings
+from imulab.readers.layout import Layout
+from imulab.readers.text import _DATE
+from imulab.recording import Array, Recording
+from imulab.verdict import Note
+
+LARGEST = 20_000_000
+"""Bytes of a file: what they hold may take 35 times as many in memory."""
+_LISTED = 20
+
+
+class _Literal(str):
+    """NaN, Infinity or -Infinity, which some programs write and JSON does not have."""
+
+
+def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
+    """Yield the columns that a layout names; the file is held in memory.
+
+    Raises
+    ------
+    ReadError
+        The file is too large or not JSON, there is no layout, or a key is not there or holds no numbers.
+    """
+    size = path.stat().st_size
+    if size > LARGEST:
+        raise ReadError(
+            f"{name}: {size / 1e6:.0f} MB of JSON; expected at most {LARGEST / 1e6:.0f} MB, which are held in memory "
+            "as a whole: write CSV, or several files"
+        )
+    try:
+        document = _document(path.read_bytes(), name)
+        if isinstance(document, dict) and document.get("format") == FORMAT:
+            raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
+        if layout is None:
+            found = _listed(_names(document))
+            raise ReadError(f"{name}: say with --layout FILE.toml which key is which column; keys found: {found}")
+    except RecursionError:
+        raise ReadError(f"{name}: nests arrays or objects hundreds of levels deep; expected records") from None
+    values = {}
+    for column, (key, number) in origins(layout, name, "JSON").items():
+        where = f"{name}: {layout.name} takes {column} from {key!r}"
+        values[column] = _values(document, key, number, where, layout.skip_incomplete)
+    yield from _blocks(values, layout, name)
+
+
+def _document(data: bytes, name: str) -> Any:
+    """Return what a file holds; of a record a line, the list of them."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ReadError(f"{name}: byte {error.start}: expected UTF-8 text, as JSON is") from None
+    try:
+        try:
+            return _parsed(text)
+        except json.JSONDecodeError as error:
+            begun = text[: error.pos].strip()
+            if error.msg != "Extra data" or not begun.startswith("{") or "\n" in begun:
+                raise
+            # Commas at the ends of lines move no line, and no column below the first.
+            text = "[" + text.rstrip().replace("}\n", "},\n").replace("}\r\n", "},\r\n") + "]"
+            return _parsed(text)
+    except json.JSONDecodeError as error:
+        _refuse(error, text, name)
+    except ValueError:
+        raise ReadError(f"{name}: a whole number of thousands of digits; expected readings") from None
+
+
+def _parsed(text: str) -> Any:
+    return json.loads(text, parse_constant=_Literal)
+
+
+def _refuse(error: json.JSONDecodeError, text: str, name: str) -> NoReturn:
+    end = "; the file ends there: was it cut?" if not text[error.pos :].strip(" \r\n\t]") else ""
+    said = error.msg[0].lower() + error.msg[1:]
+    raise ReadError(f"{name}: line {error.lineno}, column {error.colno}: not JSON: {said}{end}") from None
+
+
+# --- from keys to columns ------------------------------------------------------------------------------------------
+
+
+def _values(document: Any, key: str, number: int | None, where: str, skips: bool) -> list[Any]:
+    """Return the values of a column, None where one is missing."""
+    rows, rest = document, key
+    while rest and isinstance(rows, dict):
+        if rest in rows:
+            rows, rest = rows[rest], ""
+            continue
+        first, _, after = rest.partition(".")
+        if first not in rows:
+            there = list(islice(_names(document), _LISTED + 1))
+            raise ReadError(f"{where}: no such key, found {_listed(there)}{meant(there, key)}")
+        rows, rest = rows[first], after
+    if not isinstance(rows, list):
+        raise ReadError(f"{where}: expected an array, found {_described(rows)}")
+    values = [_inside(row, rest, number, index, where) for index, row in enumerate(rows, 1)]
+    if KeyError not in values:
+        return values
+    index = values.index(KeyError)
+    if skips and any(value is not KeyError for value in values):
+        return [None if value is KeyError else value for value in values]
+    there = list(islice(_names(rows[index]), _LISTED + 1))
+    other = any(value is not KeyError for value in values)
+    advice = "; skip_incomplete = true in the layout skips such rows" if other else ""
+    raise ReadError(f"{where}: row {index + 1}: no such key, found {_listed(there)}{meant(there, rest)}{advice}")
+
+
+def _inside(value: Any, rest: str, number: int | None, row: int, where: str) -> Any:
+    """Return what a name leads to in a row: None where that is null, `KeyError` where there is no such key."""
+    while rest and value is not None:
+        if not isinstance(value, dict):
+            raise ReadError(f"{where}: row {row}: expected an object with the key {rest!r}, found {_described(value)}")
+        if rest in value:
+            value, rest = value[rest], ""
+            continue
+        first, _, rest = rest.partition(".")
+        value = value.get(first, KeyError) if rest else KeyError
+        if value is KeyError:
+            return KeyError
+    if number is None or value is None:
+        return value
+    if not isinstance(value, list) or len(value) <= number:
+        raise ReadError(f"{where}: row {row}: expected an array with a place [{number}], found {_described(value)}")
+    return value[number]
+
+
+def _blocks(values: dict[str, list[Any]], layout: Layout, name: str) -> Iterator[Recording]:
+    lengths = {column: len(entries) for column, entries in values.items()}
+    count = min(lengths.values())
+    rows, notes = np.arange(1, count + 1), tuple[Note, ...]()
+    if layout.skip_incomplete and max(lengths.values()) == count:
+        whole = np.array([None not in row for row in zip(*values.values(), strict=True)], dtype=bool)
+        skipped = count - int(whole.sum())
+        if skipped:
+            said = layout.skipped(skipped)
+            if skipped == count:
+                raise ReadError(f"{name}: no rows of data: {said}")
+            rows, notes = rows[whole], (Note(said),)
+            values = {key: [entries[row - 1] for row in rows.tolist()] for key, entries in values.items()}
+            lengths = dict.fromkeys(values, len(rows))
+    columns = {key: _column(key, entries, rows, layout, name) for key, entries in values.items()}
+    take = {key: lambda start, stop, column=column: column[start:stop] for key, column in columns.items()}
+    for block in recordings(take, lengths, layout, name):
+        yield replace(block, notes=(*block.notes, *notes)) if notes else block
+
+
+def _column(column: str, values: list[Any], rows: np.ndarray, layout: Layout, name: str) -> Array:
+    """Return the values of a column as numbers; dates as nanoseconds in their bits, as `Readings` takes them."""
+    entry = layout.columns[column]
+    if not entry.date:
+        wrong = next((i for i, value in enumerate(values) if not _is_number(value)), None)
+        if wrong is None:
+            return np.array(values, dtype=np.float64)
+        expected = "a number"
+    else:
+        wrong = next((i for i, value in enumerate(values) if not isinstance(value, str) or "\n" in value), None)
+        out = np.empty((1, len(values) + 1))
+        if wrong is None:
+            lines = "\n".join(values).encode("utf-8", "replace")
+            read, problem, _ = _text.parse(lines, "\x1f", np.array([_DATE], np.int32), out, len(values))
+            if not problem and read == len(values):
+                return out[0, :read]
+            wrong = read
+        expected = "a date and time such as 2026-11-22T15:04:05.250Z"
+    row = wrong + 1 if wrong >= len(rows) else rows[wrong]
+    hint = " (missing readings are written null)" if isinstance(values[wrong], _Literal) else ""
+    raise ReadError(
+        f"{name}: row {row}, key {entry.origin!r}: expected {expected}, found {_described(values[wrong])}{hint}"
+    )
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a number within the range of a double, or missing."""
+    return value is None or (type(value) in (int, float) and abs(value) <= 1.7976931348623157e308)
+
+
+# --- words for messages --------------------------------------------------------------------------------------------
+
+
+def _names(value: Any, prefix: str = "") -> Iterator[str]:
+    """Yield the names that a layout can take columns from; of records those of the first."""
+    first = value[0] if isinstance(value, list) and value else value
+    if not isinstance(first, dict):
+        if prefix:
+            yield prefix
+        return
+    for key, inside in first.items():
+        yield from _names(inside, f"{prefix}.{key}" if prefix else key)
+
+
+def _listed(names: Any) -> str:
+    some = [name if len(name) <= 40 else name[:37] + "..." for name in islice(names, _LISTED + 1)]
+    return (" ".join(some[:_LISTED]) + (" ..." if len(some) > _LISTED else "")) or "no keys"
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"an object ({_listed(value)})"
+    if isinstance(value, list):
+        return f"an array of {len(value)}"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    shown = str(value) if isinstance(value, _Literal | float) else repr(value) if isinstance(value, str) else f"{value}"
+    return shown if len(shown) <= 40 else shown[:37] + "..."
