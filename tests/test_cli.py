@@ -194,8 +194,12 @@ def test_apply_warns_once_beyond_what_the_test_has_seen(imulab, tmp_path):
     done = imulab("apply", "t.json", "wild.csv", "-o", "c.csv")
     assert done.returncode == 0
     assert done.stderr.startswith("imulab: warning: wild.csv: 1 samples beyond 2 g (up to 5.")
-    assert done.stderr.count("\n") == 1
-    assert imulab("apply", "t.json", "t.csv", "-o", "c.csv").stderr == ""
+    _, said = done.stderr.splitlines()
+    rows = len(il.read(tmp_path / "t.csv"))
+    assert said == f"imulab: note: {rows} rows of wild.csv corrected by t.json: c.csv"
+    assert imulab("apply", "t.json", "t.csv", "-o", "c.csv").stderr == said.replace("wild", "t") + "\n"
+    assert imulab("apply", "t.json", "t.csv", "-o", "c.csv", "--quiet").stderr == ""
+    assert imulab("apply", "t.json", "t.csv").stderr.endswith("corrected by t.json: standard output\n")
     twice = imulab("apply", "t.json", "t.json", "t.csv", "-o", "twice.csv")
     assert twice.returncode == 2
     assert "t.csv: already corrected by t.json" in twice.stderr

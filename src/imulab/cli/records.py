@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +25,7 @@ from imulab.cli.options import (
     heard,
     is_json,
     naming,
+    note,
     quantity,
     warn,
 )
@@ -95,7 +97,23 @@ def apply(
     blocks = heard(read_blocks(file, layout, **part), notes=False)
     if temperature_column:
         blocks = with_power_on_temperature(blocks)
-    write_out(apply_blocks(chain, _warned(records, blocks)), output)
+    rows = _Rows()
+    write_out(rows.counted(apply_blocks(chain, _warned(records, blocks))), output)
+    by = " and ".join(dict.fromkeys(Path(name).name for name in names))
+    note(f"{rows.count} rows of {file} corrected by {by}: {output or 'standard output'}")
+
+
+@dataclass
+class _Rows:
+    """How many rows went through."""
+
+    count: int = 0
+
+    def counted(self, blocks: Iterable[Recording]) -> Iterator[Recording]:
+        """Pass blocks on and count their rows."""
+        for block in blocks:
+            self.count += len(block)
+            yield block
 
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
