@@ -210,20 +210,21 @@ def test_a_blob_and_its_copy_hold_the_same_and_the_record_that_they_were_made_fr
     assert holds[1:] == loaded(record).holds
 
 
-def test_a_blob_with_a_section_that_apply_does_not_know_is_refused(tmp_path):
-    text = {"format": "imulab.blob", "sensor": {}, "software": "x", "records": [], "sections": [{"kind": "wings"}]}
-    (tmp_path / "unit.blob").write_bytes(pack(tables_of(madeup.tumble(1)), 4, text))
-    with pytest.raises(RecordError, match=r"unit\.blob: a section 'wings' cannot be applied"):
-        loaded(load_blob(tmp_path / "unit.blob"))
-
-
-def test_the_table_of_an_array_is_for_array_fuse(tmp_path):
-    text = {"format": "imulab.blob", "sensor": {}, "software": "x", "records": [], "sections": [{"kind": "array"}]}
-    (tmp_path / "unit.blob").write_bytes(pack(tables_of(madeup.tumble(1)), 4, text))
-    with pytest.raises(
-        RecordError, match=r"unit\.blob: nothing in this blob corrects a recording; array fuse takes it"
-    ):
-        loaded(load_blob(tmp_path / "unit.blob"))
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("wings", r"unit\.blob: a section 'wings' cannot be applied"),
+        ("array", r"unit\.blob: nothing in this blob corrects a recording; array fuse takes it"),
+    ],
+)
+def test_a_blob_with_a_section_that_apply_does_not_take_is_refused(kind, message, tmp_path):
+    text = {"format": "imulab.blob", "sensor": {}, "software": "x", "records": [], "sections": [{"kind": kind}]}
+    data = pack(tables_of(madeup.tumble(1)), 4, text)
+    with pytest.raises(RecordError, match=message):
+        loaded(Blob("unit.blob", data, text))
+    (tmp_path / "unit.blob").write_bytes(data)
+    with pytest.raises(RecordError, match=rf"unit\.blob: its text speaks of {kind}, but it holds tumble"):
+        load_blob(tmp_path / "unit.blob")
 
 
 @pytest.mark.parametrize(

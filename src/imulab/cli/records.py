@@ -100,7 +100,8 @@ def apply(
     rows = _Rows()
     write_out(rows.counted(apply_blocks(chain, _warned(records, blocks))), output)
     by = " and ".join(dict.fromkeys(Path(name).name for name in names))
-    note(f"{rows.count} rows of {file} corrected by {by}: {output or 'standard output'}")
+    what = "standard input" if file == "-" else file
+    note(f"{rows.count} rows of {what} corrected by {by}: {output or 'standard output'}")
 
 
 @dataclass
