@@ -196,7 +196,7 @@ def test_the_commands_read_json_and_list_its_keys(imulab, file, tmp_path):
     done = imulab("show", "log.json")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
-        "imulab: log.json: say with --layout FILE.toml which key is which column; keys found: t acc.x\n"
+        "imulab: log.json: not a calibration record; of a recording --layout says which key is what; found t acc.x\n"
     )
     file(b'[columns]\ntime = { from = "t", unit = "s" }\naccel_x = { from = "acc.x", unit = "g" }\n', "l.toml")
     assert imulab("convert", "log.json", "--layout", "l.toml", "-o", "out.csv").returncode == 0

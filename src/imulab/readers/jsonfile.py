@@ -52,7 +52,9 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
             raise ReadError(f"{name}: expected a recording, found JSON (a calibration record?)")
         if layout is None:
             found = _listed(_names(document))
-            raise ReadError(f"{name}: say with --layout FILE.toml which key is which column; keys found: {found}")
+            raise ReadError(
+                f"{name}: not a calibration record; of a recording --layout says which key is what; found {found}"
+            )
     except RecursionError:
         raise ReadError(f"{name}: nests arrays or objects hundreds of levels deep; expected records") from None
     values = {}
