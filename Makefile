@@ -58,7 +58,7 @@ docs: $(STAMP) $(VENV)/.docs
 clean:
 	rm -rf $(VENV) demo docs/_build build dist runtime/build
 
-C_SOURCES := $(wildcard src/imulab/*.c src/imulab/*/*.c runtime/*.[ch])
+C_SOURCES := $(wildcard src/imulab/*/*.[ch] src/imulab/procedures/*/*.[ch] runtime/*.[ch])
 
 $(STAMP) $(VENV)/.alone: pyproject.toml CMakeLists.txt $(C_SOURCES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "imulab needs Python 3.11 or later")'

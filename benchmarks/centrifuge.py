@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.centrifuge.fit import fit_centrifuge
-from imulab.centrifuge.manifest import Run, make_manifest
-from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
+from imulab.procedures.centrifuge.fit import fit_centrifuge
+from imulab.procedures.centrifuge.manifest import Run, make_manifest
+from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from imulab.recording import Recording
 
 G = 9.80665

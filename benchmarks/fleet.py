@@ -19,7 +19,7 @@ from timing import Row
 
 import imulab as il
 from imulab.fleet.run import run_fleet
-from imulab.tumble.fit import fit_tumble
+from imulab.procedures.tumble.fit import fit_tumble
 
 G = 9.80665
 UNITS = 1000

@@ -15,10 +15,10 @@ import numpy as np
 from timing import measured, seconds
 
 import imulab as il
-from imulab.gyro_array.fuse import FuseOptions, fuse
-from imulab.noise import allan_deviation
+from imulab.device.unit import array_stream
+from imulab.estimation.allan import allan_deviation
+from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
 from imulab.recording import Recording
-from imulab.runtime import array_stream
 
 _BARE = r"""
 /* The source's recursion and nothing else: six gyros, growing memory, weights not kept. */
@@ -162,7 +162,7 @@ def _noise() -> list[tuple[str, str, str]]:
     peaks = [
         measured("-c", noise + call)[1]
         for call in (
-            "from imulab.noise import allan_deviation; allan_deviation(z, 100.0)",
+            "from imulab.estimation.allan import allan_deviation; allan_deviation(z, 100.0)",
             "import allantools; allantools.oadev(z, rate=100.0, data_type='freq', taus='octave')",
         )
     ]

@@ -16,9 +16,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import madeup
+from imulab.device.unit import Unit
 from imulab.exporters import export
-from imulab.runtime import Unit
-from imulab.tables import MODELS, tables_of
+from imulab.procedures.device_tables import MODELS, tables_of
 
 CORE = Path(__file__).resolve().parents[1] / "runtime"
 SAMPLES = 1_000_000

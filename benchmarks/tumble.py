@@ -9,9 +9,9 @@ import numpy as np
 from timing import Row, exponent, seconds
 
 import imulab as il
-from imulab.tumble.gyro import fit_gyro
-from imulab.tumble.plan import plan_tumble
-from imulab.tumble.solve import Problem, solve_norm
+from imulab.procedures.tumble.gyro import fit_gyro
+from imulab.procedures.tumble.plan import plan_tumble
+from imulab.procedures.tumble.solve import Problem, solve_norm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from reference import tumble as reference

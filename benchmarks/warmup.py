@@ -10,11 +10,11 @@ from collections.abc import Callable
 import numpy as np
 
 import imulab as il
-from imulab.warmup.cycles import find_power_cycle
-from imulab.warmup.fit import WarmupFit
-from imulab.warmup.model import SOURCE_TEMPERATURES, Table, evaluate
-from imulab.warmup.simulate import LAWS, warmup_truth
-from imulab.warmup.table import evaluate_float32, to_int16
+from imulab.procedures.warmup.cycles import find_power_cycle
+from imulab.procedures.warmup.fit import WarmupFit
+from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, Table, evaluate
+from imulab.procedures.warmup.simulate import LAWS, warmup_truth
+from imulab.procedures.warmup.table import evaluate_float32, to_int16
 
 HOUR = np.pi / 180 / 3600
 END = 300.0

@@ -10,13 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import imulab as il
-from imulab.centrifuge.manifest import make_manifest
-from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Truth
 from imulab.cli import main as commands
 from imulab.demo import run
-from imulab.exhibit import BAD, GOOD, Exhibits, Figure
-from imulab.present import exhibits_of
+from imulab.procedures.centrifuge.manifest import make_manifest
+from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Truth
+from imulab.procedures.reports import exhibits_of
 from imulab.report import Card, render, render_index
+from imulab.report.elements import BAD, GOOD, Exhibits, Figure
 
 LEVELS = (1, 2, 5, 10, 15, 20, 30, 40)
 FIGURES = Path(__file__).resolve().parent / "figures"

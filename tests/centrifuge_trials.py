@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.centrifuge.fit import fit_centrifuge
-from imulab.centrifuge.manifest import make_manifest
-from imulab.centrifuge.simulate import Simulation, typical_truth
+from imulab.procedures.centrifuge.fit import fit_centrifuge
+from imulab.procedures.centrifuge.manifest import make_manifest
+from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
 
 G = 9.80665
 LEVELS = (1, 3, 6, 10)

@@ -52,7 +52,7 @@ def noise_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
         return np.zeros(len(residuals)), np.full(len(residuals), np.inf)
 
     for room in ("solve", "prior"):
-        monkeypatch.setattr(f"imulab.tumble.{room}.plausible_excess", none)
+        monkeypatch.setattr(f"imulab.procedures.tumble.{room}.plausible_excess", none)
 
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.calibration import Calibration, Covariance, Parameter
+from imulab.records.calibration import Calibration, Covariance, Parameter
 from reference import tumble as reference
 
 G = 9.80665

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imulab.applying import apply, apply_blocks, warnings_of
-from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import DataError, RecordError, UnitError
+from imulab.procedures.apply import apply, apply_blocks, warnings_of
 from imulab.recording import Recording
+from imulab.records.calibration import Calibration, Covariance, Parameter
 from reference import tumble as reference
 
 G = 9.80665

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imulab.bulk import bulk, edge_marks, edge_note
+from imulab.report.bulk import bulk, edge_marks, edge_note
 
 
 def test_a_single_far_value_does_not_flatten_the_rest():

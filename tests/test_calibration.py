@@ -12,10 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from imulab.calibration import Calibration, Covariance, Parameter, content_sha256, json_text, load, loads, loads_sealed
+from imulab.atomic_write import replacing, write_text
 from imulab.errors import OptionError, RecordError
-from imulab.files import replacing, write_text
 from imulab.recording import Source
+from imulab.records.calibration import (
+    Calibration,
+    Covariance,
+    Parameter,
+    content_sha256,
+    json_text,
+    load,
+    loads,
+    loads_sealed,
+)
 
 FIXED = settings(derandomize=True, database=None, deadline=None, max_examples=200)
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.centrifuge.manifest import make_manifest
-from imulab.centrifuge.plan import plan_centrifuge
-from imulab.centrifuge.simulate import Simulation, typical_truth
 from imulab.errors import DataError, OptionError, RecordError, UnitError
-from imulab.exhibit import Figure
-from imulab.present import exhibits_of
+from imulab.procedures.centrifuge.manifest import make_manifest
+from imulab.procedures.centrifuge.plan import plan_centrifuge
+from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
+from imulab.procedures.reports import exhibits_of
 from imulab.recording import Recording
 from imulab.report import render
+from imulab.report.elements import Figure
 
 G = 9.80665
 DEG_H = np.pi / 180 / 3600

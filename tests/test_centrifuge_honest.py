@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.centrifuge.curve import fit_curve
-from imulab.centrifuge.manifest import load_manifest, make_manifest, manifest_text
-from imulab.centrifuge.simulate import Simulation, typical_truth
+from imulab.procedures.centrifuge.curve import fit_curve
+from imulab.procedures.centrifuge.manifest import load_manifest, make_manifest, manifest_text
+from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
 
 G = 9.80665
 NET = np.radians(40.0)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.centrifuge.curve import fit_curve
-from imulab.centrifuge.manifest import make_manifest
-from imulab.centrifuge.model import fog_share
-from imulab.centrifuge.repeat import Deviations, find_repeatability
-from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from imulab.errors import OptionError
+from imulab.procedures.centrifuge.curve import fit_curve
+from imulab.procedures.centrifuge.manifest import make_manifest
+from imulab.procedures.centrifuge.model import fog_share
+from imulab.procedures.centrifuge.repeat import Deviations, find_repeatability
+from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from reference import centrifuge as reference
 
 G, DEG_H = reference.G, reference.DEG_H

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imulab.centrifuge.manifest import Manifest, Run, make_manifest
-from imulab.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from imulab.errors import OptionError
+from imulab.procedures.centrifuge.manifest import Manifest, Run, make_manifest
+from imulab.procedures.centrifuge.simulate import AxisTruth, FogTruth, RigTruth, Simulation, Truth, typical_truth
 from reference import centrifuge as reference
 
 G, DEG_H = reference.G, reference.DEG_H

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from imulab.calibration import Calibration, Covariance, Parameter
-from imulab.changes import compare_records
 from imulab.cli import main
 from imulab.errors import RecordError
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.comparison import compare_records
 
 NAMES = ("x_K0", "x_direction", "y_K0")
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.centrifuge.plan import plan_centrifuge
 from imulab.cli import common, main
 from imulab.cli.app import command
 from imulab.errors import OptionError
-from imulab.texts import interval
+from imulab.procedures.centrifuge.plan import plan_centrifuge
+from imulab.quantities import interval
 
 ROOT = Path(__file__).resolve().parents[1]
 G = "9.80665"

@@ -8,10 +8,10 @@ import pytest
 
 import imulab as il
 import madeup
-from imulab.applying import loaded, warnings_of
-from imulab.blob import load_blob
 from imulab.cli import main
+from imulab.device.blob import load_blob
 from imulab.errors import DataError
+from imulab.procedures.apply import loaded, warnings_of
 from imulab.recording import Recording
 from imulab.writers import write
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from imulab.estimate import (
+from imulab.estimation.estimate import (
     bayesian_information,
     chi_square_limit,
     covariance,

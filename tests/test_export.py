@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import EXPORTERS, ExportOptions, export
 from imulab.recording import Recording
+from imulab.records.calibration import Calibration, Covariance, Parameter
 from reference import programs
 
 G = 9.80665

@@ -10,13 +10,13 @@ import pytest
 import imulab as il
 import madeup
 from conftest import REPOSITORY
-from imulab.arraytable import METHODS, Fusion
 from imulab.cli import main
+from imulab.device.array_settings import METHODS, Fusion
+from imulab.device.tables import pack
+from imulab.device.unit import ArraySettings, Stream, Unit, array_table
 from imulab.exporters import export
 from imulab.exporters.c import _header
-from imulab.packing import pack
-from imulab.runtime import ArraySettings, Stream, Unit, array_table
-from imulab.tables import MODELS, tables_of
+from imulab.procedures.device_tables import MODELS, tables_of
 
 G = madeup.G
 MANY = 1_000_000

@@ -11,9 +11,9 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, OptionError, ReadError, UnitError
+from imulab.quantities import quantity
 from imulab.readers.layout import EXAMPLE, load_layout
 from imulab.recording import Recording
-from imulab.texts import quantity
 from imulab.units import STANDARD_GRAVITY as G
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

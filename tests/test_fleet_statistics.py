@@ -9,7 +9,6 @@ import pytest
 import scipy.stats
 
 from fleets import G, make_fleet, write_attitudes, write_manifest
-from imulab.calibration import Parameter
 from imulab.cli import main
 from imulab.errors import ImulabError
 from imulab.fleet.display import display_of, to_parameter_unit
@@ -29,6 +28,7 @@ from imulab.fleet.statistics import (
     outlier_limit,
 )
 from imulab.fleet.work import Summary
+from imulab.records.calibration import Parameter
 
 
 def summary(serial, value, *, u=0.1, when="2026-01-01T00:00:00Z", unit="m/s^2", freedom=None, sha="s", inputs=("f",)):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.calibration import Calibration, Covariance, Parameter
 from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.records.calibration import Calibration, Covariance, Parameter
 from reference.flightlogs import dataflash, ulog
 
 ACCEL = (

@@ -9,15 +9,15 @@ import pytest
 
 import imulab as il
 import madeup
-from imulab.blob import load_blob, tables_of_all
-from imulab.calibration import loads
 from imulab.cli import main
+from imulab.device.blob import load_blob, tables_of_all
+from imulab.device.tables import pack
 from imulab.errors import RecordError
 from imulab.exporters import ExportOptions
-from imulab.jsontext import content_sha256
-from imulab.packing import pack
+from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.recording import Recording
-from imulab.tumble.simulate import simulate_tumble
+from imulab.records.calibration import loads
+from imulab.records.json_text import content_sha256
 
 HIDDEN = ["\n", "\x1b[2J", "\x85", "\u2028", "\u2029", "\u202e", "\u2066", "\x00", "\x7f"]
 

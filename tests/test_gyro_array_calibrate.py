@@ -7,11 +7,11 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, ObservabilityError, RecordError, UnitError
-from imulab.gyro_array.align import align, nominal_orientation
-from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import FuseOptions, fuse
-from imulab.gyro_array.simulate import NoiseModel, simulate_array
-from imulab.present import exhibits_of
+from imulab.procedures.gyro_array.align import align, nominal_orientation
+from imulab.procedures.gyro_array.fit import calibrate_array
+from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
+from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
+from imulab.procedures.reports import exhibits_of
 from imulab.recording import Recording
 from test_gyro_array_fuse import array_recording
 

@@ -7,9 +7,9 @@ sigma the largest noise of one gyro, 0.08 deg/s.
 import numpy as np
 import pytest
 
-from imulab.gyro_array.fuse import Fused, FuseOptions, fuse
-from imulab.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
-from imulab.runtime import array_stream
+from imulab.device.unit import array_stream
+from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse
+from imulab.procedures.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
 from reference import gyro_array as reference
 from test_gyro_array_fuse import array_recording, dynamic
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.arraytable import ArraySettings
-from imulab.blob import Blob, make_blob
-from imulab.gyro_array.fit import calibrate_array
-from imulab.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream
-from imulab.gyro_array.memory import parse_memory
-from imulab.gyro_array.model import METHODS, find_elements
-from imulab.gyro_array.simulate import Fault, NoiseModel, simulate_array
+from imulab.device.array_settings import ArraySettings
+from imulab.device.blob import Blob, make_blob
+from imulab.device.unit import Stream
+from imulab.procedures.device_tables import tables_of
+from imulab.procedures.gyro_array.fit import calibrate_array
+from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream
+from imulab.procedures.gyro_array.memory import parse_memory
+from imulab.procedures.gyro_array.model import METHODS, find_elements
+from imulab.procedures.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.recording import Recording
-from imulab.runtime import Stream
-from imulab.tables import tables_of
 from reference import gyro_array as reference
 
 
@@ -174,7 +174,7 @@ def test_robust_comes_within_2_percent_of_the_best_fixed_weights(seed):
 
 
 def test_the_gain_of_kalman_is_that_of_an_iterated_riccati_equation():
-    from imulab.gyro_array.kalman import steady_gain
+    from imulab.procedures.gyro_array.kalman import steady_gain
 
     white, walk, rate_walk, dt = np.array([0.04, 0.06, 0.08]), np.array([1e-3, 2e-3, 1e-3]), 0.3, 0.02
     gain = steady_gain(white, walk, rate_walk, dt)
@@ -421,7 +421,7 @@ def test_faults_of_the_simulator_are_where_they_should_be():
 _RESUME = """
 import sys
 import numpy as np
-from imulab.runtime import Stream
+from imulab.device.unit import Stream
 stream = Stream.from_state(open(sys.argv[1], "rb").read())
 np.save(sys.argv[3], stream.process(np.load(sys.argv[2])).rate)
 """

@@ -5,7 +5,7 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError
-from imulab.gyro_array.merge import merge_recordings
+from imulab.procedures.gyro_array.merge import merge_recordings
 from imulab.recording import Recording
 
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imulab import _digits
-from imulab.jsontext import content_sha256, json_text, sealed_text
+from imulab.records.json_text import content_sha256, json_text, sealed_text
+from imulab.writers import _digits
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 whole = st.integers() | st.integers(-(2**70), 2**70)

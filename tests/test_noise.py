@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imulab.allan import analyse, column_noise, noise_lines
-from imulab.coefficients import read_coefficients
 from imulab.errors import DataError, OptionError
-from imulab.lines import spectral_lines
-from imulab.noise import allan_deviation
+from imulab.estimation.allan import allan_deviation
+from imulab.estimation.column_noise import analyse, column_noise, noise_lines
+from imulab.estimation.noise_coefficients import read_coefficients
+from imulab.estimation.sampling import sampling_rate
+from imulab.estimation.spectral_lines import spectral_lines
 from imulab.recording import Recording
-from imulab.sampling import sampling_rate
 
 
 @pytest.mark.parametrize("count", [5, 57, 1000, 65_537])

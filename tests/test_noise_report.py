@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import chi2
 
 import imulab as il
-from imulab.allan import analyse
-from imulab.exhibit import Figure
-from imulab.noisefigures import exhibits_of_noise, interval
+from imulab.estimation.column_noise import analyse
+from imulab.report.elements import Figure
+from imulab.report.noise_figures import exhibits_of_noise, interval
 
 RATE = 50.0
 

@@ -11,9 +11,9 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import RecordError
-from imulab.exhibit import Exhibits, Figure, Table, format_uncertain
-from imulab.present import exhibits_of
+from imulab.procedures.reports import exhibits_of
 from imulab.report import render_page
+from imulab.report.elements import Exhibits, Figure, Table, format_uncertain
 from imulab.report.narrow import narrow
 from reference import tumble as reference
 

@@ -5,9 +5,9 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError
+from imulab.estimation.rows import leave_out
+from imulab.procedures.tumble.gyro import fit_gyro
 from imulab.recording import Recording
-from imulab.rows import leave_out
-from imulab.tumble.gyro import fit_gyro
 from imulab.verdict import Note
 from test_tumble_hold import errors, fitted, held
 
@@ -176,7 +176,7 @@ def test_an_array_is_calibrated_as_without_the_rows():
 
 
 def test_allan_is_as_without_the_rows():
-    from imulab.allan import analyse
+    from imulab.estimation.column_noise import analyse
 
     clean = still_array()
     bad, rows = blanked(clean)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import madeup
-from imulab import _runtime
-from imulab.arraytable import METHODS
+from imulab.device import _runtime
+from imulab.device.array_settings import METHODS
+from imulab.device.tables import pack
+from imulab.device.unit import ALONE, NOT_FINITE, ArraySettings, Stream, Unit, array_stream, array_table, fuse_table
 from imulab.errors import DataError, OptionError, RecordError
-from imulab.packing import pack
-from imulab.runtime import ALONE, NOT_FINITE, ArraySettings, Stream, Unit, array_stream, array_table, fuse_table
-from imulab.tables import MODELS, tables_of
+from imulab.procedures.device_tables import MODELS, tables_of
 
 
 def readings(samples=600, elements=6, axes=1, seed=1):
@@ -76,7 +76,7 @@ def test_a_stream_goes_on_in_another_process(method, tmp_path):
     (tmp_path / "state").write_bytes(first.state())
     np.save(tmp_path / "z.npy", z[333:])
     script = (
-        "import numpy as np; from imulab.runtime import Stream\n"
+        "import numpy as np; from imulab.device.unit import Stream\n"
         "stream = Stream.from_state(open('state', 'rb').read())\n"
         "np.save('rate.npy', stream.process(np.load('z.npy')).rate)\n"
     )

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imulab.arraytable import METHODS
-from imulab.runtime import ArraySettings, Stream
+from imulab.device.array_settings import METHODS
+from imulab.device.unit import ArraySettings, Stream
 
 SAMPLES = 2000
 

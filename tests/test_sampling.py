@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.allan import analyse
 from imulab.errors import DataError
+from imulab.estimation.column_noise import analyse
+from imulab.estimation.sampling import bridged, sampling_rate, steady_part
 from imulab.recording import Recording
-from imulab.sampling import bridged, sampling_rate, steady_part
 
 
 def noise(time, unit="s", seed=1):

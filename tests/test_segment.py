@@ -8,10 +8,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from imulab import segment
 from imulab.errors import DataError, ImulabError, SegmentError, UnitError
+from imulab.procedures.tumble import segment
+from imulab.procedures.tumble.segment import find_attitudes
 from imulab.recording import Recording
-from imulab.segment import find_attitudes
 from reference import tumble as reference
 
 G = 9.8

@@ -9,9 +9,9 @@ from scipy import stats
 
 import imulab as il
 from conftest import sap5_table, table
-from imulab.changes import compare_records
 from imulab.errors import RecordError, UnitError
-from imulab.tumble.compare import check_tumble
+from imulab.procedures.tumble.compare import check_tumble
+from imulab.records.comparison import compare_records
 from reference import tumble as reference
 
 G = 9.80665

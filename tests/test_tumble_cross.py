@@ -8,10 +8,10 @@ import pytest
 
 import imulab as il
 from conftest import table
-from imulab.blob import load_blob
+from imulab.device.blob import load_blob
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions, export
-from imulab.tumble.model import norm_and_jacobian, parameter_count
+from imulab.procedures.tumble.model import norm_and_jacobian, parameter_count
 from reference import tumble as reference
 
 G = 9.80665

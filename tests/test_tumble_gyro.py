@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 
 import imulab as il
 from imulab.errors import DataError, OptionError, SegmentError
-from imulab.present import exhibits_of
-from imulab.rotation import frame_rotations, weighted_turns
-from imulab.tumble.gyro import PAIRS, fit_gyro, gyro_names
-from imulab.tumble.gyrorecord import with_gyro
+from imulab.procedures.reports import exhibits_of
+from imulab.procedures.tumble.gyro import PAIRS, fit_gyro, gyro_names
+from imulab.procedures.tumble.gyrorecord import with_gyro
+from imulab.procedures.tumble.rotation import frame_rotations, weighted_turns
 from reference import tumble as reference
 
 G = 9.80665
@@ -265,7 +265,7 @@ def test_a_clock_that_is_off_is_said(case, late, words):
 
 def test_a_fit_that_has_not_settled_is_no_result(case, monkeypatch):
     recording, attitudes, record = case
-    module = sys.modules["imulab.tumble.gyrosolve"]
+    module = sys.modules["imulab.procedures.tumble.gyrosolve"]
     settled = module.least_squares
     monkeypatch.setattr(module, "least_squares", partial(settled, max_evaluations=1))
     with pytest.raises(DataError, match=r"does not converge on these \d+ turns \(condition number \d+\)"):

@@ -8,9 +8,9 @@ import pytest
 
 import imulab as il
 from imulab.errors import OptionError
-from imulab.present import exhibits_of
-from imulab.tumble.gyro import fit_gyro
-from imulab.tumble.gyrorecord import with_gyro
+from imulab.procedures.reports import exhibits_of
+from imulab.procedures.tumble.gyro import fit_gyro
+from imulab.procedures.tumble.gyrorecord import with_gyro
 from imulab.verdict import Bad, Note
 from reference.turns import GRAVITY, accelerometers, gyroscopes, random_path, random_unit
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import butter, sosfilt
 
 import imulab as il
+from imulab.procedures.tumble.model import length_noise, norm_and_jacobian
 from imulab.recording import Recording
-from imulab.tumble.model import length_noise, norm_and_jacobian
 from reference import tumble as reference
 
 G, RATE = 9.81362, 100.0

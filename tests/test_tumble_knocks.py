@@ -9,9 +9,9 @@ import pytest
 import imulab as il
 from conftest import table
 from imulab.errors import OptionError
-from imulab.present import exhibits_of
-from imulab.tumble.gyro import fit_gyro
-from imulab.tumble.outliers import _best_subset, _extended, _Whitened
+from imulab.procedures.reports import exhibits_of
+from imulab.procedures.tumble.gyro import fit_gyro
+from imulab.procedures.tumble.outliers import _best_subset, _extended, _Whitened
 from imulab.verdict import Note
 from reference import tumble as reference
 

@@ -8,9 +8,9 @@ import pytest
 from scipy import optimize
 
 import madeup
-from imulab.runtime import Unit
-from imulab.tables import tables_of
-from imulab.tumble.model import (
+from imulab.device.unit import Unit
+from imulab.procedures.device_tables import tables_of
+from imulab.procedures.tumble.model import (
     fit_lengths,
     invert,
     left_out_lengths,

@@ -9,7 +9,7 @@ from scipy import stats
 import imulab as il
 from conftest import sap5_table, table
 from imulab.errors import ObservabilityError, OptionError
-from imulab.tumble.plan import plan_tumble
+from imulab.procedures.tumble.plan import plan_tumble
 from imulab.verdict import Note
 from reference import tumble as reference
 

@@ -8,10 +8,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import imulab as il
-from imulab.calibration import Calibration, Covariance
 from imulab.errors import ObservabilityError, OptionError
-from imulab.tumble.plan import fixture_candidates, head_candidates, information_rows, plan_tumble, roll_pitch, turning
-from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
+from imulab.procedures.tumble.plan import (
+    fixture_candidates,
+    head_candidates,
+    information_rows,
+    plan_tumble,
+    roll_pitch,
+    turning,
+)
+from imulab.procedures.tumble.sheet import attitude_picture, directions_of, plan_recording
+from imulab.records.calibration import Calibration, Covariance
 from reference import tumble as reference
 
 G = 9.80665

@@ -8,8 +8,8 @@ import pytest
 
 import imulab as il
 from conftest import table
-from imulab.calibration import Covariance
 from imulab.errors import OptionError, RecordError
+from imulab.records.calibration import Covariance
 from reference import tumble as reference
 
 G = 9.80665

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import madeup
-from imulab.calibration import Parameter
+from imulab.device.tables import KINDS, pack
+from imulab.device.unit import ArraySettings, Unit, array_table
 from imulab.errors import RecordError
-from imulab.packing import KINDS, pack
-from imulab.runtime import ArraySettings, Unit, array_table
-from imulab.tables import monotone_range, tables_of, warmup_table
+from imulab.procedures.device_tables import monotone_range, tables_of, warmup_table
+from imulab.records.calibration import Parameter
 
 
 def fields_of(table):

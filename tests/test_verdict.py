@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 import imulab as il
-from imulab.calibration import loads
 from imulab.errors import RecordError
-from imulab.jsontext import content_sha256
-from imulab.tumble.simulate import simulate_tumble
+from imulab.procedures.tumble.simulate import simulate_tumble
+from imulab.records.calibration import loads
+from imulab.records.json_text import content_sha256
 from imulab.verdict import Bad, Note, Verdict, verdict_of
 
 

@@ -10,9 +10,9 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.warmup.apply import record_table
-from imulab.warmup.figures import exhibits
-from imulab.warmup.model import evaluate
+from imulab.procedures.warmup.apply import record_table
+from imulab.procedures.warmup.figures import exhibits
+from imulab.procedures.warmup.model import evaluate
 from reference import flightlogs
 from reference import warmup as reference
 
@@ -317,7 +317,7 @@ def test_other_procedures_records_have_no_table_and_other_commands_know_this_one
     assert main(["report", str(record), "-o", str(tmp_path / "r.html")]) == 0
     damaged = json.loads(record.read_text())
     damaged["table"]["settling_time"] = 0
-    from imulab.calibration import content_sha256
+    from imulab.records.calibration import content_sha256
 
     damaged["content_sha256"] = content_sha256(damaged)
     (tmp_path / "d.json").write_text(json.dumps(damaged))

@@ -7,9 +7,9 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, UnitError
+from imulab.procedures.warmup.curves import bin_edges
+from imulab.procedures.warmup.cycles import common_axes, find_power_cycle, gauss_nodes, merge
 from imulab.recording import Recording
-from imulab.warmup.curves import bin_edges
-from imulab.warmup.cycles import common_axes, find_power_cycle, gauss_nodes, merge
 
 
 def a_cycle(*, rate=50.0, duration=400.0, temperature="-20", unit="deg/h", seed=1, **columns):

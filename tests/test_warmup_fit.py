@@ -7,12 +7,12 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError
+from imulab.procedures.warmup.curves import make_curves
+from imulab.procedures.warmup.cycles import find_power_cycle
+from imulab.procedures.warmup.model import evaluate
+from imulab.procedures.warmup.simulate import warmup_truth
+from imulab.procedures.warmup.solve import coefficient_covariance, solve, statistics
 from imulab.recording import Recording
-from imulab.warmup.curves import make_curves
-from imulab.warmup.cycles import find_power_cycle
-from imulab.warmup.model import evaluate
-from imulab.warmup.simulate import warmup_truth
-from imulab.warmup.solve import coefficient_covariance, solve, statistics
 from reference import warmup as reference
 
 AT = [-40.0, -30, -20, -10, 0, 40, 50, 60]

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import imulab as il
-from imulab.blob import load_any
 from imulab.cli import main
+from imulab.device.blob import load_any
 from imulab.exporters import export
-from imulab.present import exhibits_of
+from imulab.procedures.reports import exhibits_of
+from imulab.procedures.warmup.apply import record_table
+from imulab.procedures.warmup.fit import fit_warmup
+from imulab.procedures.warmup.model import evaluate
 from imulab.verdict import Bad
-from imulab.warmup.apply import record_table
-from imulab.warmup.fit import fit_warmup
-from imulab.warmup.model import evaluate
 
 AT = (-20.0, 0.0, 20.0)
 AXES = ("gyro_x", "gyro_y")
@@ -295,7 +295,7 @@ def test_a_knock_that_fills_whole_bins_is_left_out_and_an_odd_cycle_is_named() -
 
 
 def test_time_must_rise_from_block_to_block(folder: Path) -> None:
-    from imulab.applying import apply_blocks
+    from imulab.procedures.apply import apply_blocks
 
     start = cycle(3.0, 1)
     first = replace(start, columns={n: v[:500] for n, v in start.columns.items()})

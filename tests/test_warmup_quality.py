@@ -7,11 +7,11 @@ import pytest
 
 import imulab as il
 from imulab.errors import DataError, OptionError
+from imulab.procedures.warmup.curves import make_curves
+from imulab.procedures.warmup.cycles import find_power_cycle
+from imulab.procedures.warmup.model import evaluate
+from imulab.procedures.warmup.solve import coefficients_of, fitted_noise, solve, statistics
 from imulab.recording import Recording
-from imulab.warmup.curves import make_curves
-from imulab.warmup.cycles import find_power_cycle
-from imulab.warmup.model import evaluate
-from imulab.warmup.solve import coefficients_of, fitted_noise, solve, statistics
 from test_warmup_fit import END, HOUR, cycle_of
 
 

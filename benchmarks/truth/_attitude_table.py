@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import imulab as il
-from imulab.calibration import Calibration
 from imulab.recording import Recording
+from imulab.records.calibration import Calibration
 
 G = 9.80665
 UG = G * 1e-6

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import imulab as il
-from imulab.centrifuge.manifest import parse_manifest
+from imulab.procedures.centrifuge.manifest import parse_manifest
 
 G = 9.80665
 DEG_PER_HOUR = np.pi / 180 / 3600

@@ -30,7 +30,7 @@ def _sensor(n: int, rate: float, corner: float, rng: np.random.Generator) -> np.
 
 
 def _analysed(time: np.ndarray, samples: np.ndarray, unit: str = "s") -> tuple[dict, list[str]]:
-    from imulab.allan import analyse
+    from imulab.estimation.column_noise import analyse
     from imulab.recording import Recording
 
     recording = Recording({"time": time, "gyro_x": samples}, {"time": unit, "gyro_x": "rad/s"}, name="still")

@@ -67,7 +67,7 @@ def _sensing(kind: str, axes: int, n: int, rng: np.random.Generator) -> np.ndarr
 def _calibrate(seed: int, *, kind: str, axes: int, size: float, slow: float, part: float) -> Trial:
     """`array calibrate` of a recording that moves by `size`, deg/s, in all but the first `part` of it."""
     from imulab.errors import ImulabError
-    from imulab.gyro_array.fit import calibrate_array
+    from imulab.procedures.gyro_array.fit import calibrate_array
 
     rng = np.random.default_rng([seed, 12])
     count, n = 6000, 6
@@ -91,9 +91,9 @@ def _calibrate(seed: int, *, kind: str, axes: int, size: float, slow: float, par
 def _said(seed: int, *, what: str, command: str, kind: str = "", fault: str = "", word: str = "") -> Trial:
     """Whether a command says a word of an array on which something is wrong."""
     from imulab.errors import ImulabError
-    from imulab.gyro_array.compare import compare_methods
-    from imulab.gyro_array.fit import calibrate_array
-    from imulab.gyro_array.fuse import FuseOptions, fuse
+    from imulab.procedures.gyro_array.compare import compare_methods
+    from imulab.procedures.gyro_array.fit import calibrate_array
+    from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
 
     rng = np.random.default_rng([seed, 13])
     axes, n, count = (3 if kind == "swapped" else 1), 6, 4000

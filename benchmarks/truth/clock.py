@@ -12,8 +12,8 @@ from scipy.stats import t as student
 
 import imulab as il
 from imulab.errors import ImulabError
-from imulab.tumble.gyro import fit_gyro
-from imulab.tumble.gyrorecord import with_gyro
+from imulab.procedures.tumble.gyro import fit_gyro
+from imulab.procedures.tumble.gyrorecord import with_gyro
 from imulab.verdict import Note
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scenario import Scenario, Trial
 
 import imulab as il
-from imulab.calibration import Calibration
 from imulab.gravity import Gravity, gravity_option
 from imulab.recording import Recording
+from imulab.records.calibration import Calibration
 
 G = 9.80665
 UG = 1e-6 * G

@@ -61,7 +61,7 @@ def tumble(seed: int, fault: Fault, every: int, step: float) -> Trial:
 def array(seed: int, command: str, every: int) -> Trial:
     """Six gyros at rest, every so-manieth row at zero: error of biases or rate, deg/s, or relative one of the noise."""
     import imulab as il
-    from imulab.allan import analyse
+    from imulab.estimation.column_noise import analyse
     from imulab.recording import Recording
 
     rng = np.random.default_rng(seed)

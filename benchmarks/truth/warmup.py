@@ -63,7 +63,7 @@ def fitted(change, word: str, seed: int) -> Trial:
 
 def applied(change, word: str, seed: int) -> Trial:
     """Whether `apply` refuses a recording that was changed, and says why."""
-    from imulab.applying import apply_blocks
+    from imulab.procedures.apply import apply_blocks
 
     record = _small(seed).calibration
     start = change(Chamber(scatter=0.0).cycle(10.0, np.random.default_rng(10_000 + seed)))

@@ -28,78 +28,78 @@ from typing import TYPE_CHECKING, Any
 from imulab._version import VERSION as __version__  # noqa: N811
 
 if TYPE_CHECKING:
-    from imulab.applying import apply as apply
-    from imulab.attitudes import Attitudes as Attitudes
-    from imulab.calibration import Calibration as Calibration
-    from imulab.calibration import load as load
-    from imulab.centrifuge.fit import CentrifugeFit as CentrifugeFit
-    from imulab.centrifuge.fit import fit_centrifuge as fit_centrifuge
-    from imulab.centrifuge.manifest import load_manifest as load_manifest
-    from imulab.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
     from imulab.errors import ImulabError as ImulabError
+    from imulab.estimation.allan import allan_deviation as allan_deviation
     from imulab.exporters import export as export
     from imulab.gravity import normal_gravity as normal_gravity
-    from imulab.gyro_array.compare import compare_methods as compare_methods
-    from imulab.gyro_array.fit import ArrayFit as ArrayFit
-    from imulab.gyro_array.fit import calibrate_array as calibrate_array
-    from imulab.gyro_array.fuse import Fused as Fused
-    from imulab.gyro_array.fuse import FuseOptions as FuseOptions
-    from imulab.gyro_array.fuse import fuse as fuse
-    from imulab.gyro_array.simulate import simulate_array as simulate_array
-    from imulab.noise import allan_deviation as allan_deviation
-    from imulab.present import write_report as write_report
+    from imulab.procedures.apply import apply as apply
+    from imulab.procedures.centrifuge.fit import CentrifugeFit as CentrifugeFit
+    from imulab.procedures.centrifuge.fit import fit_centrifuge as fit_centrifuge
+    from imulab.procedures.centrifuge.manifest import load_manifest as load_manifest
+    from imulab.procedures.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
+    from imulab.procedures.gyro_array.compare import compare_methods as compare_methods
+    from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
+    from imulab.procedures.gyro_array.fit import calibrate_array as calibrate_array
+    from imulab.procedures.gyro_array.fuse import Fused as Fused
+    from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
+    from imulab.procedures.gyro_array.fuse import fuse as fuse
+    from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
+    from imulab.procedures.reports import write_report as write_report
+    from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
+    from imulab.procedures.tumble.compare import check_tumble as check_tumble
+    from imulab.procedures.tumble.fit import TumbleFit as TumbleFit
+    from imulab.procedures.tumble.fit import fit_tumble as fit_tumble
+    from imulab.procedures.tumble.segment import find_attitudes as find_attitudes
+    from imulab.procedures.tumble.simulate import simulate_tumble as simulate_tumble
+    from imulab.procedures.warmup.cycles import find_power_cycle as find_power_cycle
+    from imulab.procedures.warmup.fit import WarmupFit as WarmupFit
+    from imulab.procedures.warmup.fit import fit_warmup as fit_warmup
+    from imulab.procedures.warmup.plan import plan_warmup as plan_warmup
+    from imulab.procedures.warmup.simulate import simulate_warmup as simulate_warmup
     from imulab.readers import read as read
     from imulab.readers import read_blocks as read_blocks
     from imulab.recording import Recording as Recording
-    from imulab.segment import find_attitudes as find_attitudes
-    from imulab.tumble.compare import check_tumble as check_tumble
-    from imulab.tumble.fit import TumbleFit as TumbleFit
-    from imulab.tumble.fit import fit_tumble as fit_tumble
-    from imulab.tumble.simulate import simulate_tumble as simulate_tumble
-    from imulab.warmup.cycles import find_power_cycle as find_power_cycle
-    from imulab.warmup.fit import WarmupFit as WarmupFit
-    from imulab.warmup.fit import fit_warmup as fit_warmup
-    from imulab.warmup.plan import plan_warmup as plan_warmup
-    from imulab.warmup.simulate import simulate_warmup as simulate_warmup
+    from imulab.records.calibration import Calibration as Calibration
+    from imulab.records.calibration import load as load
     from imulab.writers import write as write
     from imulab.writers import write_csv as write_csv
 
 _HOME = {
-    "ArrayFit": "gyro_array.fit",
-    "FuseOptions": "gyro_array.fuse",
-    "Fused": "gyro_array.fuse",
-    "allan_deviation": "noise",
-    "calibrate_array": "gyro_array.fit",
-    "check_tumble": "tumble.compare",
-    "compare_methods": "gyro_array.compare",
-    "fuse": "gyro_array.fuse",
-    "simulate_array": "gyro_array.simulate",
-    "Attitudes": "attitudes",
-    "Calibration": "calibration",
-    "CentrifugeFit": "centrifuge.fit",
+    "ArrayFit": "procedures.gyro_array.fit",
+    "FuseOptions": "procedures.gyro_array.fuse",
+    "Fused": "procedures.gyro_array.fuse",
+    "allan_deviation": "estimation.allan",
+    "calibrate_array": "procedures.gyro_array.fit",
+    "check_tumble": "procedures.tumble.compare",
+    "compare_methods": "procedures.gyro_array.compare",
+    "fuse": "procedures.gyro_array.fuse",
+    "simulate_array": "procedures.gyro_array.simulate",
+    "Attitudes": "procedures.tumble.attitudes",
+    "Calibration": "records.calibration",
+    "CentrifugeFit": "procedures.centrifuge.fit",
     "ImulabError": "errors",
     "Recording": "recording",
-    "TumbleFit": "tumble.fit",
-    "WarmupFit": "warmup.fit",
-    "apply": "applying",
+    "TumbleFit": "procedures.tumble.fit",
+    "WarmupFit": "procedures.warmup.fit",
+    "apply": "procedures.apply",
     "export": "exporters",
-    "find_attitudes": "segment",
-    "find_power_cycle": "warmup.cycles",
-    "fit_centrifuge": "centrifuge.fit",
-    "fit_tumble": "tumble.fit",
-    "fit_warmup": "warmup.fit",
-    "load": "calibration",
-    "load_manifest": "centrifuge.manifest",
+    "find_attitudes": "procedures.tumble.segment",
+    "find_power_cycle": "procedures.warmup.cycles",
+    "fit_centrifuge": "procedures.centrifuge.fit",
+    "fit_tumble": "procedures.tumble.fit",
+    "fit_warmup": "procedures.warmup.fit",
+    "load": "records.calibration",
+    "load_manifest": "procedures.centrifuge.manifest",
     "normal_gravity": "gravity",
-    "plan_warmup": "warmup.plan",
+    "plan_warmup": "procedures.warmup.plan",
     "read": "readers",
     "read_blocks": "readers",
-    "simulate_centrifuge": "centrifuge.simulate",
-    "simulate_tumble": "tumble.simulate",
-    "simulate_warmup": "warmup.simulate",
+    "simulate_centrifuge": "procedures.centrifuge.simulate",
+    "simulate_tumble": "procedures.tumble.simulate",
+    "simulate_warmup": "procedures.warmup.simulate",
     "write": "writers",
     "write_csv": "writers",
-    "write_report": "present",
+    "write_report": "procedures.reports",
 }
 
 __all__ = ["__version__", *_HOME]

@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from imulab.calibration import load
+from imulab.atomic_write import write_text
 from imulab.errors import ImulabError, OptionError
-from imulab.exhibit import Figure
-from imulab.files import write_text
-from imulab.present import exhibits_of
+from imulab.procedures.reports import exhibits_of
+from imulab.records.calibration import load
 from imulab.report import Card, render_index
+from imulab.report.elements import Figure
 from imulab.verdict import Verdict
 
 

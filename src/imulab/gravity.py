@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
-from imulab.texts import quantity
+from imulab.quantities import quantity
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.verdict import Note
 

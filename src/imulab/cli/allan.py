@@ -34,15 +34,15 @@ def allan(
     json: AsJson = False,
 ) -> None:
     """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
-    from imulab.allan import analyse
+    from imulab.estimation.column_noise import analyse
     from imulab.readers import read
 
     check_outputs([report], [name for name in (file, layout) if name])
     recording = read(file, layout, **chosen(topic, instance, window, element))
     found = analyse(recording, taus)
     if report:
-        from imulab.files import write_text
-        from imulab.noisefigures import noise_page
+        from imulab.atomic_write import write_text
+        from imulab.report.noise_figures import noise_page
 
         write_text(report, noise_page(found, recording))
     if json:
@@ -60,8 +60,8 @@ def allan(
 def describe(found: dict[str, Any]) -> str:
     """Return coefficients and curves as tables."""
     from imulab.cli.show import aligned
-    from imulab.exhibit import plain_number
-    from imulab.noisefigures import coefficient_rows, shown_unit
+    from imulab.report.elements import plain_number
+    from imulab.report.noise_figures import coefficient_rows, shown_unit
 
     lines = [f"{printable(found['file'])}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
     lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(found))

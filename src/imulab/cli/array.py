@@ -29,11 +29,11 @@ from imulab.cli.options import (
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
-    from imulab.blob import Blob
-    from imulab.calibration import Calibration
-    from imulab.gyro_array.fuse import Fuser
-    from imulab.gyro_array.simulate import Fault
+    from imulab.device.blob import Blob
+    from imulab.procedures.gyro_array.fuse import Fuser
+    from imulab.procedures.gyro_array.simulate import Fault
     from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
 
 CalibrationFile = Annotated[
     str | None, typer.Option("--calibration", metavar="RECORD", help="Record of array calibrate, taken off first.")
@@ -75,7 +75,7 @@ def simulate(
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate an array's recording, with its truth in the columns truth_rate."""
-    from imulab.gyro_array.simulate import NoiseModel, simulate_array
+    from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
     from imulab.writers import write_csv
 
     check_outputs([output], [])
@@ -110,7 +110,7 @@ def simulate(
 
 
 def _fault(text: str) -> Fault:
-    from imulab.gyro_array.simulate import Fault
+    from imulab.procedures.gyro_array.simulate import Fault
 
     kind, *rest = text.split(":")
     if not 1 <= len(rest) <= 4:
@@ -139,7 +139,7 @@ def merge(
 ) -> None:
     """Join files of one gyroscope each to the recording of an array, by time, at the times of the first file."""
     from imulab.cli.options import note, read_recording
-    from imulab.gyro_array.merge import merge_recordings
+    from imulab.procedures.gyro_array.merge import merge_recordings
     from imulab.writers import check_writable, write
 
     if axis is not None and axis not in ("x", "y", "z"):
@@ -185,7 +185,7 @@ def calibrate(
 ) -> None:
     """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
     from imulab.cli.tumble import finish
-    from imulab.tasks import run_task
+    from imulab.procedures.tasks import run_task
 
     check_outputs([output, report], [name for name in (still, moving, layout) if name])
     files = [still] if moving is None else [still, moving]
@@ -221,10 +221,10 @@ def fuse(
     output: OutputFile = None,
 ) -> None:
     """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
-    from imulab.gyro_array.fuse import FuseOptions, Fuser, fused_recording
-    from imulab.gyro_array.memory import carried, fusion_text
+    from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fused_recording
+    from imulab.procedures.gyro_array.memory import carried, fusion_text
+    from imulab.quantities import interval
     from imulab.readers import read_blocks
-    from imulab.texts import interval
     from imulab.writers import check_writable, write, write_csv_to
 
     records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
@@ -258,8 +258,8 @@ def fuse(
 def _load(name: str, option: str) -> Calibration:
     from pathlib import Path
 
-    from imulab.calibration import load
-    from imulab.gyro_array.model import check_calibration
+    from imulab.procedures.gyro_array.model import check_calibration
+    from imulab.records.calibration import load
 
     if option == "--initial-bias" and not Path(name).exists():
         raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
@@ -269,8 +269,8 @@ def _load(name: str, option: str) -> Calibration:
 
 
 def _load_any(name: str) -> Calibration | Blob:
-    from imulab.blob import Blob, load_any
-    from imulab.gyro_array.model import check_calibration
+    from imulab.device.blob import Blob, load_any
+    from imulab.procedures.gyro_array.model import check_calibration
 
     record = load_any(name)
     if not isinstance(record, Blob):
@@ -329,7 +329,7 @@ def compare(
     if experiment is not None:
         if output or report or memory:
             raise OptionError("array compare: -o, --report and --memory need a FILE")
-        from imulab.gyro_array.experiments import run_experiment
+        from imulab.procedures.gyro_array.experiments import run_experiment
 
         with progress_bar("seeds", count) as progress:
             rows = run_experiment(experiment, seeds=count, progress=progress)
@@ -340,8 +340,8 @@ def compare(
         )
         return
     from imulab.cli.show import verdict_line
-    from imulab.gyro_array.compare import compare_methods
-    from imulab.gyro_array.memory import carried, fusion_text
+    from imulab.procedures.gyro_array.compare import compare_methods
+    from imulab.procedures.gyro_array.memory import carried, fusion_text
     from imulab.readers import read
 
     record = None if calibration is None else _load(calibration, "--calibration")

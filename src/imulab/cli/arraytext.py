@@ -7,13 +7,13 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from json import dumps
 
-from imulab.calibration import Calibration
+from imulab.atomic_write import replacing
 from imulab.cli.show import aligned
-from imulab.exhibit import plain_number
-from imulab.files import replacing
-from imulab.gyro_array.compare import Comparison
-from imulab.gyro_array.experiments import ExperimentRow
-from imulab.gyro_array.model import unit_of_angle
+from imulab.procedures.gyro_array.compare import Comparison
+from imulab.procedures.gyro_array.experiments import ExperimentRow
+from imulab.procedures.gyro_array.model import unit_of_angle
+from imulab.records.calibration import Calibration
+from imulab.report.elements import plain_number
 
 _TITLE = {
     "static": "at rest, 100 Hz, 2000 s",
@@ -90,7 +90,7 @@ def _those(names: Sequence[str], working: Sequence[str]) -> str:
 
 def write(record: Calibration, output: str | None, report: str | None) -> None:
     """Write record and report, both or none."""
-    from imulab.present import exhibits_of
+    from imulab.procedures.reports import exhibits_of
     from imulab.report import render
 
     with ExitStack() as stack:

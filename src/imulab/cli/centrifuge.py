@@ -22,9 +22,9 @@ from imulab.cli.options import (
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
-    from imulab.centrifuge.manifest import Manifest
-    from imulab.centrifuge.plan import Plan
-    from imulab.centrifuge.simulate import Truth
+    from imulab.procedures.centrifuge.manifest import Manifest
+    from imulab.procedures.centrifuge.plan import Plan
+    from imulab.procedures.centrifuge.simulate import Truth
 
 ManifestFile = Annotated[str, typer.Argument(metavar="MANIFEST", help="Manifest of the test, TOML.")]
 Levels = Annotated[str, typer.Option(help="Specific forces in g, with commas; the lowest is the reference.")]
@@ -66,7 +66,7 @@ def plan(
     json: AsJson = False,
 ) -> None:
     """List the runs for wanted levels, predict uncertainties, and say which are too short, too close or too noisy."""
-    from imulab.centrifuge.plan import plan_centrifuge
+    from imulab.procedures.centrifuge.plan import plan_centrifuge
 
     check_outputs([output], [])
     if output is not None and not output.lower().endswith((".toml", ".csv")):
@@ -118,9 +118,9 @@ def simulate(
     """Simulate the test of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth."""
     from dataclasses import replace
 
-    from imulab.centrifuge.manifest import load_manifest, make_manifest
-    from imulab.centrifuge.plan import plan_centrifuge
-    from imulab.centrifuge.simulate import simulate_centrifuge, typical_truth
+    from imulab.procedures.centrifuge.manifest import load_manifest, make_manifest
+    from imulab.procedures.centrifuge.plan import plan_centrifuge
+    from imulab.procedures.centrifuge.simulate import simulate_centrifuge, typical_truth
 
     if manifest is not None:
         for name in ("levels", "radius", "net_rate", "cycles", "both_senses"):
@@ -177,9 +177,9 @@ def reduce(
     """
     from pathlib import Path
 
-    from imulab.centrifuge.manifest import load_manifest
     from imulab.cli.tumble import finish
-    from imulab.tasks import run_task
+    from imulab.procedures.centrifuge.manifest import load_manifest
+    from imulab.procedures.tasks import run_task
 
     test = load_manifest(manifest)
     files = [str(Path(manifest).parent / run.file) for run in test.runs]
@@ -246,7 +246,7 @@ def _plan_text(result: Plan, wanted: float) -> str:
 
 
 def _plan_json(result: Plan, wanted: float) -> str:
-    from imulab.jsontext import json_text
+    from imulab.records.json_text import json_text
 
     def of(value: float | None, unit: str) -> dict[str, Any]:
         return {"value": None if value is None or value == float("inf") else value, "unit": unit}
@@ -276,8 +276,8 @@ def _plan_json(result: Plan, wanted: float) -> str:
 
 
 def _write_plan(result: Plan, output: str) -> None:
-    from imulab.centrifuge.manifest import manifest_text
-    from imulab.files import write_text
+    from imulab.atomic_write import write_text
+    from imulab.procedures.centrifuge.manifest import manifest_text
     from imulab.units import from_si
 
     test = result.manifest
@@ -319,8 +319,8 @@ def _write_simulation(simulation: Any, test: Manifest, truth: Truth, output: str
     from dataclasses import asdict
     from pathlib import Path
 
-    from imulab.centrifuge.manifest import manifest_text
-    from imulab.files import write_text
+    from imulab.atomic_write import write_text
+    from imulab.procedures.centrifuge.manifest import manifest_text
     from imulab.writers import write_csv
 
     folder = Path(output)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imulab.cli.speech import coloured
-from imulab.jsontext import json_text
-from imulab.tumble.checkfigures import meaning, measured, next_step
-from imulab.tumble.engineering import small_g
+from imulab.procedures.tumble.checkfigures import meaning, measured, next_step
+from imulab.procedures.tumble.engineering import small_g
+from imulab.records.json_text import json_text
 
 if TYPE_CHECKING:
-    from imulab.attitudes import Attitudes
-    from imulab.tumble.compare import Check
+    from imulab.procedures.tumble.attitudes import Attitudes
+    from imulab.procedures.tumble.compare import Check
 
 
 def as_text(check: Check, attitudes: Attitudes, record: str, file: str) -> str:

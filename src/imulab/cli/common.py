@@ -17,32 +17,32 @@ from imulab.cli.speech import choose, note, speech, tell
 from imulab.errors import OptionError, listed, meant
 
 _CHOICES: dict[str, tuple[str, ...]] = {
-    "tumble plan --criterion": ("imulab.tumble.optimal:CRITERIA",),
+    "tumble plan --criterion": ("imulab.procedures.tumble.optimal:CRITERIA",),
     "tumble plan --from": ("sphere", "fixture:15", "head:15"),
     "tumble fit --order": ("auto", "0", "1", "2", "3", "4", "5", "blend"),
-    "tumble fit --method": ("imulab.tumble.options:METHODS",),
-    "tumble plan --method": ("imulab.tumble.options:METHODS",),
-    "tumble fit --loss": ("imulab.tumble.options:LOSSES",),
+    "tumble fit --method": ("imulab.procedures.tumble.options:METHODS",),
+    "tumble plan --method": ("imulab.procedures.tumble.options:METHODS",),
+    "tumble fit --loss": ("imulab.procedures.tumble.options:LOSSES",),
     "tumble gyro --g-sensitivity": ("auto", "yes", "no"),
     "tumble gyro --clock-of": ("gyro", "accel"),
-    "array simulate --experiment": ("imulab.gyro_array.simulate:EXPERIMENTS",),
+    "array simulate --experiment": ("imulab.procedures.gyro_array.simulate:EXPERIMENTS",),
     "array simulate --mounting": ("same", "alternate"),
-    "array simulate --fault": ("imulab.gyro_array.simulate:FAULTS",),
+    "array simulate --fault": ("imulab.procedures.gyro_array.simulate:FAULTS",),
     "array simulate --unit": ("rad/s", "deg/s", "deg/h"),
-    "array calibrate --method": ("imulab.arraytable:METHODS",),
+    "array calibrate --method": ("imulab.device.array_settings:METHODS",),
     "array calibrate --memory": ("growing",),
-    "array fuse --method": ("imulab.arraytable:METHODS",),
+    "array fuse --method": ("imulab.device.array_settings:METHODS",),
     "array fuse --memory": ("growing",),
     "array fuse --initial-bias": ("first", "zero"),
     "array compare --experiment": ("static", "dynamic"),
     "allan --taus": ("octave", "dense"),
-    "warmup simulate --law": ("imulab.warmup.simulate:LAWS",),
-    "warmup fit --model": ("auto", "imulab.warmup.model:MODELS"),
-    "warmup fit --exit": ("imulab.warmup.model:EXITS",),
-    "warmup fit --pool": ("imulab.warmup.fit:POOLS",),
-    "warmup fit --beyond": ("imulab.warmup.model:BEYOND",),
-    "centrifuge reduce --method": ("imulab.centrifuge.fit:METHODS",),
-    "centrifuge reduce --curve": ("auto", "imulab.centrifuge.curve:MODELS"),
+    "warmup simulate --law": ("imulab.procedures.warmup.simulate:LAWS",),
+    "warmup fit --model": ("auto", "imulab.procedures.warmup.model:MODELS"),
+    "warmup fit --exit": ("imulab.procedures.warmup.model:EXITS",),
+    "warmup fit --pool": ("imulab.procedures.warmup.fit:POOLS",),
+    "warmup fit --beyond": ("imulab.procedures.warmup.model:BEYOND",),
+    "centrifuge reduce --method": ("imulab.procedures.centrifuge.fit:METHODS",),
+    "centrifuge reduce --curve": ("auto", "imulab.procedures.centrifuge.curve:MODELS"),
     "export --to": ("imulab.exporters:EXPORTERS",),
     "fleet run --engine": ("imulab.fleet.engine:ENGINES",),
 }
@@ -106,8 +106,8 @@ def _run(
         raise OptionError("--quiet together with --verbose: expected one or the other")
     choose(quiet=quiet, verbose=verbose, project=not no_project)
     if "layout" in values:
+        from imulab.quantities import size
         from imulab.readers.unpacking import raise_limit
-        from imulab.texts import size
 
         raise_limit(None if unpack_limit is None else size(unpack_limit, "--unpack-limit"))
     values |= _from_project(values, files)

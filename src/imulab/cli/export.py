@@ -13,8 +13,8 @@ from imulab.cli.options import naming, warn, whole_number
 from imulab.errors import OptionError, listed
 
 if TYPE_CHECKING:
-    from imulab.arraytable import Fusion
-    from imulab.calibration import Calibration
+    from imulab.device.array_settings import Fusion
+    from imulab.records.calibration import Calibration
 
 _DEVICE_IDS = 2**32
 
@@ -38,10 +38,10 @@ def export(
     ] = None,
 ) -> None:
     """Write calibration records in the form of firmware, an autopilot or a toolbox."""
-    from imulab.calibration import load
     from imulab.exporters import EXPORTERS, ExportOptions
     from imulab.exporters import export as write
-    from imulab.tables import tables_of
+    from imulab.procedures.device_tables import tables_of
+    from imulab.records.calibration import load
     from imulab.verdict import SENTENCES
 
     if to not in EXPORTERS:
@@ -71,7 +71,7 @@ def export(
 
 
 def _fusion(to: str, method: str | None, memory: str | None, records: list[Calibration]) -> Fusion:
-    from imulab.gyro_array.memory import carried, fusion_text
+    from imulab.procedures.gyro_array.memory import carried, fusion_text
 
     array = next((record for record in records if record.procedure == "gyro_array"), None)
     if to not in ("c", "blob") or array is None:

@@ -15,13 +15,13 @@ from imulab.cli.speech import hold, speech
 from imulab.cli.speech import note as note
 from imulab.cli.speech import warn as warn
 from imulab.errors import ImulabError, OptionError, ReadError
-from imulab.texts import chosen as chosen
-from imulab.texts import quantity as quantity
-from imulab.texts import whole_number as whole_number
+from imulab.quantities import chosen as chosen
+from imulab.quantities import quantity as quantity
+from imulab.quantities import whole_number as whole_number
 
 if TYPE_CHECKING:
-    from imulab.calibration import Calibration
     from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
 
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
@@ -75,7 +75,7 @@ def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recor
 
 
 class GivenFiles:
-    """Access to the files that a command names, for `imulab.tasks`."""
+    """Access to the files that a command names, for `imulab.procedures.tasks`."""
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Read a recording as a whole, and warn where it was cut."""
@@ -83,7 +83,7 @@ class GivenFiles:
 
     def record(self, name: str) -> Calibration:
         """Read a calibration record."""
-        from imulab.calibration import load
+        from imulab.records.calibration import load
 
         return load(name)
 
@@ -110,7 +110,7 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
     OptionError
         An output cannot be written, or would overwrite another file of this command.
     """
-    from imulab.files import real_path
+    from imulab.atomic_write import real_path
 
     taken = {Path(os.path.realpath(name)): name for name in inputs if name != "-"}
     for name in outputs:
@@ -130,7 +130,7 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
 
 def is_json(file: str) -> bool:
     """Return whether a file is a record rather than a recording: an object that holds one of two marks of records."""
-    from imulab.calibration import FORMAT
+    from imulab.records.calibration import FORMAT
 
     if file == "-" or (Path(file).exists() and not Path(file).is_file()):
         return False  # a pipe can be read only once, as a recording

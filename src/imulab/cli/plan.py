@@ -7,23 +7,23 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.calibration import Calibration, load
+from imulab.atomic_write import replacing
 from imulab.cli.options import check_outputs, is_json, quantity, whole_number
 from imulab.cli.show import aligned
 from imulab.errors import ImulabError, OptionError, RecordError
-from imulab.files import replacing
-from imulab.jsontext import json_text
+from imulab.procedures.tumble.engineering import predicted_rows
+from imulab.procedures.tumble.findings import freedom_finding
+from imulab.procedures.tumble.fit import fit_tumble
+from imulab.procedures.tumble.model import parameter_units
+from imulab.procedures.tumble.options import check_method
+from imulab.procedures.tumble.plan import Plan, fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
+from imulab.procedures.tumble.segment import find_attitudes
+from imulab.procedures.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.readers import read
 from imulab.recording import Array
+from imulab.records.calibration import Calibration, load
+from imulab.records.json_text import json_text
 from imulab.report import render_plan
-from imulab.segment import find_attitudes
-from imulab.tumble.engineering import predicted_rows
-from imulab.tumble.findings import freedom_finding
-from imulab.tumble.fit import fit_tumble
-from imulab.tumble.model import parameter_units
-from imulab.tumble.options import check_method
-from imulab.tumble.plan import Plan, fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
-from imulab.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.writers import write_csv_to
 

@@ -75,8 +75,8 @@ def additions(said: Mapping[str, str], typed: Mapping[str, object], files: Seque
 
 def _describes_itself(file: str) -> bool:
     """Return whether a file is a record, a blob, native CSV or a log, which need no layout."""
-    from imulab.blob import is_blob
     from imulab.cli.options import is_json
+    from imulab.device.blob import is_blob
     from imulab.readers import is_pipe
     from imulab.readers.formats import TEXT, recognised
 

@@ -32,9 +32,9 @@ from imulab.cli.options import (
 from imulab.errors import ImulabError, OptionError, RecordError
 
 if TYPE_CHECKING:
-    from imulab.blob import Blob
-    from imulab.calibration import Calibration
+    from imulab.device.blob import Blob
     from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -65,10 +65,10 @@ def apply(
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
-    from imulab.applying import apply_blocks, loaded
-    from imulab.blob import load_any
+    from imulab.device.blob import load_any
+    from imulab.procedures.apply import apply_blocks, loaded
+    from imulab.procedures.warmup.poweron import with_power_on_temperature
     from imulab.readers import read_blocks
-    from imulab.warmup.poweron import with_power_on_temperature
 
     if len(files) < 2:
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
@@ -119,7 +119,7 @@ class _Rows:
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
-    from imulab.applying import beyond_message, beyond_test_of, warnings_of
+    from imulab.procedures.apply import beyond_message, beyond_test_of, warnings_of
 
     counts, largest, name = [0] * len(records), [0.0] * len(records), ""
     for number, block in enumerate(blocks):
@@ -164,10 +164,10 @@ def show(
         _show_changes(*files, json=json)
         return
     (file,) = files
-    from imulab.blob import is_blob, load_blob
-    from imulab.calibration import load
     from imulab.cli.show import describe_blob, describe_record, describe_recording, recording_json
+    from imulab.device.blob import is_blob, load_blob
     from imulab.readers import read_blocks
+    from imulab.records.calibration import load
 
     if layout is None and is_blob(file):
         blob = load_blob(file)
@@ -200,9 +200,9 @@ def _show_formats(names: list[str]) -> None:
 
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:
-    from imulab.calibration import load
-    from imulab.changes import compare_records
     from imulab.cli.show import describe_changes
+    from imulab.records.calibration import load
+    from imulab.records.comparison import compare_records
 
     records = [load(first), load(second)]
     comparison = compare_records(*records)
@@ -222,8 +222,8 @@ def report(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.html", help="Report to write.")],
 ) -> None:
     """Draw the report of a record."""
-    from imulab.calibration import load
-    from imulab.present import write_report
+    from imulab.procedures.reports import write_report
+    from imulab.records.calibration import load
 
     check_outputs([output], [file])
     write_report(load(file), output)

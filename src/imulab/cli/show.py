@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.blob import Blob
-from imulab.calibration import Calibration
-from imulab.changes import Comparison
 from imulab.cli.speech import coloured
+from imulab.device.blob import Blob
 from imulab.errors import ReadError
-from imulab.exhibit import Table, format_uncertain, plain_number
-from imulab.jsontext import json_text
-from imulab.present import change_unit, exhibits_of
 from imulab.printable import printable
+from imulab.procedures.reports import change_unit, exhibits_of
+from imulab.procedures.tumble.figures import gyro_headline
 from imulab.recording import Array, Recording
-from imulab.tumble.figures import gyro_headline
+from imulab.records.calibration import Calibration
+from imulab.records.comparison import Comparison
+from imulab.records.json_text import json_text
+from imulab.report.elements import Table, format_uncertain, plain_number
 from imulab.verdict import SENTENCES, Verdict
 
 _GAP = 1.5

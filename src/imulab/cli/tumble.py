@@ -30,7 +30,7 @@ from imulab.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from imulab.calibration import Calibration
+    from imulab.records.calibration import Calibration
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -110,7 +110,7 @@ def simulate(
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate a tumble recording of a random MEMS triad, with its truth in the head of the file."""
-    from imulab.tumble.simulate import simulate_tumble
+    from imulab.procedures.tumble.simulate import simulate_tumble
     from imulab.writers import check_writable, write
 
     check_writable(output)
@@ -187,7 +187,7 @@ def fit(
 
     Prints what was found; -o writes the calibration record, --report its figures.
     """
-    from imulab.tasks import run_task
+    from imulab.procedures.tasks import run_task
 
     check_outputs([output, report], [name for name in (file, layout, prior) if name])
     options = {
@@ -224,8 +224,8 @@ def finish(
     describe: Callable[[Calibration], str] | None = None,
 ) -> None:
     """Write a record and its report, both or none, and say what was found, in full or as `describe` has it."""
-    from imulab.files import replacing
-    from imulab.present import exhibits_of
+    from imulab.atomic_write import replacing
+    from imulab.procedures.reports import exhibits_of
     from imulab.report import render
 
     with ExitStack() as stack:
@@ -277,11 +277,11 @@ def gyro(
     json: AsJson = False,
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
-    from imulab.calibration import load
     from imulab.cli.show import describe_gyro
-    from imulab.segment import find_attitudes
-    from imulab.tumble.gyro import fit_gyro
-    from imulab.tumble.gyrorecord import with_gyro
+    from imulab.procedures.tumble.gyro import fit_gyro
+    from imulab.procedures.tumble.gyrorecord import with_gyro
+    from imulab.procedures.tumble.segment import find_attitudes
+    from imulab.records.calibration import load
 
     inputs = [name for name in (file, accel, accel_file, layout, accel_layout) if name]
     check_outputs([output, report], inputs)
@@ -325,13 +325,13 @@ def check(
 
     A record that still holds fails once in twenty tests.
     """
-    from imulab.applying import warnings_of
-    from imulab.calibration import load
     from imulab.cli.check import as_json, as_text
     from imulab.errors import RecordError
     from imulab.gravity import gravity_option
-    from imulab.segment import find_attitudes
-    from imulab.tumble.compare import check_tumble
+    from imulab.procedures.apply import warnings_of
+    from imulab.procedures.tumble.compare import check_tumble
+    from imulab.procedures.tumble.segment import find_attitudes
+    from imulab.records.calibration import load
 
     check_outputs([report], [name for name in (record, file, layout) if name])
     held = load(record)
@@ -348,8 +348,8 @@ def check(
         said[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
     notes = (*said, *warnings_of(held, recording), *result.notes)
     if report:
-        from imulab.files import write_text
-        from imulab.tumble.checkfigures import check_page
+        from imulab.atomic_write import write_text
+        from imulab.procedures.tumble.checkfigures import check_page
 
         write_text(report, check_page(result, attitudes, held, record=record, file=file, said=notes))
     print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, record, file))

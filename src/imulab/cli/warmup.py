@@ -24,11 +24,11 @@ from imulab.cli.options import (
     whole_number,
 )
 from imulab.errors import OptionError
-from imulab.tasks.warmup import TEMPERATURES, temperature_list
-from imulab.texts import number as _number
+from imulab.procedures.warmup.task import TEMPERATURES, temperature_list
+from imulab.quantities import number as _number
 
 if TYPE_CHECKING:
-    from imulab.warmup.plan import WarmupPlan
+    from imulab.procedures.warmup.plan import WarmupPlan
 
 Temperatures = Annotated[str, typer.Option(metavar="T,T,...", help="Calibration temperatures, degC, ascending.")]
 
@@ -58,7 +58,7 @@ def plan(
     from math import sqrt
 
     from imulab.cli.show import aligned
-    from imulab.warmup.plan import plan_warmup, programme
+    from imulab.procedures.warmup.plan import plan_warmup, programme
     from imulab.writers import write_csv
 
     check_outputs([output], [])
@@ -103,7 +103,7 @@ def plan(
 def _print_plan(result: WarmupPlan, white: float, share: float) -> None:
     from dataclasses import asdict
 
-    from imulab.jsontext import json_text
+    from imulab.records.json_text import json_text
     from imulab.units import to_si
 
     print(
@@ -136,7 +136,7 @@ def simulate(
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate the power cycles of a warm-up test, a file each, into a folder."""
-    from imulab.warmup.simulate import simulate_warmup
+    from imulab.procedures.warmup.simulate import simulate_warmup
     from imulab.writers import write_csv
 
     at = temperature_list(temperatures)
@@ -209,7 +209,7 @@ def fit(
     Prints the comparison of the models; -o writes the calibration record, --report its figures.
     """
     from imulab.cli.tumble import finish
-    from imulab.tasks import run_task
+    from imulab.procedures.tasks import run_task
 
     check_outputs([output, report], [*files, *([layout] if layout else [])])
     options = {
@@ -242,11 +242,11 @@ def table(
     ] = False,
 ) -> None:
     """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
-    from imulab.blob import is_blob
-    from imulab.calibration import load
+    from imulab.atomic_write import write_text
     from imulab.cli.options import is_json
-    from imulab.files import write_text
-    from imulab.warmup.spreadsheet import read_table, record_of_table, write_table
+    from imulab.device.blob import is_blob
+    from imulab.procedures.warmup.spreadsheet import read_table, record_of_table, write_table
+    from imulab.records.calibration import load
 
     check_outputs([output], [file])
     if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason

@@ -8,9 +8,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from imulab.arraytable import Fusion
-from imulab.calibration import Calibration
+from imulab.device.array_settings import Fusion
 from imulab.errors import OptionError, listed
+from imulab.records.calibration import Calibration
 
 EXPORTERS = {
     "c": "c",

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from imulab.calibration import Calibration
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
@@ -23,6 +22,7 @@ from imulab.exporters.model import (
     single_precision,
     write_one,
 )
+from imulab.records.calibration import Calibration
 
 _LARGEST_OFFSET = 3.5
 _SCALES = (0.8, 1.2)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from imulab.blob import make_blob, tables_of_all
-from imulab.calibration import Calibration
+from imulab.atomic_write import replacing
+from imulab.device.blob import make_blob, tables_of_all
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
-from imulab.files import replacing
+from imulab.records.calibration import Calibration
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:

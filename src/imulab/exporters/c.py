@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.blob import make_blob, tables_of_all
-from imulab.calibration import Calibration
+from imulab.atomic_write import replacing
+from imulab.device.blob import make_blob, tables_of_all
+from imulab.device.tables import KINDS, Field, Table
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.golden import golden_of
-from imulab.files import replacing
-from imulab.packing import KINDS, Field, Table
 from imulab.printable import printable
+from imulab.records.calibration import Calibration
 
 _HEADERS = ("real.h", "array.h", "robust.h")
 _CORE = (

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.packing import Table
+from imulab.device.tables import Table
+from imulab.device.unit import Unit, fuse_table
 from imulab.recording import Array
-from imulab.runtime import Unit, fuse_table
 from imulab.units import STANDARD_GRAVITY
 
 _VECTORS = 64

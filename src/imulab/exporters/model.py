@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from imulab._version import VERSION
-from imulab.calibration import Calibration
+from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
-from imulab.exhibit import plain_number
 from imulab.exporters import ExportOptions
-from imulab.files import write_text
 from imulab.printable import printable
+from imulab.procedures.refit import linear_record
 from imulab.recording import Array
-from imulab.refitting import linear_record
+from imulab.records.calibration import Calibration
+from imulab.report.elements import plain_number
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
 AXES = "xyz"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.calibration import Calibration
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import lower_times_rotation, one_unit, write_one, yaml_matrix
 from imulab.exporters.yamlimu import bias_lines, noise_lines, unit_lines, without_nonlinearity
+from imulab.records.calibration import Calibration
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:

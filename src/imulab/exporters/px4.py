@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.calibration import Calibration
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
@@ -25,6 +24,7 @@ from imulab.exporters.model import (
     single_precision,
     write_one,
 )
+from imulab.records.calibration import Calibration
 
 _INT32, _FLOAT = 6, 9
 _SCALES = (0.1, 3.0)

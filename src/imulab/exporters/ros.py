@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.calibration import Calibration
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
     accel_terms,
@@ -22,6 +21,7 @@ from imulab.exporters.model import (
     write_one,
     yaml_number,
 )
+from imulab.records.calibration import Calibration
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from imulab import panels as grid
-from imulab.bulk import bulk, edge_marks, edge_note
-from imulab.exhibit import BAD, GOOD, QUIET, Figure
 from imulab.fleet import panels as small
 from imulab.fleet.display import display_of
 from imulab.fleet.reporttables import number
 from imulab.fleet.statistics import Change, ParameterStatistics, change_limit
+from imulab.report import panels as grid
+from imulab.report.bulk import bulk, edge_marks, edge_note
+from imulab.report.elements import BAD, GOOD, QUIET, Figure
 
 MOST_PANELS = 24
 _MOST_POINTS = 1500

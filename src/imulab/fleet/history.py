@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imulab.calibration import Parameter
 from imulab.errors import OptionError
 from imulab.fleet.sources import masked
 from imulab.fleet.work import Summary
+from imulab.records.calibration import Parameter
 
 _MANY = 500
 

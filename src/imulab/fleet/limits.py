@@ -15,7 +15,7 @@ from typing import Any
 
 from imulab.errors import ReadError, UnitError, listed
 from imulab.fleet.display import to_parameter_unit
-from imulab.tasks import TASKS
+from imulab.procedures.tasks import TASKS
 from imulab.toml import load_toml
 
 

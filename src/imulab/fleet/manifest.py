@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from imulab.errors import OptionError, ReadError, listed
 from imulab.fleet.sources import local_file, parent_of
-from imulab.tasks import TASKS
+from imulab.procedures.tasks import TASKS
 
 COLUMNS = ("serial", "procedure", "file")
 _SERIAL = re.compile(r"[^\W_][\w .+=@()-]*")

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from imulab.atomic_write import write_text
 from imulab.errors import OptionError
-from imulab.exhibit import Exhibits, Figure, Table
-from imulab.files import write_text
 from imulab.fleet import figures, reporttables
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
@@ -24,6 +23,7 @@ from imulab.fleet.statistics import (
 from imulab.fleet.store import Store
 from imulab.fleet.work import Summary
 from imulab.report import render_page
+from imulab.report.elements import Exhibits, Figure, Table
 
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imulab.exhibit import Table, format_uncertain, plain_number
 from imulab.fleet.display import display_of
 from imulab.fleet.statistics import Change, ParameterStatistics, change_limit
 from imulab.fleet.table import Row
+from imulab.report.elements import Table, format_uncertain, plain_number
 
 _MOST_ROWS = 40
 

@@ -11,8 +11,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from imulab._version import VERSION
+from imulab.atomic_write import real_path, write_text
 from imulab.errors import OptionError
-from imulab.files import real_path, write_text
 from imulab.fleet.engine import Engine, WorkersLostError, open_engine
 from imulab.fleet.history import History, open_history
 from imulab.fleet.manifest import FleetManifest, Unit, load_fleet, modules_of
@@ -20,7 +20,7 @@ from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
 from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, summarise
-from imulab.tasks import TASKS
+from imulab.procedures.tasks import TASKS
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.atomic_write import write_text
 from imulab.errors import OptionError
-from imulab.files import write_text
-from imulab.tumble.simulate import simulate_tumble
+from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv
 

@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 from imulab.errors import ImulabError, ReadError
 
 if TYPE_CHECKING:
-    from imulab.calibration import Calibration
     from imulab.readers import Layout
     from imulab.recording import Recording
+    from imulab.records.calibration import Calibration
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(::[A-Za-z][A-Za-z0-9+.-]*)*://")
 _BLOCK = 1 << 22
@@ -143,7 +143,7 @@ def sha256_of(path: Path, name: str) -> str:
 
 
 class UnitFiles:
-    """Access to one unit's files for `imulab.tasks`; remembers the hash of each and what the first head says.
+    """Access to one unit's files for `imulab.procedures.tasks`; remembers the hash of each and what the first head says.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ class UnitFiles:
 
     def record(self, name: str) -> Calibration:
         """Read a calibration record."""
-        from imulab.calibration import loads
+        from imulab.records.calibration import loads
 
         try:
             data = self.path(name).read_bytes()

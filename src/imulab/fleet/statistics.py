@@ -10,11 +10,11 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.calibration import Parameter
 from imulab.fleet.history import Past, sources_of
 from imulab.fleet.limits import Limits
 from imulab.fleet.work import Summary
 from imulab.recording import Array
+from imulab.records.calibration import Parameter
 
 _MAD_TO_SIGMA = 1.482602218505602
 _MEAN_TO_SIGMA = 1.2533141373155001

@@ -20,10 +20,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from imulab.calibration import Calibration, load_sealed
+from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
-from imulab.files import write_text
 from imulab.fleet.manifest import FleetManifest, Unit
+from imulab.records.calibration import Calibration, load_sealed
 
 MOST_ATTEMPTS = 3
 """A unit that was under work when its process ended this often is not tried again."""

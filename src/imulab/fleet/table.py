@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from imulab.atomic_write import real_path, replacing
 from imulab.errors import OptionError
-from imulab.files import real_path, replacing
 from imulab.fleet.manifest import Unit
 from imulab.fleet.work import Summary
 

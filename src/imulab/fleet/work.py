@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from imulab.calibration import Calibration, Parameter
+from imulab.atomic_write import write_text
 from imulab.errors import ImulabError
-from imulab.files import write_text
 from imulab.fleet.manifest import Unit
 from imulab.fleet.sources import UnitFiles
 from imulab.fleet.store import MOST_ATTEMPTS, Store, asked_of
-from imulab.tasks import run_task
+from imulab.procedures.tasks import run_task
+from imulab.records.calibration import Calibration, Parameter
 
 DONE, KEPT, FAILED, LEFT = "done", "kept", "failed", "left"
 """Made now; there already; refused, with a reason; not touched, because another run has taken over."""

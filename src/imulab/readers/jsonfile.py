@@ -14,13 +14,13 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from imulab.calibration import FORMAT
 from imulab.errors import ReadError, meant
 from imulab.readers import _text
 from imulab.readers.arrays import origins, recordings
 from imulab.readers.layout import Layout
 from imulab.readers.text import _DATE
 from imulab.recording import Array, Recording
+from imulab.records.calibration import FORMAT
 from imulab.verdict import Note
 
 LARGEST = 20_000_000

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from imulab.entries import check_keys, number_of, scale_factor_of
 from imulab.errors import ReadError, UnitError, listed
+from imulab.quantity_entries import check_keys, number_of, scale_factor_of
 from imulab.recording import Array, check_unit
 from imulab.toml import load_toml
 from imulab.units import Unit, conversion_factor, parse_unit, to_si

@@ -20,8 +20,8 @@ from imulab.readers import _text
 from imulab.readers.layout import Layout, Readings
 from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Crew, Lines
 from imulab.recording import CORRECTED_BY, Recording, parse_column_title
-from imulab.tens import powers_of_five
 from imulab.verdict import Note
+from imulab.writers.powers_of_ten import powers_of_five
 
 _text.prepare(powers_of_five())
 _DATE = 1 << 30

@@ -13,9 +13,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from imulab.calibration import Calibration
-from imulab.exhibit import Exhibits, Figure, Table
-from imulab.files import write_text
+from imulab.atomic_write import write_text
+from imulab.records.calibration import Calibration
+from imulab.report.elements import Exhibits, Figure, Table
 from imulab.report.narrow import narrow
 from imulab.verdict import SENTENCES, Verdict
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from imulab.exhibit import Figure
+from imulab.report.elements import Figure
 
 _LEAST, _MOST = 150, 300
 _GAP = 74

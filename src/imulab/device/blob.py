@@ -1,0 +1,127 @@
+"""Blobs: the tables of one unit as the bytes that its firmware loads, read back on the desk."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from imulab.device.array_settings import Fusion
+from imulab.device.tables import KINDS, TEXT, Table, pack
+from imulab.device.unit import Unit
+from imulab.errors import RecordError
+from imulab.printable import first_hidden
+from imulab.procedures.device_tables import tables_of
+from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
+from imulab.records.shape import check_blob_text
+
+FORMAT = "imulab.blob"
+_HEAD = 16
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A blob: its bytes, and what it says about itself (sensor, columns and units of each section)."""
+
+    name: str
+    data: bytes
+    text: Mapping[str, Any]
+
+
+def make_blob(records: Sequence[Calibration], tables: Sequence[Table]) -> bytes:
+    """Return the blob of these tables, float numbers, with what the desk needs to apply it.
+
+    Raises
+    ------
+    RecordError
+        A number is beyond the range of a float.
+    """
+    text = {
+        "format": FORMAT,
+        "sensor": {key: value for record in records for key, value in record.sensor.items()},
+        "software": records[0].software,
+        "records": [record.to_dict()["content_sha256"] for record in records],
+        "sections": [{"kind": table.kind, **table.columns} for table in tables],
+    }
+    return pack(tables, 4, plain_values(text, ""))
+
+
+def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[Table]:
+    """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
+
+    Raises
+    ------
+    RecordError
+        Two records give the same section, or are of different units.
+    """
+    serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
+    if len(serials) > 1:
+        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
+    tables = [table for record in records for table in tables_of(record, fusion)]
+    kinds = [table.kind for table in tables]
+    twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
+    if twice:
+        raise RecordError(f"two records give a {twice[0]} table; a unit has one")
+    return tables
+
+
+def is_blob(path: str | Path) -> bool:
+    """Return whether a file begins like a blob; False where it cannot be read."""
+    try:
+        if not Path(path).is_file():
+            return False  # a pipe can be read only once
+        with Path(path).open("rb") as stream:
+            return stream.read(len(BLOB_MAGIC)) == BLOB_MAGIC
+    except OSError:
+        return False
+
+
+def load_blob(path: str | Path) -> Blob:
+    """Read a blob and check it by the core's own loader.
+
+    Raises
+    ------
+    RecordError
+        The file is missing, cut, corrupt, of a newer version, or no blob.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        Unit(data)
+    except RecordError as error:
+        raise RecordError(f"{path}: not a blob that can be used: {error}") from None
+    text = next((payload for kind, payload in _sections(data) if kind == TEXT), None)
+    try:
+        content = json.loads((text or b"").decode("utf-8"))
+        if content["format"] != FORMAT or not all(section["kind"] for section in content["sections"]):
+            raise ValueError
+    except (ValueError, KeyError, TypeError):
+        raise RecordError(f"{path}: the blob has no description of its units: it is for firmware only") from None
+    names = {number: name for name, number in KINDS.items()}
+    try:
+        check_blob_text(content, [names[kind] for kind, _ in _sections(data) if kind != TEXT])
+    except RecordError as error:
+        raise RecordError(f"{path}: {error}") from None
+    if place := first_hidden(content):
+        raise RecordError(f"{path}: {place} holds a control or bidirectional character; expected plain text")
+    return Blob(str(path), data, content)
+
+
+def load_any(path: str | Path) -> Calibration | Blob:
+    """Read a record or a blob; errors as for `imulab.load` and `load_blob`."""
+    from imulab.records.calibration import load
+
+    return load_blob(path) if is_blob(path) else load(path)
+
+
+def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:
+    at, end = _HEAD, len(data) - 4
+    while at < end:
+        kind, size = struct.unpack_from("<II", data, at)
+        yield kind, data[at + 8 : at + 8 + size]
+        at += 8 + size

@@ -1,0 +1,84 @@
+"""Tables as the C core's structs and as the bytes ("blob") that it loads.
+
+A blob is little-endian, versioned and closed by a CRC-32; the core checks it (``runtime/table.c`` has the layout).
+The desk runs the same core on the same layout with 8 bytes per number, so that nothing is computed twice.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import RecordError
+from imulab.records.calibration import BLOB_MAGIC
+
+VERSION = 1
+TEXT = 0
+KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5}
+
+
+@dataclass(frozen=True)
+class Field:
+    """One member of a C struct: whole or real numbers, of shape () for a scalar, or real numbers that it points to.
+
+    None stands for NULL.
+    """
+
+    name: str
+    values: NDArray[Any] | None
+    pointed: bool = False
+
+    @property
+    def whole(self) -> bool:
+        """Whether the member holds whole numbers."""
+        return self.values is not None and self.values.dtype.kind in "iu"
+
+
+@dataclass(frozen=True)
+class Table:
+    """The members of one section's struct (``il_tumble`` ...), in order, and what the desk knows about its columns."""
+
+    kind: str
+    fields: tuple[Field, ...]
+    columns: Mapping[str, Any]
+
+    def payload(self, width: int) -> bytes:
+        """Return the section's bytes, `width` bytes per real number."""
+        parts: list[bytes] = []
+        pointed = [field for field in self.fields if field.pointed]
+        mask = sum(1 << i for i, field in enumerate(pointed) if field.values is not None)
+        masked = self.kind != "array"
+        for field in self.fields:
+            if not field.whole and not masked:  # the array's optional tables are announced before its real numbers
+                parts.append(struct.pack("<I", mask))
+                masked = True
+            if field.values is not None:
+                parts.append(field.values.astype("<u4" if field.whole else f"<f{width}").tobytes())
+        return b"".join(parts)
+
+
+def pack(tables: Sequence[Table], width: int, text: Mapping[str, Any] | None = None) -> bytes:
+    """Return a blob of these sections; `width` is 8 on the desk and 4 for a unit.
+
+    Raises
+    ------
+    RecordError
+        A number is beyond the range of a float.
+    """
+    sections = [] if text is None else [(TEXT, json.dumps(text, ensure_ascii=False, sort_keys=True).encode("utf-8"))]
+    with np.errstate(over="ignore"):
+        for table in tables:
+            for field in table.fields:
+                if field.values is not None and not np.isfinite(field.values.astype(f"<f{width}")).all():
+                    raise RecordError(f"{table.kind} {field.name}: {field.values} is beyond what {width} bytes hold")
+    sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
+    body = b"".join(struct.pack("<II", kind, len(payload)) + payload for kind, payload in sections)
+    head = BLOB_MAGIC + struct.pack("<HHI", VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4)
+    return head + body + struct.pack("<I", zlib.crc32(head + body))

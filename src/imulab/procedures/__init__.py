@@ -1,0 +1,1 @@
+"""Procedures: each a folder of the same rooms, and one entry in the registry."""

@@ -1,0 +1,396 @@
+"""The figures and tables of a centrifuge record, from the record alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imulab.estimation.estimate import coverage_factor
+from imulab.procedures.centrifuge.model import curve
+from imulab.procedures.centrifuge.tables import (
+    PER_G,
+    budget_table,
+    curve_table,
+    cycle_tables,
+    level_table,
+    parameters_table,
+    run_table,
+)
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, format_uncertain
+from imulab.units import STANDARD_GRAVITY, from_si
+
+_POINTS = 121
+_SHOWN_SPECTRA = 3
+_DECADES = [10.0**n for n in range(-6, 7)]
+_SPECTRUM_CAPTION = (
+    "Hann-windowed, height of a sine. The FOG's line is rotation: tilt and flexure of the table axis. What is left of "
+    "X without it is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further lines "
+    "are vibration."
+)
+_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "x", "triangle-down")
+_SPECTRA = (("dtg_x", "X"), ("fog", "FOG"), ("residual_x", "X − FOG"))
+_CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
+
+
+def exhibits(record: Calibration) -> Exhibits:
+    """Return what a report on this record shows."""
+    sets = prefixes(record)
+    items: list[Figure | Table] = [_zeta(record, sets)]
+    if any(f"{p}direction" in record.parameters for p in sets):
+        items.append(_polar(record, [p for p in sets if f"{p}direction" in record.parameters]))
+    items += [_repeatability(record, sets), *_spectra(record)]
+    items += [
+        level_table(record, sets),
+        *cycle_tables(record),
+        curve_table(record, sets),
+        budget_table(record),
+        parameters_table(record),
+        run_table(record),
+    ]
+    return Exhibits(headline=_headline(record, sets[0]), facts=_facts(record, sets), items=items)
+
+
+def prefixes(record: Calibration) -> list[str]:
+    """Return the sets of parameters that a record has: ``x_``, ``y_``, ``x_down_`` ..."""
+    return [p for p in ("x_", "y_", "x_down_", "y_down_") if f"{p}K0" in record.parameters]
+
+
+def numbers(record: Calibration, prefix: str) -> list[int]:
+    """Return the levels of a set, rising."""
+    return [row["level"] for row in record.sections["levels"] if f"{prefix}K_{row['level']}" in record.parameters]
+
+
+def _force(record: Calibration, level: int) -> float:
+    row = next(row for row in record.sections["levels"] if row["level"] == level)
+    return float(row["specific_force"]["value"])
+
+
+def _label(prefix: str) -> str:
+    return prefix[0].upper() + (", spin axis down" if "down" in prefix else "")
+
+
+def _headline(record: Calibration, prefix: str) -> str:
+    """Return the g-sensitivity in one sentence, and by how much it departs from the linear."""
+    levels = numbers(record, prefix)
+    last = levels[-1]
+    first, top = _g(_force(record, levels[0])), _g(_force(record, last))
+    if last == levels[0]:
+        return f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{last}')} at {first}."
+    zeta = record.parameters[f"{prefix}zeta_{last}"]
+    measured = _change(zeta.value, zeta.standard_uncertainty)
+    curved = _curve_change(record, prefix, _force(record, last))
+    if record.model["curve"][prefix.rstrip("_")] == "constant":
+        return (
+            f"{_label(prefix)} drifts linearly with g, by {_per_g(record, f'{prefix}K0')} from {first} to {top}; the "
+            f"factor at {top} is {measured} than that at {first}."
+        )
+    K, _ = curve_at(record, prefix, np.array([_force(record, last)]))
+    fitted = _change(float(K[0]) / record.value(f"{prefix}K0") - 1, curved)
+    return (
+        f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}, its drift factor; "
+        f"at {top} the factor is {measured} measured directly against {first}, and {fitted} by the curve through all "
+        "levels."
+    )
+
+
+def _per_g(record: Calibration, name: str) -> str:
+    K = record.parameters[name]
+    value, u = format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
+    return f"{value} ± {u} deg/h per g"
+
+
+def _change(share: float, uncertainty: float | None) -> str:
+    change, u = format_uncertain(100 * abs(share), 100 * (uncertainty or 0.0))
+    return f"{change} ± {u} % {'smaller' if share < 0 else 'larger'}"
+
+
+def _curve_change(record: Calibration, prefix: str, force: float) -> float:
+    """Standard uncertainty of K(a)/K0 - 1 from those of c1 and c2."""
+    names = [n for n in (f"{prefix}c1", f"{prefix}c2") if n in record.parameters]
+    if not names:
+        return 0.0
+    order = [record.covariance.names.index(n) for n in names]
+    C = record.covariance.array()[np.ix_(order, order)]
+    gradient = np.array([force if n.endswith("c1") else force**2 for n in names])
+    return float(np.sqrt(gradient @ C @ gradient))
+
+
+def curve_at(record: Calibration, prefix: str, force: Array) -> tuple[Array, Array]:
+    """Return K(a), rad/s/(m/s^2), and its standard uncertainty at specific forces, m/s^2, shapes (n,)."""
+    terms = {
+        t: record.value(f"{prefix}{t}") if f"{prefix}{t}" in record.parameters else 0.0 for t in ("K0", "c1", "c2")
+    }
+    K = curve(force, **terms)
+    names = [n for n in ("K0", "c1", "c2") if f"{prefix}{n}" in record.parameters]
+    order = [record.covariance.names.index(f"{prefix}{n}") for n in names]
+    C = record.covariance.array()[np.ix_(order, order)]
+    gradient = {"K0": K / terms["K0"], "c1": terms["K0"] * force, "c2": terms["K0"] * force**2}
+    J = np.stack([gradient[n] for n in names], axis=1)
+    return K, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
+
+
+def _facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
+    facts = []
+    for prefix in sets[:2]:
+        K0 = record.parameters[f"{prefix}K0"]
+        value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G, digits=1)
+        digits = u.replace(".", "").lstrip("0")
+        facts.append((f"K0 {_label(prefix)}, deg/h/g", f"{value}({digits})"))
+    loaded = [row for row in record.sections["runs"] if row["role"] == "loaded"]
+    facts += [
+        ("curve", ", ".join(dict.fromkeys(str(m) for m in record.model["curve"].values()))),
+        ("levels", str(len(record.sections["levels"]))),
+        ("loaded runs", str(len(loaded))),
+        ("highest level", _g(record.model["highest_specific_force"]["value"])),
+    ]
+    return facts
+
+
+def _g(force: float) -> str:
+    return f"{from_si(force, 'g'):.3g} g"
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", "automargin": True, **more}
+
+
+def _scatter(x: Any, y: Any, name: str, **more: Any) -> dict[str, Any]:
+    return {"type": "scatter", "x": _plain(x), "y": _plain(y), "name": name, **more}
+
+
+def _plain(values: Any) -> list[float | None]:
+    return [None if value is None else float(value) for value in values]
+
+
+def _zeta(record: Calibration, sets: list[str]) -> Figure:
+    """Change of K over g: the source's zeta and the fitted curve, each with its 95 % interval."""
+    traces: list[dict[str, Any]] = []
+    shown = [p for p in sets if "down" not in p] or sets
+    for number, prefix in enumerate(shown):
+        axis = "" if number == 0 else str(number + 1)
+        levels = numbers(record, prefix)
+        force = np.array([_force(record, level) for level in levels])
+        grid = np.linspace(0.0, 1.02 * force.max(), _POINTS)
+        K0 = record.value(f"{prefix}K0")
+        K, _ = curve_at(record, prefix, grid)
+        half = coverage_factor(None) * np.array([_curve_change(record, prefix, a) for a in grid])
+        x = grid / STANDARD_GRAVITY
+        change = 100 * (K / K0 - 1)
+        where = {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+        traces += [
+            _scatter([*x, *x[::-1]], [*(change + 100 * half), *(change - 100 * half)[::-1]], "curve, 95 %",
+                fill="toself",
+                     fillcolor="rgba(31,111,139,0.18)", line={"width": 0}, hoverinfo="skip", showlegend=number == 0,
+                         **where),
+            _scatter(x, change, "fitted curve", mode="lines", line={"color": GOOD, "width": 2},
+                showlegend=number == 0, **where),
+        ]  # fmt: skip
+        measured = np.array([record.value(f"{prefix}K_{level}") for level in levels])
+        factors = record.fit["coverage_factor_95"]
+        u = np.array(
+            [
+                (record.parameters[f"{prefix}K_{level}"].standard_uncertainty or 0.0) * factors[f"{prefix}K_{level}"]
+                for level in levels
+            ]
+        )
+        traces.append(
+            _scatter(force / STANDARD_GRAVITY, 100 * (measured / K0 - 1), "K_i against K0, 95 %", mode="markers",
+                     marker={"color": INK, "size": 7}, showlegend=number == 0,
+                     error_y={"type": "data", "array": _plain(100 * u / K0), "color": INK, "thickness": 1.2,
+                         "width": 4}, **where)
+        )  # fmt: skip
+        later = levels[1:]
+        if later:
+            zeta = [100 * record.value(f"{prefix}zeta_{level}") for level in later]
+            bars = [
+                100
+                * (record.parameters[f"{prefix}zeta_{n}"].standard_uncertainty or 0.0)
+                * factors[f"{prefix}zeta_{n}"]
+                for n in later
+            ]
+            spread = 0.012 * float(force.max()) / STANDARD_GRAVITY
+            traces.append(
+                _scatter(force[1:] / STANDARD_GRAVITY + spread, zeta, "zeta_i against K_1, 95 %", mode="markers",
+                         marker={"color": BAD, "size": 7, "symbol": "diamond-open"}, showlegend=number == 0,
+                         error_y={"type": "data", "array": _plain(bars), "color": BAD, "thickness": 1.2,
+                             "width": 4}, **where)
+            )  # fmt: skip
+    return Figure(
+        title="Change of the drift factor with specific force",
+        caption="K is the drift per specific force, zeta its change from K_1, the lowest level and the weakest run, "
+        "so that all zeta share one error; the fitted curve uses every level and is what apply subtracts. Filled "
+        "points are the same K_i against the curve's K0. Points off the band by more than their bars are not "
+        "described by the curve.",
+        traces=traces,
+        layout=_panels([f"{_label(p)}: change of K, %" for p in shown], "specific force, g"),
+        height=430,
+    )
+
+
+def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
+    """Layout of panels side by side, the legend above."""
+    count = len(titles)
+    width = (1 - gap * (count - 1)) / count
+    layout: dict[str, Any] = {
+        "legend": dict(LEGEND),
+        "margin": {"l": 70, "r": 20, "t": 50, "b": 55},
+    }
+    for number, title in enumerate(titles):
+        mark = "" if number == 0 else str(number + 1)
+        start = number * (width + gap)
+        layout[f"xaxis{mark}"] = _axis(below, domain=[start, start + width], anchor=f"y{mark}")
+        layout[f"yaxis{mark}"] = _axis(title, anchor=f"x{mark}")
+    return layout
+
+
+def _polar(record: Calibration, sets: list[str]) -> Figure:
+    """The complex K of each level in the gyroscope's frame."""
+    traces: list[dict[str, Any]] = []
+    shown = [p for p in sets if "down" not in p] or sets
+    annotations = []
+    for number, prefix in enumerate(shown):
+        mark = "" if number == 0 else str(number + 1)
+        where = {"xaxis": f"x{mark}", "yaxis": f"y{mark}"}
+        key = prefix[0] if "down" not in prefix else f"{prefix[0]}_down"
+        rows = [row for row in record.sections["levels"] if key in row]
+        z = np.array([complex(row[key]["A"], row[key]["B"]) for row in rows]) * PER_G
+        force = [from_si(row["specific_force"]["value"], "g") for row in rows]
+        angle = np.linspace(0, 2 * np.pi, 49)
+        for index, row in enumerate(rows):
+            C = np.array(row[key]["covariance"]) * PER_G**2
+            ring = np.linalg.cholesky(C + 1e-12 * np.trace(C) * np.eye(2) + 1e-30 * np.eye(2)) @ np.array(
+                [np.cos(angle), np.sin(angle)]
+            )
+            ring *= 2.448  # 95 % of a two-dimensional normal distribution
+            traces.append(
+                _scatter(z[index].real + ring[0], z[index].imag + ring[1], "95 % region", mode="lines",
+                    line={"color": QUIET, "width": 1},
+                         hoverinfo="skip", showlegend=index == 0 and number == 0, **where)
+            )  # fmt: skip
+        traces.append(
+            _scatter(z.real, z.imag, "level, coloured by g", mode="lines+markers", line={"color": QUIET, "width": 1,
+                "dash": "dot"},
+                     marker={"color": _plain(force), "colorscale": "Viridis", "size": 9,
+                         "line": {"color": "#ffffff", "width": 1},
+                             "showscale": number == len(shown) - 1,
+                             "colorbar": {"title": {"text": "g"}, "thickness": 12}},
+                     text=[f"{f:.3g} g" for f in force], hovertemplate="%{text}<extra></extra>",
+                     showlegend=number == 0, **where)
+        )  # fmt: skip
+        annotations += [
+            {"x": z[index].real, "y": z[index].imag, "xref": f"x{mark}", "yref": f"y{mark}", "showarrow": True,
+             "text": f"{force[index]:.3g} g", "arrowcolor": QUIET, "ax": 26, "ay": -24 if index else 24}
+            for index in (0, len(rows) - 1)
+        ]  # fmt: skip
+    layout = _panels([f"{_label(p)}: along Y, deg/h/g" for p in shown], "along X, deg/h/g", gap=0.13)
+    layout["annotations"] = annotations
+    for number in range(len(shown)):
+        mark = "" if number == 0 else str(number + 1)
+        layout[f"yaxis{mark}"] |= {"scaleanchor": f"x{mark}", "scaleratio": 1}
+        layout[f"xaxis{mark}"] |= {"constrain": "domain"}
+    caption = (
+        "Where in the gyroscope's frame the drift per g is largest, and how large: points in a line outward are "
+        "nonlinearity in size, across it a turning of the drift, which the magnitude does not show. The largest ring "
+        "is that of the lowest level."
+    )
+    return Figure("Complex drift factor of each level", caption, traces, layout, height=440)
+
+
+def _repeatability(record: Calibration, sets: list[str]) -> Figure:
+    """K of every run against its level's K, by power cycle."""
+    traces: list[dict[str, Any]] = []
+    axes = list(dict.fromkeys(p[0] for p in sets))
+    cycles = sorted({row["power_cycle"] for row in record.sections["runs"] if row["role"] == "loaded"})
+    level_of = {run: row for row in record.sections["levels"] for run in row["runs"]}
+    for number, axis in enumerate(axes):
+        mark = "" if number == 0 else str(number + 1)
+        for cycle_number, cycle in enumerate(cycles):
+            x, y, bars = [], [], []
+            for index, run in enumerate(record.sections["runs"]):
+                if run["role"] != "loaded" or run["power_cycle"] != cycle or "K" not in run.get(axis, {}):
+                    continue
+                prefix = f"{axis}_" + ("down_" if run["spin_axis"] == "down" else "")
+                level = level_of[index]
+                K = record.value(f"{prefix}K_{level['level']}")
+                x.append(level["level"] + 0.5 * ((cycle_number + 0.5) / len(cycles) - 0.5) + 0.06 * (run["sense"] < 0))
+                y.append(100 * (run[axis]["K"]["value"] / K - 1))
+                bars.append(100 * run[axis]["K"]["standard_uncertainty"] / K)
+            colour = _CYCLES[cycle_number % len(_CYCLES)]
+            traces.append(
+                _scatter(x, y, f"power cycle {cycle}", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
+                         marker={"symbol": _MARKS[cycle_number % len(_MARKS)], "size": 7, "color": colour},
+                         error_y={"type": "data", "array": bars, "thickness": 1, "width": 3, "color": QUIET},
+                         showlegend=number == 0)
+            )  # fmt: skip
+    layout = _panels([f"{axis.upper()}: K off its level, %" for axis in axes], "level (number)")
+    ticks = [row["level"] for row in record.sections["levels"]]
+    texts = [
+        f"{row['level']}<br>{from_si(row['specific_force']['value'], 'g'):.3g} g" for row in record.sections["levels"]
+    ]
+    for number in range(len(axes)):
+        mark = "" if number == 0 else str(number + 1)
+        layout[f"xaxis{mark}"] |= {"tickvals": ticks, "ticktext": texts}
+        layout[f"yaxis{mark}"] |= {"zeroline": True, "zerolinecolor": QUIET}
+    found = record.fit["repeatability"]
+    words = [
+        f"{what} by {size:.2g} {unit} beyond their noise"
+        for what, size, unit in (
+            ("K differs from cycle to cycle", 100 * found["relative_standard_deviation"], "%"),
+            ("its direction", np.degrees(found["direction"]["value"]), "deg"),
+            ("K differs from run to run", 100 * found["within_power_cycle"], "%"),
+        )
+        if size
+    ]
+    text = "; ".join(words) + ": in the uncertainties" if words else "The scatter is explained by the noise"
+    said = f"{text}." if len(cycles) > 1 else "One power cycle only: nothing is known of repeatability."
+    caption = f"K of each run, relative to that of its level; bars are one standard uncertainty of a run. {said}"
+    return Figure("Repeatability over power cycles", caption, traces, layout, height=400)
+
+
+def _spectra(record: Calibration) -> list[Figure]:
+    """Spectra of X, FOG and residual around the table rate, at the lowest, a middle and the highest level."""
+    found = [s for s in record.data["spectra"] if s["spin_axis"] == record.data["spectra"][0]["spin_axis"]]
+    picked = sorted({0, len(found) // 2, len(found) - 1})[:_SHOWN_SPECTRA]
+    by_level = {row["level"]: row for row in record.sections["levels"]}
+    traces: list[dict[str, Any]] = []
+    titles, annotations = [], []
+    for number, index in enumerate(picked):
+        spectrum = found[index]
+        mark = "" if number == 0 else str(number + 1)
+        rate = from_si(np.array(spectrum["rate"]), "deg/s")
+        lines = zip(_SPECTRA, (QUIET, "#b8860b", GOOD), ("solid", "dot", "dash"), strict=True)
+        for (name, label), colour, dash in lines:
+            height = np.maximum(from_si(np.array(spectrum["height"][name]), "deg/h"), 1e-6)
+            width = 2.4 if name == "residual_x" else 1.6
+            traces.append(
+                _scatter(rate, height, label, mode="lines", line={"color": colour, "width": width, "dash": dash},
+                         xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0)
+            )  # fmt: skip
+        row = by_level[spectrum["level"]]
+        key = "x" if spectrum["spin_axis"] == "up" else "x_down"
+        K, a = abs(complex(row[key]["A"], row[key]["B"])), row["specific_force"]["value"]
+        line = from_si(K * a, "deg/h")
+        centre = float(np.median(rate))
+        traces.append(
+            _scatter([centre], [line], "fitted K a", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
+                     showlegend=number == 0, marker={"color": BAD, "size": 10, "symbol": "circle-open",
+                         "line": {"width": 2}})
+        )  # fmt: skip
+        titles.append("height, deg/h" if number == 0 else "")
+        annotations.append(
+            {"xref": f"x{mark} domain", "yref": f"y{mark} domain", "x": 0.0, "y": 1.01, "showarrow": False,
+             "xanchor": "left", "yanchor": "bottom",
+             "text": f"<b>{from_si(a, 'g'):.3g} g</b>: K a = {line:.3g} deg/h"}
+        )  # fmt: skip
+    layout = _panels(titles, "rate, deg/s", gap=0.07)
+    layout["annotations"] = annotations
+    layout["legend"]["y"] = 1.09
+    layout["margin"]["t"] = 75
+    for number in range(len(picked)):
+        mark = "" if number == 0 else str(number + 1)
+        layout[f"yaxis{mark}"] |= {"type": "log", "tickvals": _DECADES, "ticktext": [f"{v:g}" for v in _DECADES]}
+        layout[f"xaxis{mark}"] |= {"nticks": 5}
+    return [Figure("Spectrum around the table rate", _SPECTRUM_CAPTION, traces, layout, height=425)]

@@ -1,0 +1,160 @@
+"""The reduction of a centrifuge test: manifest and recordings to K(a) with its uncertainty, and the record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imulab.errors import DataError, OptionError, listed
+from imulab.procedures.centrifuge.budget import error_budget
+from imulab.procedures.centrifuge.corrections import corrected, find_corrections
+from imulab.procedures.centrifuge.curve import MODELS
+from imulab.procedures.centrifuge.levels import Levels, level_numbers, pool_levels
+from imulab.procedures.centrifuge.manifest import Manifest, Run
+from imulab.procedures.centrifuge.parameters import Estimates, estimate
+from imulab.procedures.centrifuge.record import make_record
+from imulab.procedures.centrifuge.run import LoadedRun, reduce_run
+from imulab.procedures.centrifuge.static import StaticRun, reduce_static
+from imulab.recording import Array, Recording, Source
+from imulab.records.calibration import Calibration
+
+METHODS = ("least-squares", "fourier")
+
+
+@dataclass(frozen=True)
+class CentrifugeFit:
+    """A reduced centrifuge test: the record, and the runs, levels and estimates behind it."""
+
+    calibration: Calibration
+    runs: tuple[LoadedRun, ...]
+    levels: Levels
+    estimates: Estimates
+
+
+def fit_centrifuge(
+    manifest: Manifest,
+    recording_of: Callable[[Run], Iterable[Recording]],
+    *,
+    method: str = "least-squares",
+    curve: str = "auto",
+    sources: Callable[[], Sequence[Source]] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> CentrifugeFit:
+    """Reduce a centrifuge test to K and zeta at every level and the curve K(a), run by run, block by block.
+
+    ``least-squares``: X, Y and FOG regressed on constant, trend, and lines at chi, 2 chi, 3 chi and the net rate,
+    with the phase measured by the encoder or the frequency refined on the FOG; ``fourier``: whole-period sums at the
+    manifest's rate, as published. ``K_i = |X - FOG| / a_i``, ``zeta_i = K_i / K_1 - 1``.
+
+    Parameters
+    ----------
+    manifest
+        The test.
+    recording_of
+        Gives the consecutive blocks of a run's recording; `functools.partial(il.read_blocks, ...)` or a simulation.
+    method
+        ``least-squares`` or ``fourier``.
+    curve
+        Terms of K(a): ``auto``, ``constant``, ``c1``, ``c2`` or ``c1+c2``.
+    sources
+        Called when all is read; returns the files that the record is made from.
+    progress
+        Called with the number of runs done.
+
+    Returns
+    -------
+    CentrifugeFit
+
+    Raises
+    ------
+    OptionError
+        Unknown method or curve.
+    DataError, UnitError
+        A run cannot be what the manifest says; the message names run and file.
+
+    References
+    ----------
+    CN102636185A; IEEE Std 813, 836, 1057.
+    """
+    check_options(method, curve)
+    seen = _Seen(recording_of)
+    statics: list[StaticRun] = []
+    runs: list[LoadedRun] = []
+    numbers, drawn = level_numbers(manifest), set[tuple[str, int]]()
+    order = sorted(range(len(manifest.runs)), key=lambda i: manifest.runs[i].role != "static")
+    for done, index in enumerate(order, start=1):
+        run = manifest.runs[index]
+        if run.role == "static":
+            statics.append(reduce_static(seen(run), manifest, index))
+        else:
+            rest = _rest(statics, run, manifest, index) if method == "fourier" else None
+            place = run.spin_axis, numbers[index]
+            runs.append(reduce_run(seen(run), manifest, index, rest, spectrum=place not in drawn))
+            drawn.add(place)
+        if progress is not None:
+            progress(done)
+    _same_channels(statics, runs, manifest)
+    levels = before = pool_levels(runs, manifest, method)
+    found = find_corrections(runs, before.lines, correct=method == "least-squares")
+    if found.common:
+        levels = pool_levels(corrected(runs, found), manifest, method)
+    estimates = estimate(levels, manifest, method=method, curve=curve)
+    record = make_record(
+        manifest=manifest,
+        statics=statics,
+        runs=runs,
+        levels=levels,
+        estimates=estimates,
+        budget=error_budget(runs, before.lines, manifest, found.corrected),
+        found=found.warnings,
+        options={"method": method, "curve": curve},
+        sources=sources() if sources is not None else (),
+        temperature=float(np.mean(seen.temperatures)) if seen.temperatures else None,
+    )
+    return CentrifugeFit(record, tuple(runs), levels, estimates)
+
+
+def check_options(method: str, curve: str) -> None:
+    """Check what can be checked before there is data.
+
+    Raises
+    ------
+    OptionError
+        Unknown method or curve.
+    """
+    if method not in METHODS:
+        raise OptionError(f"method {method!r}: expected one of {listed(METHODS, method)}")
+    if curve != "auto" and curve not in MODELS:
+        raise OptionError(f"curve {curve!r}: expected one of {listed(('auto', *MODELS), curve)}")
+
+
+@dataclass
+class _Seen:
+    """Passes blocks on and keeps each run's temperature at its start."""
+
+    source: Callable[[Run], Iterable[Recording]]
+    temperatures: list[float] = field(default_factory=list)
+
+    def __call__(self, run: Run) -> Iterator[Recording]:
+        for number, block in enumerate(self.source(run)):
+            if number == 0 and (temperature := block.mean_temperature()) is not None:
+                self.temperatures.append(temperature)
+            yield block
+
+
+def _rest(statics: list[StaticRun], run: Run, manifest: Manifest, index: int) -> Array:
+    """Mean of the static records of a run's power cycle, weighted by their samples."""
+    mine = [static for static in statics if static.run.power_cycle == run.power_cycle]
+    if len({static.channels for static in mine}) > 1:
+        raise DataError(f"{manifest.place(index)}: the static runs of its power cycle have different columns")
+    mean: Array = np.average([static.mean for static in mine], axis=0, weights=[static.samples for static in mine])
+    return mean
+
+
+def _same_channels(statics: list[StaticRun], runs: list[LoadedRun], manifest: Manifest) -> None:
+    reduced: list[StaticRun | LoadedRun] = [*statics, *runs]
+    for each in reduced:
+        if "dtg_y" not in each.channels and any("dtg_y" in run.channels for run in runs):
+            raise DataError(f"{manifest.place(each.index)}: no column dtg_y, which other runs have")

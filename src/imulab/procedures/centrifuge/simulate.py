@@ -1,0 +1,398 @@
+"""A simulated centrifuge test: every term of the error model as a named parameter, block by block.
+
+Written from the equations of motion in the time domain, apart from the reduction, which knows lines only. An arm-fixed
+vector stands in the gyroscope's frame at the angle chi (from X, turning to Y), which grows at the table rate; what is
+fixed in the room stands there at minus the angle by which the gyroscope has turned. An input axis at the angle psi
+(X: 0, Y: a quarter turn, FOG: its azimuth error) senses the cosine of the angle between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imulab.errors import OptionError
+from imulab.procedures.centrifuge.cells import FEWEST_PER_PERIOD
+from imulab.procedures.centrifuge.manifest import Manifest, Run
+from imulab.recording import Array, Recording
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+_DEG_H = np.pi / 180 / 3600
+_DEG_ROOT_H = np.pi / 180 / 60
+_PER_G = 1 / STANDARD_GRAVITY
+_BLOCK = 65536
+_TERMS = ("x", "y", "fog", "rig")
+
+
+@dataclass(frozen=True)
+class AxisTruth:
+    """One axis of the gyroscope. Its own axis carries the component ``a cos(chi - psi)`` of the specific force.
+
+    Attributes
+    ----------
+    bias
+        D_F, rad/s.
+    D_x, D_y
+        Drift per specific force along X and along Y, rad/s/(m/s^2).
+    c1, c2
+        Both change with the magnitude as ``1 + c1 a + c2 a^2``, 1/(m/s^2), 1/(m/s^2)^2.
+    cross_x, cross_y
+        D_XZ, D_YZ: per product of specific force along X or Y and along the spin axis, rad/s/(m/s^2)^2.
+    quadratic, cubic
+        D_XX, D_XXX: per square and cube of the own component, rad/s/(m/s^2)^2, rad/s/(m/s^2)^3.
+    scale_error
+        k_x: sensed rate is 1 + k_x times the true one.
+    out_of_plane
+        mu: angle of the input axis to the plane, rad; senses the net rate.
+    differential_flexure, differential_phase
+        kappa_d: tilt of this axis against the FOG per specific force, rad/(m/s^2), and where in the frame, rad.
+    angle_random_walk
+        rad/sqrt(s).
+    drift
+        Trend, rad/s^2.
+    markov, markov_time
+        Coloured noise: standard deviation, rad/s, and correlation time, s.
+    """
+
+    bias: float = 0.0
+    D_x: float = 0.0
+    D_y: float = 0.0
+    c1: float = 0.0
+    c2: float = 0.0
+    cross_x: float = 0.0
+    cross_y: float = 0.0
+    quadratic: float = 0.0
+    cubic: float = 0.0
+    scale_error: float = 0.0
+    out_of_plane: float = 0.0
+    differential_flexure: float = 0.0
+    differential_phase: float = 0.0
+    angle_random_walk: float = 0.0
+    drift: float = 0.0
+    markov: float = 0.0
+    markov_time: float = 1.0
+
+
+@dataclass(frozen=True)
+class FogTruth:
+    """The fibre-optic gyroscope: azimuth error eta against X, rad; delay, s; the rest as for an axis."""
+
+    bias: float = 0.0
+    scale_error: float = 0.0
+    azimuth: float = 0.0
+    out_of_plane: float = 0.0
+    delay: float = 0.0
+    angle_random_walk: float = 0.0
+    drift: float = 0.0
+
+
+@dataclass(frozen=True)
+class RigTruth:
+    """Centrifuge and place.
+
+    Attributes
+    ----------
+    tilt, tilt_phase
+        delta: table axis against the arm's axis, rad, and its direction, rad.
+    flexure, flexure_phase
+        kappa: further tilt per specific force, rad/(m/s^2), and its direction, rad.
+    base_tilt, base_phase
+        Arm's axis against the vertical, rad: gravity terms at the net rate.
+    earth_rate, earth_phase
+        W_N: level component of Earth rate, rad/s, and its phase at the start of a run, rad.
+    gravity
+        m/s^2.
+    arm_rate_error, table_rate_error
+        True rate over the manifest's, less 1.
+    """
+
+    tilt: float = 0.0
+    tilt_phase: float = 0.0
+    flexure: float = 0.0
+    flexure_phase: float = 0.0
+    base_tilt: float = 0.0
+    base_phase: float = 0.0
+    earth_rate: float = 0.0
+    earth_phase: float = 0.0
+    gravity: float = STANDARD_GRAVITY
+    arm_rate_error: float = 0.0
+    table_rate_error: float = 0.0
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Everything that the simulated test has in it; all zero unless given."""
+
+    x: AxisTruth = field(default_factory=AxisTruth)
+    y: AxisTruth | None = None
+    fog: FogTruth = field(default_factory=FogTruth)
+    rig: RigTruth = field(default_factory=RigTruth)
+
+
+def typical_truth(nonlinearity: float = 0.01, at: float = 20 * STANDARD_GRAVITY) -> Truth:
+    """Return a tuned gyroscope of 3.3 deg/h/g on a rig with 10 arcsec of tilt.
+
+    Parameters
+    ----------
+    nonlinearity
+        K(at) / K(0) - 1.
+    at
+        Specific force, m/s^2.
+    """
+    K = 3.3 * _DEG_H * _PER_G
+    angle = np.radians(25.0)
+    axis = AxisTruth(
+        bias=12.0 * _DEG_H,
+        D_x=K * np.cos(angle),
+        D_y=K * np.sin(angle),
+        c2=nonlinearity / at**2,
+        quadratic=0.002 * _DEG_H * _PER_G**2,
+        out_of_plane=4e-4,
+        angle_random_walk=0.01 * _DEG_ROOT_H,
+        drift=1.0 * _DEG_H / 3600,
+    )
+    other = AxisTruth(
+        bias=-7.0 * _DEG_H,
+        D_x=-0.9 * K * np.sin(angle),
+        D_y=0.9 * K * np.cos(angle),
+        c2=0.6 * nonlinearity / at**2,
+        quadratic=-0.001 * _DEG_H * _PER_G**2,
+        out_of_plane=-3e-4,
+        angle_random_walk=0.01 * _DEG_ROOT_H,
+        drift=-0.5 * _DEG_H / 3600,
+    )
+    fog = FogTruth(bias=0.4 * _DEG_H, angle_random_walk=0.005 * _DEG_ROOT_H, out_of_plane=2e-4)
+    rig = RigTruth(
+        tilt=np.radians(10 / 3600), tilt_phase=0.7, flexure=2e-7 * _PER_G, flexure_phase=2.1,
+        base_tilt=5e-5, base_phase=0.3, earth_rate=11.6 * _DEG_H, earth_phase=1.0,
+    )  # fmt: skip
+    return Truth(axis, other, fog, rig)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A simulated test; `blocks` gives the recording of one run, the same one every time.
+
+    Attributes
+    ----------
+    manifest, truth
+        Of the test.
+    sample_rate
+        Hz.
+    duration, static_duration
+        Of a loaded and of a static run, s.
+    encoder
+        Whether the recordings have a `table_angle` column.
+    unit
+        Of the rates in the recordings.
+    ramp
+        Duration of a spin-up from rest at the start of every loaded run, s.
+    seed
+        Of the random numbers.
+    """
+
+    manifest: Manifest
+    truth: Truth
+    sample_rate: float = 100.0
+    duration: float = 900.0
+    static_duration: float = 300.0
+    encoder: bool = True
+    unit: str = "deg/h"
+    ramp: float = 0.0
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("sample rate", self.sample_rate, 5.0, 1e5),
+            ("duration", self.duration, 1.0, 1e6),
+            ("static duration", self.static_duration, 1.0, 1e6),
+            ("ramp", self.ramp, 0.0, self.duration),
+        ):
+            if not low <= value <= high:
+                raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
+        fastest = max(run.table_rate for run in self.manifest.runs) / (2 * np.pi)
+        if self.sample_rate < FEWEST_PER_PERIOD * fastest:
+            raise OptionError(
+                f"sample rate {self.sample_rate:g}: expected {FEWEST_PER_PERIOD * fastest:.3g} Hz or more, "
+                f"{FEWEST_PER_PERIOD} samples in a period of the table"
+            )
+        if self.seed < 0:
+            raise OptionError(f"seed {self.seed}: expected a whole number from 0")
+        if parse_unit(self.unit).quantity != "rate":
+            raise OptionError(f"unit {self.unit!r}: expected a unit of rate")
+
+    def blocks(self, run: Run, size: int = _BLOCK) -> Iterator[Recording]:
+        """Yield the recording of a run in blocks of `size` samples."""
+        index = self.manifest.runs.index(run)
+        rng = np.random.default_rng([self.seed, index])
+        start_angle = rng.uniform(0, 2 * np.pi)
+        seconds = self.duration if run.role == "loaded" else self.static_duration
+        count = round(seconds * self.sample_rate)
+        state = np.zeros(2)
+        for first in range(0, count, size):
+            time = np.arange(first, min(first + size, count)) / self.sample_rate
+            yield self._block(run, time, start_angle, rng, state)
+
+    def __call__(self, run: Run) -> Iterator[Recording]:
+        """Yield the recording of a run in blocks."""
+        return self.blocks(run)
+
+    def _block(self, run: Run, time: Array, start_angle: float, rng: np.random.Generator, state: Array) -> Recording:
+        truth = self.truth
+        columns = {"time": time}
+        axes = [("dtg_x", truth.x, 0.0)]
+        if truth.y is not None:
+            axes.append(("dtg_y", truth.y, np.pi / 2))
+        motion = _Motion(self, run, time, start_angle)
+        for number, (name, axis, psi) in enumerate(axes):
+            rate = _gyroscope(motion, axis, psi, truth.rig)
+            rate += self._noise(axis.angle_random_walk, rng, len(time))
+            if axis.markov:
+                rate += _markov(axis, self.sample_rate, rng, len(time), state, number)
+            columns[name] = from_si(rate, self.unit)
+        late = _Motion(self, run, time - truth.fog.delay, start_angle) if truth.fog.delay else motion
+        fog = _fog(late, truth.fog, truth.rig) + self._noise(truth.fog.angle_random_walk, rng, len(time))
+        columns["fog"] = from_si(fog, self.unit)
+        units = {"time": "s"} | {name: self.unit for name in columns if name != "time"}
+        if self.encoder:
+            columns["table_angle"] = np.degrees(motion.chi) % 360.0
+            units["table_angle"] = "deg"
+        return Recording(columns=columns, units=units, metadata=dict(self.manifest.sensor), name=run.file)
+
+    def _noise(self, walk: float, rng: np.random.Generator, count: int) -> Array:
+        """White noise of the rate whose integral is an angle random walk, rad/s."""
+        if not walk:
+            return np.zeros(count)
+        noise: Array = walk * np.sqrt(self.sample_rate) * rng.standard_normal(count)
+        return noise
+
+
+class _Motion:
+    """Rates and angles of the rig over a block: signed arm rate, chi, turned angle, specific force."""
+
+    def __init__(self, simulation: Simulation, run: Run, time: Array, start_angle: float) -> None:
+        rig = simulation.truth.rig
+        arm = run.sense * run.arm_rate * (1 + rig.arm_rate_error)
+        table = run.sense * run.table_rate * (1 + rig.table_rate_error)
+        ramp = simulation.ramp if run.role == "loaded" else 0.0
+        # Angle turned in units of the steady rate: a parabola while spinning up, then a line.
+        turned = time if not ramp else np.where(time < ramp, time**2 / (2 * ramp), time - ramp / 2)
+        share: Array | float = 1.0 if not ramp else np.minimum(time / ramp, 1.0)
+        self.time = time
+        self.arm = arm * share
+        self.net = (arm - table) * share
+        self.chi = start_angle + table * turned
+        self.net_angle = (arm - table) * turned
+        self.force = self.arm**2 * simulation.manifest.radius
+        self.up = 1.0 if run.spin_axis == "up" else -1.0
+
+
+def _common(motion: _Motion, psi: float, out_of_plane: float, rig: RigTruth) -> Array:
+    """Rate of the body along an input axis at the angle psi, rad/s."""
+    tilted = rig.tilt * np.cos(motion.chi + rig.tilt_phase - psi)
+    bent = rig.flexure * motion.force * np.cos(motion.chi + rig.flexure_phase - psi)
+    rate: Array = (
+        motion.net * out_of_plane
+        + rig.earth_rate * np.cos(rig.earth_phase - motion.net_angle - psi)
+        - motion.arm * (tilted + bent)
+    )
+    return rate
+
+
+def _gyroscope(motion: _Motion, axis: AxisTruth, psi: float, rig: RigTruth) -> Array:
+    a, chi = motion.force, motion.chi
+    along_x, along_y = a * np.cos(chi), a * np.sin(chi)
+    growth = 1 + axis.c1 * a + axis.c2 * a**2
+    spin = motion.up * rig.gravity
+    own = a * np.cos(chi - psi)
+    level = rig.gravity * rig.base_tilt
+    base = rig.base_phase - motion.net_angle
+    rate: Array = (1 + axis.scale_error) * _common(motion, psi, axis.out_of_plane, rig)
+    rate += axis.bias + axis.drift * motion.time
+    rate += (growth * axis.D_x + spin * axis.cross_x) * along_x + (growth * axis.D_y + spin * axis.cross_y) * along_y
+    rate += axis.quadratic * own**2 + axis.cubic * own**3
+    rate += axis.D_x * level * np.cos(base) + axis.D_y * level * np.sin(base)
+    if axis.differential_flexure:
+        rate += motion.arm * axis.differential_flexure * a * np.cos(chi + axis.differential_phase - psi)
+    return rate
+
+
+def _fog(motion: _Motion, fog: FogTruth, rig: RigTruth) -> Array:
+    rate = (1 + fog.scale_error) * _common(motion, fog.azimuth, fog.out_of_plane, rig)
+    return rate + fog.bias + fog.drift * motion.time
+
+
+def _markov(
+    axis: AxisTruth, sample_rate: float, rng: np.random.Generator, count: int, state: Array, slot: int
+) -> Array:
+    """First-order Gauss-Markov noise, continued from block to block through `state`."""
+    from scipy.signal import lfilter
+
+    decay = np.exp(-1 / (sample_rate * axis.markov_time))
+    drive = axis.markov * np.sqrt(1 - decay**2) * rng.standard_normal(count)
+    noise: Array
+    noise, final = lfilter([1.0], [1.0, -decay], drive, zi=state[slot : slot + 1])
+    state[slot] = final[0]
+    return noise
+
+
+def simulate_centrifuge(
+    manifest: Manifest,
+    truth: Truth | None = None,
+    *,
+    sample_rate: float = 100.0,
+    duration: float = 900.0,
+    static_duration: float = 300.0,
+    encoder: bool = True,
+    unit: str = "deg/h",
+    ramp: float = 0.0,
+    seed: int = 1,
+) -> Simulation:
+    """Simulate a centrifuge test.
+
+    ``X = (1 + k_x) common + D_F + (D_X + g D_XZ) a cos chi + (D_Y + g D_YZ) a sin chi + D_XX a^2 cos^2 chi + D_XXX
+    a^3 cos^3 chi`` + gravity terms + differential flexure + noise, ``common = w_n mu + W_N cos(w_n t) - w_t (delta +
+    kappa a) cos(chi + ..)``; the FOG senses the common rate alone.
+
+    Parameters
+    ----------
+    manifest
+        The runs.
+    truth
+        Parameters in SI; `typical_truth` unless given.
+    sample_rate
+        Hz.
+    duration, static_duration
+        Of loaded and of static runs, s.
+    encoder
+        Whether there is a `table_angle` column.
+    unit
+        Of the rates in the recordings.
+    ramp
+        Duration of a spin-up at the start of every loaded run, s.
+    seed
+        Of the random numbers.
+
+    Returns
+    -------
+    Simulation
+        ``simulation(run)`` yields the blocks of a run.
+
+    Raises
+    ------
+    OptionError
+        A value is out of range.
+    """
+    return Simulation(
+        manifest,
+        typical_truth() if truth is None else truth,
+        sample_rate,
+        duration,
+        static_duration,
+        encoder,
+        unit,
+        ramp,
+        seed,
+    )

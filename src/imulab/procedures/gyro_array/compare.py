@@ -1,0 +1,357 @@
+"""What fusing really buys: every method over one recording, with errors, limit, Allan curves and bandwidth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import DataError, ImulabError
+from imulab.estimation.allan import allan_deviation
+from imulab.estimation.sampling import sampling_rate
+from imulab.procedures.gyro_array.bandwidth import Response, responses
+from imulab.procedures.gyro_array.checks import Checks
+from imulab.procedures.gyro_array.clocks import on_one_clock
+from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
+from imulab.procedures.gyro_array.memory import memory_text
+from imulab.procedures.gyro_array.model import (
+    FEWEST_ROBUST,
+    METHODS,
+    Elements,
+    array_calibration,
+    feedback_notes,
+    find_elements,
+)
+from imulab.procedures.gyro_array.single import Singles, single_gyros
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration, Covariance
+
+_TRACE = 800
+_QUIET_FACTOR = 3.0
+_SHORTEST_QUIET = 5.0
+_FILTERED = 0.9  # of half the sampling rate
+_BEYOND_LIMIT = 0.97  # of the least noise that weights alone can reach
+_FOLLOWS, _SURE, _FINEST = 0.95, 2.0, 0.01
+_NOTHING = 1e-9  # of a gyro's noise
+_HALVES = 2 * FEWEST_ROBUST
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The figures of one method on one axis; rates in the unit of the readings, angles in that unit times s.
+
+    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean of
+    rate_std over the single gyros that work, over this one (None where the output does not change at all);
+    ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; ``bandwidth`` in Hz at -3 dB, half the
+    sampling rate where nothing is filtered; ``split_half`` the standard deviation of the difference of the two halves.
+    """
+
+    rate_std: float
+    rate_max: float
+    angle_std: float
+    angle_max: float
+    reduction: float | None
+    over_limit: float
+    bandwidth: float
+    split_half: float | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Every method over one recording.
+
+    Attributes
+    ----------
+    figures
+        Method to one `Figures` per axis, or to the reason why it cannot run.
+    record
+        All of it with curves and traces, as a record that a report can be drawn from.
+    warnings
+        What a reader must know.
+    """
+
+    figures: dict[str, tuple[Figures, ...] | str]
+    elements: Elements
+    record: Calibration
+    warnings: tuple[str, ...]
+
+
+def compare_methods(
+    recording: Recording,
+    *,
+    calibration: Calibration | None = None,
+    memory: str | float = "growing",
+    count_from: int = 1,
+) -> Comparison:
+    """Run all seven methods over a recording; memory and `count_from` are memory and start of `FuseOptions`.
+
+    The truth is the column ``truth_rate`` (or ``truth_rate_x`` ..); without it the unit must be still, or still for a
+    stretch of 5 s or more: the figures are then of the longest such stretch, and the truth there is 0. With six gyros
+    or more the two halves of the array (odd and even elements) are also fused apart; half of the standard deviation of
+    their difference estimates the noise of the whole without any truth. A single gyro is the mean of those that work
+    (`single_gyros`).
+
+    Raises
+    ------
+    DataError
+        No elements, no time, an axis without a finite reading, or neither truth nor a stretch at rest.
+    """
+    recording = on_one_clock(recording)
+    elements = find_elements(recording)
+    rate, notes = sampling_rate(recording)
+    warnings = [*(f"{recording.name}: {note}" for note in recording.notes), *notes]
+    logged = elements.readings(recording)
+    readings, aligned = _corrected(logged, recording, elements, calibration)
+    for a, row in enumerate(elements.names):
+        if not np.isfinite(logged[:, a]).any():
+            raise DataError(f"{recording.name}: columns {row[0]} to {row[-1]}: expected finite readings, found none")
+    checks = Checks(elements.names)
+    checks.watch(logged)
+    warnings += [type(line)(f"{recording.name}: {line}") for line in checks.lines(turned=not aligned)]
+    truth = elements.truth(recording)
+    start, stop = 0, len(recording)
+    if truth is None:
+        start, stop = _longest_quiet(recording, readings, rate)
+        if stop - start < len(recording):
+            time = recording.si("time")
+            warnings.append(
+                f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
+                f"{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"
+            )
+    reference = np.zeros((stop - start, len(elements.axes))) if truth is None else truth[start:stop]
+    error = readings[start:stop] - reference[:, :, None]
+    lost = ~np.isfinite(readings).any(axis=2)
+    figures: dict[str, tuple[Figures, ...] | str] = {}
+    rates: dict[str, Fused] = {}
+    halves: dict[str, list[float | None]] = {}
+    response: dict[str, list[Response]] = {}
+    for method in METHODS:
+        try:
+            options = FuseOptions(method=method, memory=memory, start=count_from, calibration=calibration, rate=rate)
+            fused = fuse(recording, options, weights=method == "robust", flags=method == "robust")
+            spoilt = (np.isnan(fused.rate) & ~lost).any(axis=1)
+            if spoilt.any():
+                figures[method] = (
+                    f"its output is no number from {fused.time[int(np.argmax(spoilt))]:.6g} s on: a reading that is "
+                    "none spoils it"
+                )
+                continue
+            halves[method] = _halves(readings, elements, options, start, stop)
+            response[method] = responses(logged[start:stop], elements, options, calibration, rate)
+            rates[method] = fused
+        except ImulabError as problem:
+            figures[method] = str(problem)
+    known = rates["robust"].flags if "robust" in rates else None
+    singles = [
+        single_gyros(error[:, a], None if known is None else known[start:stop, a]) for a in range(len(elements.axes))
+    ]
+    off = {method: fused.rate[start:stop] - reference for method, fused in rates.items()}
+    for method, wrong in off.items():
+        figures[method] = tuple(
+            _figures(wrong[:, a], rate, singles[a], response[method][a].bandwidth, halves[method][a])
+            for a in range(len(elements.axes))
+        )
+    figures = {method: figures[method] for method in METHODS}
+    curves: dict[str, Any] = {m: [_curve(wrong[:, a], rate) for a in range(wrong.shape[1])] for m, wrong in off.items()}
+    curves["single gyro"] = [_curve(error[:, a, singles[a].middle], rate) for a in range(len(elements.axes))]
+    angles = {
+        m: [_trace(np.cumsum(np.nan_to_num(wrong[:, a])) / rate) for a in range(wrong.shape[1])]
+        for m, wrong in off.items()
+    }
+    health = _health(rates["robust"], recording) if "robust" in rates else {}
+    warnings += _filtering(figures, response, rate)
+    if not isinstance(figures["feedback"], str):
+        warnings += [type(line)(f"{recording.name}: {line}") for line in feedback_notes(elements.count, rate)]
+    data = {
+        "figures": {m: f if isinstance(f, str) else [asdict(x) for x in f] for m, f in figures.items()},
+        "allan": curves,
+        "angle": angles,
+        "trace_time": _trace(recording.si("time")[start:stop]),
+        "health": health,
+        "single": [single.noise for single in singles],
+        "limit": [single.limit for single in singles],
+        "working": [
+            [name for name, works in zip(row, single.working, strict=True) if works]
+            for row, single in zip(elements.names, singles, strict=True)
+        ],
+        "readings_names": [list(row) for row in elements.names],
+    }
+    record = Calibration(
+        procedure="gyro_array",
+        parameters={},
+        covariance=Covariance((), ()),
+        model={
+            "kind": "comparison",
+            "elements": elements.count,
+            "axes": list(elements.axes),
+            "unit": elements.units[0],
+            "units": list(elements.units),
+            "truth": "column truth_rate" if truth is not None else "a still unit",
+            "calibrated": calibration is not None,
+            "memory": memory_text(memory, count_from),
+        },
+        fit={
+            "samples": stop - start,
+            "sample_rate": {"value": rate, "unit": "Hz"},
+            "duration": {"value": (stop - start) / rate, "unit": "s"},
+        },
+        data=data,
+        sensor={key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
+        sources=(recording.source,) if recording.source else (),
+        warnings=tuple(warnings),
+    )
+    return Comparison(figures, elements, record, tuple(warnings))
+
+
+def rate_figures(error: Array, rate: float) -> tuple[float, float, float, float]:
+    """Return std (mean removed) and largest size of a rate error, shape (m,), and the same of its integral."""
+    angle = np.cumsum(np.nan_to_num(error)) / rate
+    return float(np.nanstd(error)), float(np.nanmax(np.abs(error))), float(angle.std()), float(np.abs(angle).max())
+
+
+def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split_half: float | None) -> Figures:
+    std, largest, angle_std, angle_max = rate_figures(error, rate)
+    noise = float(np.diff(error[np.isfinite(error)]).std() / math.sqrt(2))
+    if std <= _NOTHING * single.noise:  # rounding alone: it follows a dead gyro
+        std = noise = 0.0
+    limit = single.limit
+    return Figures(
+        rate_std=std,
+        rate_max=largest,
+        angle_std=angle_std,
+        angle_max=angle_max,
+        reduction=single.noise / std if std > 0 else None,
+        over_limit=noise / limit if limit > 0 else 0.0,
+        bandwidth=bandwidth,
+        split_half=split_half,
+    )
+
+
+def _corrected(
+    logged: Array, recording: Recording, elements: Elements, calibration: Calibration | None
+) -> tuple[Array, bool]:
+    """Readings with a record's biases and matrices taken off, shape (m, axes, n); whether there were matrices."""
+    if calibration is None:
+        return logged, False
+    known = array_calibration(calibration, elements, recording.name)
+    readings = logged - known.bias
+    if known.matrices is None:
+        return readings, False
+    return np.einsum("nab,mbn->man", known.matrices, readings), True
+
+
+def _longest_quiet(recording: Recording, readings: Array, rate: float) -> tuple[int, int]:
+    """First sample and last + 1 of the longest stretch in which the array's median hardly moves."""
+    middle = _medians(readings)
+    size = max(2, round(rate))
+    count = len(middle) // size
+    windows = middle[: count * size].reshape(count, size, -1).std(axis=1)  # nan where the array was lost
+    whole = np.isfinite(windows).all(axis=1)
+    if whole.any():
+        usual = np.quantile(windows[whole], 0.1, axis=0)
+        quiet = (windows <= _QUIET_FACTOR * usual).all(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(int), [0]])))
+        runs = edges.reshape(-1, 2)
+        best = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))] if len(runs) else np.array([0, 0])
+        drift = np.abs(np.diff(middle[: count * size].reshape(count, size, -1).mean(axis=1), axis=0))
+        if (best[1] - best[0]) * size >= _SHORTEST_QUIET * rate and not _moving(drift, usual, size, best):
+            stop = len(middle) if best[1] == count else int(best[1]) * size
+            return int(best[0]) * size, stop
+    raise DataError(
+        f"{recording.name}: neither a column truth_rate nor a stretch of {_SHORTEST_QUIET:g} s at rest; "
+        "expected one to tell errors from motion"
+    )
+
+
+def _medians(readings: Array) -> Array:
+    """Median over the finite readings of each sample, shape (m, axes); nan where there is none."""
+    count = np.isfinite(readings).sum(axis=2)
+    ordered = np.sort(np.where(np.isfinite(readings), readings, np.nan), axis=2)  # nan goes to the end
+    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    last = readings.shape[2] - 1
+    pair = [np.take_along_axis(ordered, np.minimum(k, last)[..., None], axis=2)[..., 0] for k in (low, high)]
+    middle: Array = (pair[0] + pair[1]) / 2
+    return middle
+
+
+def _moving(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
+    """Whether the means of successive windows wander more than the noise within them allows."""
+    steps = drift[int(best[0]) : int(best[1]) - 1]
+    return bool(len(steps)) and bool((np.median(steps, axis=0) > 10 * usual / math.sqrt(size) + 0.5 * usual).any())
+
+
+def _halves(readings: Array, elements: Elements, options: FuseOptions, start: int, stop: int) -> list[float | None]:
+    """Standard deviation of the difference of the two halves of the array (odd and even elements), each axis."""
+    if elements.count < _HALVES or options.method == "covariance":
+        return [None] * len(elements.axes)
+    plain = replace(options, calibration=None)
+    rates = []
+    for first in (0, 1):
+        half = replace(elements, names=tuple(row[first::2] for row in elements.names))
+        part = np.ascontiguousarray(readings[:, :, first::2])
+        stream = open_stream(plain, half, options.rate or 1.0, part[:10_000])
+        rates.append(stream.process(part, flags=False).rate[start:stop])
+    apart: Array = rates[0] - rates[1]
+    return [float(np.nanstd(column)) if np.isfinite(column).any() else None for column in apart.T]
+
+
+def _curve(error: Array, rate: float) -> dict[str, Any]:
+    finite = np.isfinite(error)
+    curve = allan_deviation(np.where(finite, error, error[finite].mean() if finite.any() else 0.0), rate)
+    return {"tau": curve.tau.tolist(), "deviation": curve.deviation.tolist(), "u": curve.standard_uncertainty.tolist()}
+
+
+def _trace(values: Array) -> list[float]:
+    step = max(1, -(-len(values) // _TRACE))
+    thinned: list[float] = np.round(values[::step], 9).tolist()
+    return thinned
+
+
+def _health(fused: Fused, recording: Recording) -> dict[str, Any]:
+    """Share of each stretch in which each gyro was in use, and its weight, for the figure over time."""
+    weights, flags = fused.weights, fused.flags
+    if weights is None or flags is None:
+        return {}
+    pieces = min(240, len(weights))
+    edges = np.linspace(0, len(weights), pieces + 1).astype(int)[:-1]
+    time = recording.si("time")
+    counts = np.diff(np.append(edges, len(weights)))[:, None, None]
+    return {
+        "time": np.round(time[edges], 6).tolist(),
+        "weight": np.round(np.add.reduceat(weights, edges, axis=0) / counts, 4).tolist(),
+        "flags": np.bitwise_or.reduceat(flags, edges, axis=0).tolist(),
+        "lines": fused.health.lines(),
+    }
+
+
+def _filtering(
+    figures: dict[str, tuple[Figures, ...] | str], response: dict[str, list[Response]], rate: float
+) -> list[str]:
+    """Warn where less noise is bought by not following the motion: its fast part (a low-pass filter), or all of it."""
+    found = []
+    for method, rows in figures.items():
+        if isinstance(rows, str):
+            continue
+        slow = min(response[method], key=lambda answer: answer.gain)
+        narrow = min(row.bandwidth for row in rows)
+        beyond = min((row.over_limit for row in rows if row.over_limit > 0), default=1.0)
+        if slow.gain + _SURE * slow.gain_uncertainty < _FOLLOWS:
+            verbs = "does not move and counts" if len(slow.blind) == 1 else "do not move and count"
+            why = f": {' '.join(slow.blind)} {verbs} in it"
+            found.append(
+                f"{method}: it follows only {slow.gain:.2f} ± {max(slow.gain_uncertainty, _FINEST):.2f} of a motion"
+                f"{why if slow.blind else ''}"
+            )
+        elif narrow < _FILTERED * rate / 2:
+            found.append(
+                f"{method}: its bandwidth is {narrow:.3g} Hz of {rate / 2:.3g} Hz: where its rate noise is lower that "
+                "is low-pass filtering, which does not lower the angle error"
+            )
+        elif beyond < _BEYOND_LIMIT:
+            found.append(
+                f"{method}: its noise from sample to sample is {beyond:.2f} of the least that weights can reach: that "
+                "is low-pass filtering, which does not lower the angle error"
+            )
+    return found

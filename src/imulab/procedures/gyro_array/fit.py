@@ -1,0 +1,385 @@
+"""Calibration of an array's elements: biases and noise at rest, alignment in motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imulab.device.array_settings import Fusion
+from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
+from imulab.estimation.allan import AllanCurve
+from imulab.estimation.column_noise import ColumnNoise, column_noise, noise_lines
+from imulab.estimation.noise_coefficients import COEFFICIENTS, coefficients_dict
+from imulab.estimation.rows import LeftOut, leave_out
+from imulab.estimation.sampling import sampling_rate
+from imulab.procedures.gyro_array.align import Alignment
+from imulab.procedures.gyro_array.checks import Checks
+from imulab.procedures.gyro_array.clocks import on_one_clock
+from imulab.procedures.gyro_array.latency import align_in_time, latency_notes
+from imulab.procedures.gyro_array.model import Elements, feedback_notes, find_elements, fixed_weights
+from imulab.procedures.gyro_array.rest import find_rest
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.units import parse_unit, to_si
+from imulab.verdict import Note
+
+_FEWEST_SAMPLES = 200
+_FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
+_OVERLAP = 8
+_CLIPPED_RUN = 3
+_SHARED = 0.5
+
+
+@dataclass(frozen=True)
+class ArrayFit:
+    """A calibration of an array, with the Allan curves behind it, axis by axis."""
+
+    calibration: Calibration
+    curves: tuple[tuple[AllanCurve, ...], ...]
+
+
+@dataclass(frozen=True)
+class _AtRest:
+    """What the recording at rest says: curves and coefficients per axis and element; rad/s."""
+
+    bias: Array
+    curves: tuple[tuple[AllanCurve, ...], ...]
+    noise: tuple[tuple[ColumnNoise, ...], ...]
+    white: Array
+    duration: float
+    rate: float
+
+
+def calibrate_array(
+    still: Recording,
+    moving: Recording | None = None,
+    *,
+    averaging_time: float = 1.0,
+    serial: str | None = None,
+    fusion: Fusion | None = None,
+) -> ArrayFit:
+    """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
+
+    At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
+    come from its Allan curve, and so does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance
+    matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    covariance; Vaccaro and Zaki 2017). In motion: `align`.
+
+    Parameters
+    ----------
+    still, moving
+        Recordings with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h.
+    averaging_time
+        Of the covariance matrix, s.
+    fusion
+        Method and memory that `array fuse` and `export` take from the record; robust and growing where not given.
+
+    Raises
+    ------
+    DataError
+        Samples that are not finite, a dead element, too few samples, no stretch at rest (`find_rest`).
+    UnitError
+        The elements have different units, or none of rate.
+    ObservabilityError
+        The motion does not excite every axis.
+    """
+    still = on_one_clock(still)
+    elements = find_elements(still)
+    for unit in elements.units:
+        if parse_unit(unit).quantity != "rate":
+            raise UnitError(f"{still.name}: array calibrate needs rates, rad/s deg/s deg/h; found {unit}")
+    if elements.count < 2:
+        raise DataError(f"{still.name}: {elements.count} element on each axis; expected 2 or more")
+    if not averaging_time > 0:
+        raise OptionError(f"averaging time {averaging_time:g} s: expected more than 0")
+    _check_readings(still, elements)
+    left_out = _leave_out(still, elements)
+    warnings = [type(note)(f"{still.name}: {note}") for note in still.notes]
+    warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
+    still, cut = _still_part(left_out, elements)
+    warnings += cut
+    rest = _at_rest(still, elements)
+    _, notes = sampling_rate(still)
+    warnings += notes
+    aligned = None
+    if moving is not None:
+        aligned, more = _in_motion(moving, elements, rest)
+        warnings += more
+    readings = _si(still, elements) - rest.bias
+    checks = Checks(elements.names)
+    checks.watch(readings)
+    warnings += [type(line)(f"{still.name}: {line}") for line in checks.units()]
+    if aligned is not None:
+        readings = np.einsum("iab,mbi->mai", np.linalg.inv(aligned.sensing), readings)
+    covariance, used, count = _covariance(readings, rest.rate, averaging_time)
+    if used < averaging_time * 0.999:
+        warnings.append(
+            f"{still.name}: {rest.duration:.4g} s at rest are too short for a covariance at {averaging_time:g} s: "
+            f"taken at {used:.3g} s"
+        )
+    noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
+    warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
+    if fusion is not None and fusion.method == "feedback":
+        warnings += [type(line)(f"{still.name}: {line}") for line in feedback_notes(elements.count, rest.rate)]
+    record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
+    if fusion is not None:
+        record = replace(record, model={**record.model, "fusion": fusion.to_dict()})
+    if serial is not None:
+        record = Calibration(**{**record.__dict__, "sensor": {**record.sensor, "serial": serial}})
+    return ArrayFit(record, rest.curves)
+
+
+def _leave_out(recording: Recording, elements: Elements) -> LeftOut:
+    names = [name for row in elements.names for name in row]
+    check_finite(recording, names)
+    return leave_out(recording, names)
+
+
+def _si(recording: Recording, elements: Elements) -> Array:
+    readings = elements.readings(recording)
+    for axis, unit in enumerate(elements.units):
+        readings[:, axis] = to_si(readings[:, axis], unit)
+    return readings
+
+
+def _check_readings(recording: Recording, elements: Elements) -> None:
+    """Refuse readings that are no numbers, and gyros that are dead."""
+    names = [name for row in elements.names for name in row]
+    check_finite(recording, names)
+    for name in names:
+        values = recording.columns[name]
+        if len(values) and np.ptp(values) == 0:
+            raise DataError(f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead gyro")
+    checks = Checks(elements.names)
+    checks.watch(elements.readings(recording))
+    for line in checks.doubled():
+        raise DataError(f"{recording.name}: {line}")
+
+
+def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[str]]:
+    """The longest stretch at rest, and a line where that is not everything."""
+    still = left_out.recording
+    if len(still) < _FEWEST_SAMPLES:
+        raise DataError(f"{still.name}: {len(still)} samples at rest are too few; expected {_FEWEST_SAMPLES} or more")
+    rate, _ = sampling_rate(still)
+    found = find_rest(_si(still, elements), rate, elements.names, still.name)
+    left_out.check(found.start, found.stop, "the recording at rest")
+    if not found.moved:
+        return still, []
+    time = still.si("time")
+    columns = {name: values[found.start : found.stop] for name, values in still.columns.items()}
+    part = replace(still, columns=columns, first_row=still.first_row + found.start)
+    if len(part) < _FEWEST_SAMPLES:
+        raise DataError(
+            f"{still.name}: not at rest throughout ({found.moved}), and the longest stretch at rest has {len(part)} "
+            f"samples; expected {_FEWEST_SAMPLES} or more"
+        )
+    first, last = time[found.start], time[found.stop - 1]
+    return part, [
+        f"{still.name}: not at rest throughout ({found.moved}): used is the longest stretch at rest, {first:.6g} to "
+        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another"
+    ]
+
+
+def _at_rest(still: Recording, elements: Elements) -> _AtRest:
+    rate, _ = sampling_rate(still)
+    _check_readings(still, elements)
+    readings = _si(still, elements)
+    noise = tuple(
+        tuple(column_noise(readings[:, a, i], rate) for i in range(elements.count)) for a in range(len(elements.axes))
+    )
+    curves = tuple(tuple(one.curve for one in row) for row in noise)
+    white = np.array([[curve.deviation[0] for curve in row] for row in curves])
+    return _AtRest(readings.mean(axis=0), curves, noise, white, len(still) / rate, rate)
+
+
+def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Alignment, list[str]]:
+    moving = on_one_clock(moving)
+    its = find_elements(moving)
+    if its.names != elements.names:
+        raise DataError(
+            f"{moving.name}: {its.count} elements on {len(its.axes)} axes; expected {elements.count} on "
+            f"{len(elements.axes)} as at rest"
+        )
+    _check_readings(moving, its)
+    left_out = _leave_out(moving, its)
+    moving = left_out.recording
+    readings = _si(moving, its)
+    clipped = _clipped(readings)
+    notes = [type(note)(f"{moving.name}: {note}") for note in moving.notes]
+    notes += [type(note)(f"{moving.name}: {note}") for note in left_out.notes()]
+    if clipped.any():
+        notes.append(f"{moving.name}: {int(clipped.sum())} samples at the end of a gyro's range were left out")
+    truth = its.truth(moving)
+    if truth is not None:
+        truth = np.column_stack([to_si(truth[:, a], unit) for a, unit in enumerate(its.units)])[~clipped]
+    kept = readings[~clipped] - rest.bias
+    checks = Checks(its.names)
+    checks.watch(kept)
+    notes += [type(line)(f"{moving.name}: {line}") for line in checks.units()]
+    notes += [Note(f"{moving.name}: {line}; the record puts it right") for line in checks.turned()]
+    if len(kept) < _FEWEST_SAMPLES:
+        raise DataError(f"{moving.name}: {len(kept)} usable samples in motion; expected {_FEWEST_SAMPLES} or more")
+    try:
+        time = check_time(moving) if "time" in moving else np.arange(len(moving)) / rest.rate
+        found = align_in_time(time[~clipped], kept, rest.white, truth)
+    except ObservabilityError as error:
+        raise ObservabilityError(f"{moving.name}: {error}") from None
+    names = its.names[0] if len(its.axes) == 1 else [f"element {i + 1}" for i in range(its.count)]
+    return found, [*notes, *(f"{moving.name}: {line}" for line in latency_notes(found, names))]
+
+
+def _clipped(readings: Array) -> np.ndarray:
+    """Rows in which a gyro stands at its largest or smallest value, if it stood there for several samples in a row."""
+    flat = readings.reshape(len(readings), -1)
+    rows = np.zeros(len(flat), dtype=bool)
+    for column in flat.T:
+        for extreme in (column.min(), column.max()):
+            at = column == extreme
+            runs = np.convolve(at, np.ones(_CLIPPED_RUN), mode="valid")
+            if (runs >= _CLIPPED_RUN).any():
+                rows |= at
+    return rows
+
+
+def _covariance(readings: Array, rate: float, averaging_time: float) -> tuple[Array, float, int]:
+    """Allan covariance of each axis, shape (axes, n, n), the averaging time used, and the degrees of freedom."""
+    m, axes, n = readings.shape
+    size = max(1, min(round(averaging_time * rate), m // (_FEWEST_DIFFERENCES * n + 1)))
+    total = np.concatenate([np.zeros((1, axes, n)), np.cumsum(readings, axis=0)])
+    starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
+    first, middle, last = total[starts], total[starts + size], total[starts + 2 * size]
+    difference = (last - 2 * middle + first) / size
+    # Equivalent number of independent differences under white noise: NIST SP 1065, table 5.
+    freedom = max(2, round(1.5 * m / size))
+    return np.einsum("kai,kaj->aij", difference, difference) / (2 * len(difference)), size / rate, freedom
+
+
+def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
+    return {"value": value, "standard_uncertainty": uncertainty, "unit": unit}
+
+
+def _record(
+    still: Recording,
+    moving: Recording | None,
+    elements: Elements,
+    rest: _AtRest,
+    aligned: Alignment | None,
+    covariance: Array,
+    averaging_time: float,
+    differences: int,
+    warnings: list[str],
+) -> Calibration:
+    axes, n = len(elements.axes), elements.count
+    spread = np.array([[c.coefficients.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
+    one = axes == 1
+
+    def scalar(values: Array) -> Any:
+        """A number for one axis, a list over x, y, z for three."""
+        return float(values[0]) if one else values.tolist()
+
+    listed = []
+    parameters: dict[str, Parameter] = {}
+    for i in range(n):
+        entry: dict[str, Any] = {
+            "name": elements.names[0][i] if one else str(i + 1),
+            "bias": _with_unit(scalar(rest.bias[:, i]), scalar(spread[:, i]), "rad/s"),
+        }
+        for a, axis in enumerate(elements.axes):
+            label = f"{axis}_{i + 1}" if axis else f"{i + 1}"
+            parameters[f"bias_{label}"] = Parameter(float(rest.bias[a, i]), float(spread[a, i]), "rad/s")
+        if aligned is not None:
+            inverse = np.linalg.inv(aligned.sensing[i])
+            carried = np.sqrt((inverse**2) @ aligned.standard_uncertainty[i] ** 2 @ (inverse**2))
+            if one:
+                value, u = float(aligned.sensing[i, 0, 0]), float(aligned.standard_uncertainty[i, 0, 0])
+                entry["scale_factor"] = _with_unit(value, u, "1")
+                parameters[f"scale_factor_{i + 1}"] = Parameter(value, u, "1")
+            else:
+                entry["matrix"] = _with_unit(inverse.tolist(), carried.tolist(), "1")
+            entry["residual"] = {"value": scalar(aligned.residual[i]), "unit": "rad/s"}
+            if aligned.latency is not None and aligned.latency_uncertainty is not None:
+                entry["latency"] = _with_unit(float(aligned.latency[i]), float(aligned.latency_uncertainty[i]), "s")
+        dicts = [coefficients_dict(rest.noise[a][i].coefficients, "rad/s") for a in range(axes)]
+        for name in COEFFICIENTS:
+            entry[name] = dicts[0][name] if one else _over_axes([found[name] for found in dicts])
+        listed.append(entry)
+    fixed = [fixed_weights(matrix) for matrix in covariance]
+    sigma = np.sqrt(np.einsum("aii->ai", covariance))
+    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
+    uncertainty = (1 - correlation**2) / math.sqrt(differences)
+    shared = _shared(correlation)
+    if shared > _SHARED:
+        warnings = [
+            *warnings,
+            f"the elements' noise is shared (mean correlation {shared:.2f}): was the array at rest? Fusion "
+            f"cannot remove it",
+        ]
+    sources = tuple(r.source for r in (still, moving) if r is not None and r.source is not None)
+    return Calibration(
+        procedure="gyro_array",
+        parameters=parameters,
+        covariance=Covariance((), ()),
+        model={
+            "kind": "calibration",
+            "elements": n,
+            "axes": list(elements.axes),
+            "aligned": aligned is not None,
+            "gauge": aligned.gauge if aligned is not None else None,
+            "unit": elements.units[0],
+            **_temperature(still),
+        },
+        fit={
+            "duration": {"value": rest.duration, "unit": "s"},
+            "sample_rate": {"value": rest.rate, "unit": "Hz"},
+            "samples": len(still),
+            "samples_in_motion": 0 if moving is None else len(moving),
+        },
+        options={"averaging_time": averaging_time},
+        data={
+            "allan": [
+                [
+                    {"tau": c.tau.tolist(), "deviation": c.deviation.tolist(), "u": c.standard_uncertainty.tolist()}
+                    for c in row
+                ]
+                for row in rest.curves
+            ]
+        },
+        sensor={key: still.metadata[key] for key in ("serial", "model") if key in still.metadata},
+        sources=sources,
+        warnings=tuple(warnings),
+        sections={
+            "elements": listed,
+            "correlation": {
+                "averaging_time": {"value": averaging_time, "unit": "s"},
+                "axes": list(elements.axes),
+                "matrix": correlation.tolist(),
+                "standard_uncertainty": uncertainty.tolist(),
+                "covariance": covariance.tolist(),
+                "unit": "(rad/s)^2",
+                "weights": [weights.tolist() for weights, _ in fixed],
+                "limit": [{"value": limit, "unit": "rad/s"} for _, limit in fixed],
+            },
+        },
+    )
+
+
+def _over_axes(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """One entry with a list over x, y, z for three of one axis each."""
+    reasons = [one["reason"] for one in found if "reason" in one]
+    listed = {key: [one[key] for one in found] for key in ("value", "standard_uncertainty")}
+    return {**listed, "unit": found[0]["unit"], **({"reason": reasons[0]} if reasons else {})}
+
+
+def _shared(correlation: Array) -> float:
+    n = correlation.shape[1]
+    off = ~np.eye(n, dtype=bool)
+    return float(np.mean(np.abs(correlation[:, off])))
+
+
+def _temperature(still: Recording) -> dict[str, Any]:
+    temperature = still.mean_temperature()
+    return {} if temperature is None else {"temperature": {"value": temperature, "unit": "degC"}}

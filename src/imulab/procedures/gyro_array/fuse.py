@@ -1,0 +1,377 @@
+"""Fusion of an array's readings into one rate, by the C core, whole or block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from imulab.device.array_settings import MOST_COUNT
+from imulab.device.blob import Blob
+from imulab.errors import DataError, OptionError, listed
+from imulab.estimation.rows import HISTORY, zero_rows
+from imulab.procedures.gyro_array.blobs import blob_stream, fusion_of_blob
+from imulab.procedures.gyro_array.checks import Checks
+from imulab.procedures.gyro_array.clocks import Clock, to_one_clock
+from imulab.procedures.gyro_array.health import Health
+from imulab.procedures.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
+from imulab.procedures.gyro_array.memory import memory_text
+from imulab.procedures.gyro_array.model import (
+    FEWEST_ROBUST,
+    METHODS,
+    ArrayCalibration,
+    Elements,
+    array_calibration,
+    feedback_notes,
+    find_elements,
+)
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+from imulab.units import from_si, parse_unit
+
+_NEED_THREE = ("robust", "support", "least-squares")
+_FOR_NOISE = 10_000
+_WITHOUT_UNIT = 16.0
+
+
+@dataclass(frozen=True)
+class FuseOptions:
+    """How to fuse.
+
+    Attributes
+    ----------
+    method
+        One of ``mean support least-squares feedback robust covariance kalman``.
+    memory
+        ``growing``, or a gain between 0 and 1.
+    start
+        Count of the first sample under growing memory.
+    initial_bias
+        ``first``, ``zero``, or the record of an array calibration whose biases the recursion starts from.
+    calibration
+        Record whose biases (and matrices, where it has them) are taken off first; its noise gives weights and gains. Or
+        the blob of such a record: what the unit runs, `robust` with the unit's settings and float numbers.
+    rate
+        Sampling rate, Hz; from the recording's first steps of time where None.
+    rate_walk
+        Process noise of `kalman`, rad/s/sqrt(s).
+    still
+        From when to when the unit is known to be at rest, s: zero-rate updates take the common bias off from then on.
+    """
+
+    method: str = "robust"
+    memory: str | float = "growing"
+    start: int = 1
+    initial_bias: str | Calibration = "first"
+    calibration: Calibration | Blob | None = None
+    rate: float | None = None
+    rate_walk: float = RATE_WALK
+    still: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
+        if isinstance(self.memory, str):
+            if self.memory != "growing":
+                raise OptionError(f"memory {self.memory!r}: expected growing, growing:COUNT, or a gain between 0 and 1")
+        elif not 0 < self.memory < 1:
+            raise OptionError(f"memory {self.memory:g}: expected growing, growing:COUNT, or a gain between 0 and 1")
+        if not 1 <= self.start <= MOST_COUNT:
+            raise OptionError(f"memory growing:{self.start}: expected a count from 1 to {MOST_COUNT}")
+        if isinstance(self.initial_bias, str) and self.initial_bias not in ("first", "zero"):
+            raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record")
+        if self.method == "covariance" and self.calibration is None:
+            raise OptionError("method covariance needs --calibration RECORD: its weights come from a recording at rest")
+        if isinstance(self.calibration, Blob):
+            held = fusion_of_blob(self.calibration).to_dict()
+            if {"method": self.method, "memory": self.memory, "start": self.start} != held:
+                raise OptionError(
+                    f"{self.calibration.name}: this blob fuses by {held['method']} with "
+                    f"{memory_text(held['memory'], held['start'])}, and by nothing else"
+                )
+        if isinstance(self.calibration, Blob) and self.initial_bias != "first":
+            raise OptionError(f"{self.calibration.name}: a blob holds the biases it starts from: no --initial-bias")
+        if isinstance(self.initial_bias, Calibration) and self.calibration is not None:
+            raise OptionError(
+                "--initial-bias RECORD together with --calibration: the calibration takes the biases off already"
+            )
+        if self.rate is not None and not 0 < self.rate < 1e9:
+            raise OptionError(f"rate {self.rate:g}: expected a positive number of Hz")
+
+
+@dataclass(frozen=True)
+class Fused:
+    """The fused rate.
+
+    Attributes
+    ----------
+    time
+        s, shape (m,).
+    rate
+        In the unit of the readings, shape (m, axes).
+    weights, flags
+        Of each gyro in each sample, shape (m, axes, n), or None where they were not asked for.
+    elements
+        The columns that were fused.
+    health
+        What happened to each gyro.
+    notes
+        Gaps in time, and whatever else a user should know.
+    block
+        The samples that were fused.
+    """
+
+    time: Array
+    rate: Array
+    weights: Array | None
+    flags: np.ndarray | None
+    elements: Elements
+    health: Health
+    notes: tuple[str, ...] = ()
+    block: Recording | None = None
+
+
+def fuse(
+    recording: Recording, options: FuseOptions | None = None, *, weights: bool = False, flags: bool = True
+) -> Fused:
+    """Fuse a recording as a whole.
+
+    Raises
+    ------
+    DataError, UnitError, RecordError, OptionError
+        As for `fuse_blocks`.
+    """
+    fuser = Fuser(options or FuseOptions(), weights=weights)
+    parts = list(fuser.fuse([recording]))
+    joined = (
+        [np.concatenate(column) for column in zip(*[(p.time, p.rate) for p in parts], strict=True)] if parts else None
+    )
+    if joined is None or fuser.health is None:
+        raise DataError(f"{recording.name}: no samples to fuse")
+    return Fused(
+        time=joined[0],
+        rate=joined[1],
+        weights=np.concatenate([p.weights for p in parts]) if weights else None,
+        flags=np.concatenate([p.flags for p in parts]) if flags and parts[0].flags is not None else None,
+        elements=parts[0].elements,
+        health=fuser.health,
+        notes=tuple(fuser.notes()),
+    )
+
+
+@dataclass
+class Fuser:
+    """A stream over the blocks of a recording: the state between them, and what is said at the end."""
+
+    options: FuseOptions
+    weights: bool = False
+    clock: Clock = field(default_factory=Clock)
+    health: Health | None = None
+    tell: Callable[[str], None] = lambda _: None
+    name: str = "recording"
+    checks: Checks | None = None
+    before: Array | None = None
+    lost: int = 0
+
+    def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
+        """Fuse consecutive blocks; the result does not depend on where they are cut.
+
+        Raises
+        ------
+        DataError
+            No elements, too few for the method, no time, or time that does not rise.
+        UnitError
+            The elements of an axis have different units, or others than the record.
+        RecordError
+            The record is not of this array.
+        """
+        self.clock.nominal = self.options.rate
+        elements: Elements | None = None
+        stream: Any = None
+        head: Array | None = None  # the first samples and their times, until the sampling rate is known
+        early = np.empty(0)
+        for block in to_one_clock(blocks):
+            self.name = block.name
+            if elements is None:
+                elements = find_elements(block)
+                self._check(block, elements)
+                self.health = Health(elements.names)
+                self.checks = Checks(elements.names)
+            settled = stream is not None and self.clock.settled
+            before = self.clock.rate
+            self.clock.watch(block)
+            readings, time = elements.readings(block), block.si("time")
+            self._drop_zeros(readings)
+            if self.checks is not None:
+                self.checks.watch(readings)
+            seen = 0
+            if not settled:
+                early = np.concatenate([early, time])
+                seen = 0 if head is None else len(head)
+                head = readings if head is None else np.concatenate([head, readings])
+                if stream is None or self.clock.rate != before:
+                    # The times behind the settings are a different number of samples: start again from the first one.
+                    stream = self._open(block, elements, head)
+                    readings, time = head, early
+                else:
+                    seen = 0
+            still = self.options.still
+            at_rest = None if still is None else (time >= still[0]) & (time < still[1])
+            out = stream.process(np.ascontiguousarray(readings), weights=self.weights, still=at_rest)
+            if not settled and self.clock.settled:
+                head = None
+            yield self._fused(block, out, seen, elements)
+
+    def notes(self) -> list[str]:
+        """Return what there is to say at the end: gaps, rows of zeros, and what the readings show (`Checks`)."""
+        said: list[str] = []
+        if self.options.method == "feedback" and self.health is not None:
+            said = feedback_notes(len(self.health.names[0]), self.clock.rate)
+        known = self.health.stuck() if self.health is not None else ()
+        found = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
+        if self.lost:
+            rows = f"{self.lost} row{'s' * (self.lost > 1)}"
+            found = [*found, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
+        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*found, *said])]
+
+    def _drop_zeros(self, readings: Array) -> None:
+        """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""
+        flat = readings.reshape(len(readings), -1)
+        joined = flat if self.before is None else np.vstack([self.before, flat])
+        zero = zero_rows(list(joined.T))[len(joined) - len(flat) :]
+        self.before = joined[(joined != 0).any(axis=1)][-HISTORY:]
+        self.lost += int(np.count_nonzero(zero))
+        readings[zero] = np.nan
+
+    def _aligns(self) -> bool:
+        record = self.options.calibration
+        return isinstance(record, Blob) or (record is not None and bool(record.model.get("aligned")))
+
+    def _fused(self, block: Recording, out: Any, seen: int, elements: Elements) -> Fused:
+        time, rate = block.si("time"), out.rate[seen:]
+        flags = out.flags[seen:] if out.flags is not None else None
+        if self.health is not None:
+            for key in self.health.watch(time, flags, rate):
+                self.tell(self.health.first(key))
+        return Fused(
+            time=time,
+            rate=rate,
+            weights=out.weights[seen:] if out.weights is not None else None,
+            flags=flags,
+            elements=elements,
+            health=self.health or Health(elements.names),
+            block=block,
+        )
+
+    def _check(self, block: Recording, elements: Elements) -> None:
+        if self.options.method in _NEED_THREE and elements.count < FEWEST_ROBUST:
+            found = " ".join(name for row in elements.names for name in row)
+            raise DataError(
+                f"{block.name}: method {self.options.method} needs {FEWEST_ROBUST} gyros on each axis, "
+                f"found {elements.count} ({found}); --method mean fuses fewer"
+            )
+
+    def _open(self, block: Recording, elements: Elements, first: Array) -> Any:
+        return open_stream(self.options, elements, self.clock.rate, first[:_FOR_NOISE], block.name)
+
+
+def open_stream(
+    options: FuseOptions, elements: Elements, rate: float, first: Array, recording: str = "recording"
+) -> Any:
+    """Return a `runtime.Stream` for these elements of a recording of this name.
+
+    `first` are readings to take the noise from where no record has it.
+
+    Raises
+    ------
+    RecordError, UnitError
+        The record is not of this array.
+    """
+    from imulab.device.unit import array_stream
+
+    if isinstance(options.calibration, Blob):
+        return blob_stream(options.calibration, elements, recording)
+    calibration = None
+    if options.calibration is not None:
+        calibration = array_calibration(options.calibration, elements, recording)
+    initial: Any = options.initial_bias
+    bias = None if calibration is None else calibration.bias
+    if isinstance(initial, Calibration):
+        start = array_calibration(initial, elements, recording).bias
+        if options.method == "feedback":
+            initial = start
+        else:  # what the others start from is taken off for good: their own estimates are relative to it
+            initial, bias = "zero", start
+    if options.method == "kalman" and bias is not None:
+        initial = "zero"  # a first sample's noise would stay in the biases for as long as the gain takes
+    settings: dict[str, Any] = {
+        "elements": elements.count,
+        "axes": len(elements.axes),
+        "memory": options.memory,
+        "start": options.start,
+        "initial_bias": initial,
+        "bias": bias,
+        "matrices": None if calibration is None else calibration.matrices,
+        "rate": rate,
+    }
+    if calibration is not None and options.method in ("covariance", "robust"):
+        settings["weights"] = np.ascontiguousarray(
+            calibration.weights if options.method == "covariance" else _white_weights(calibration)
+        )
+    if options.method == "kalman":
+        settings["gain"] = _gain(options, elements, rate, first, calibration)
+    return array_stream(options.method, **settings)
+
+
+def _aligned(matrices: Array | None, spread: Array) -> Array:
+    """Standard deviations after alignment, shape (axes, n)."""
+    if matrices is None:
+        return spread
+    turned: Array = np.sqrt(np.einsum("nab,bn->an", matrices**2, spread**2))
+    return turned
+
+
+def _white_weights(calibration: ArrayCalibration) -> Array:
+    """Start weights of `robust`: inverse variances of the white noise."""
+    inverse = 1 / np.maximum(_aligned(calibration.matrices, calibration.white), 1e-300) ** 2
+    weights: Array = inverse / inverse.sum(axis=1, keepdims=True)
+    return weights
+
+
+def _gain(
+    options: FuseOptions, elements: Elements, rate: float, first: Array, calibration: ArrayCalibration | None
+) -> Array:
+    """Steady-state gain of `kalman`, shape (axes, n + 1, n)."""
+    step = 1 / rate
+    if calibration is not None:
+        white = _aligned(calibration.matrices, calibration.white) / np.sqrt(step)
+        walk = _aligned(calibration.matrices, calibration.walk)
+        walk = np.maximum(walk, 0.1 * default_bias_walk(white))
+    else:
+        white = noise_about_mean(first)
+        walk = default_bias_walk(white)
+    gains = []
+    for a, unit in enumerate(elements.units):
+        if parse_unit(unit).quantity == "rate":
+            rate_walk = float(from_si(options.rate_walk, unit))
+            if calibration is None and (white[a] == 1.0).all():  # nothing known: follow the motion
+                rate_walk = _WITHOUT_UNIT / np.sqrt(step)
+        else:
+            rate_walk = _WITHOUT_UNIT * float(white[a].mean()) / np.sqrt(step)
+        gains.append(steady_gain(white[a], walk[a], rate_walk, step))
+    return np.ascontiguousarray(gains)
+
+
+def fused_recording(fused: Fused) -> Recording:
+    """Return a fused block as a recording: its time as it was, and the fused rate."""
+    block = fused.block
+    if block is None:
+        raise ValueError("only a block of Fuser.fuse has its samples with it")
+    columns = {"time": block.columns["time"]}
+    units = {"time": block.units["time"]}
+    for a, (name, unit) in enumerate(zip(fused.elements.rate_names(), fused.elements.units, strict=True)):
+        columns[name] = np.ascontiguousarray(fused.rate[:, a])
+        units[name] = unit
+    return replace(block, columns=columns, units=units, notes=())

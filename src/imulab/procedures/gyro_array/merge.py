@@ -1,0 +1,235 @@
+"""Files of one gyroscope each, joined by time to the recording of an array."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from imulab.errors import DataError, UnitError
+from imulab.estimation.sampling import usual_step
+from imulab.procedures.gyro_array.model import MOST_ELEMENTS
+from imulab.recording import Array, Recording, check_time
+from imulab.units import conversion_factor, parse_unit
+
+_WIDEST_GAP = 10.0
+_MOST_POINTS = 1 << 20
+_FEWEST_POINTS = 100
+_ALIKE = 0.8
+_SECOND = 0.9
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The recording of the array, and what there is to say of how its elements came together."""
+
+    recording: Recording
+    notes: tuple[str, ...]
+
+
+def merge_recordings(
+    recordings: Sequence[Recording], *, axis: str | None = None, column: str | None = None, align: bool = False
+) -> Merged:
+    """Join recordings of one gyroscope each to one of an array, by time.
+
+    The rows are those of the first recording that lie within the time of all. The others are interpolated to them,
+    linearly; in a gap of more than 10 of their sampling intervals they are NaN. Nothing is extrapolated.
+
+    Parameters
+    ----------
+    recordings
+        At least two, on clocks that agree unless `align` is chosen.
+    axis
+        ``x``, ``y`` or ``z``: take this axis of each; all three (or the only one) if not given.
+    column
+        Take the column of this name instead.
+    align
+        Move the clocks so that the motion of each recording fits that of the first.
+
+    Raises
+    ------
+    DataError
+        There is only one recording, or one twice; a recording has no gyroscope or no time; they have no time in
+        common; `align` finds no motion that fits.
+    UnitError
+        The units of two gyroscopes cannot be converted to each other.
+    """
+    if not 2 <= len(recordings) <= MOST_ELEMENTS:
+        raise DataError(f"expected 2 to {MOST_ELEMENTS} recordings, a gyroscope each, found {len(recordings)}")
+    _refuse_twice(recordings)
+    names = [_gyro_columns(recording, axis, column) for recording in recordings]
+    first = recordings[0]
+    for recording, own in zip(recordings, names, strict=True):
+        if len(own) != len(names[0]):
+            raise DataError(
+                f"{recording.name}: {_axes(own)}, but {first.name} has {_axes(names[0])}; "
+                "--axis x, y or z takes one axis of each"
+            )
+    times = [_time(recording) for recording in recordings]
+    values = [_in_unit_of(first, names[0], r, own) for r, own in zip(recordings, names, strict=True)]
+    notes = []
+    for i in range(1, len(recordings)):
+        name, offset = recordings[i].name, _offset(times[0], values[0], times[i], values[i])
+        if align:
+            if offset is None:
+                raise DataError(f"{name}: --align: found no motion that fits {first.name} at one offset of time only")
+            times[i] = times[i] - offset
+            notes.append(f"{name}: moved by {-offset:+.6g} s, where its motion fits that of {first.name}")
+        elif offset is not None and abs(offset) > max(usual_step(np.diff(times[k]))[0] for k in (0, i)):
+            later = f"{abs(offset):.4g} s {'later' if offset > 0 else 'earlier'}"
+            notes.append(
+                f"{name}: its motion comes {later} than that of {first.name}: the clocks differ; --align moves it"
+            )
+    start, stop = max(t[0] for t in times), min(t[-1] for t in times)
+    rows = np.flatnonzero((times[0] >= start) & (times[0] <= stop))
+    if not rows.size:
+        i = int(np.argmax([max(t[0] - times[0][-1], times[0][0] - t[-1]) for t in times]))
+        raise DataError(
+            f"{recordings[i].name}: {times[i][0]:.9g} to {times[i][-1]:.9g} s, no time in common with {first.name}, "
+            f"{times[0][0]:.9g} to {times[0][-1]:.9g} s; clocks that began apart are moved by --align"
+        )
+    notes += [_joined(r, t, times[0]) for r, t in zip(recordings[1:], times[1:], strict=True)]
+    columns, units = {"time": first.column("time")[rows]}, {"time": first.units["time"]}
+    for i, (time, read) in enumerate(zip(times, values, strict=True), start=1):
+        at = read[rows] if i == 1 else _interpolated(times[0][rows], time, read)
+        for k, name in enumerate(names[0]):
+            title = f"gyro_{'xyz'[k]}_{i}" if len(names[0]) > 1 else f"gyro_{i}"
+            columns[title], units[title] = np.ascontiguousarray(at[:, k]), first.units[name]
+    elements = {f"element_{i}": Path(recording.name).name for i, recording in enumerate(recordings, start=1)}
+    merged = Recording(
+        columns=columns,
+        units=units,
+        metadata={**first.metadata, **elements},
+        name="the merged recording",
+        corrected_by=tuple(dict.fromkeys(entry for recording in recordings for entry in recording.corrected_by)),
+    )
+    return Merged(merged, tuple(notes))
+
+
+def _refuse_twice(recordings: Sequence[Recording]) -> None:
+    seen: dict[str, str] = {}
+    for recording in recordings:
+        digest = recording.source.sha256 if recording.source else ""
+        if digest and digest in seen:
+            same = "given twice" if seen[digest] == recording.name else f"the same file as {seen[digest]}"
+            raise DataError(f"{recording.name}: {same}; expected a file for each gyroscope")
+        seen[digest] = recording.name
+
+
+def _gyro_columns(recording: Recording, axis: str | None, column: str | None) -> list[str]:
+    """Return the columns of the gyroscope: three, or one."""
+    if column is not None or axis is not None:
+        name = column if column is not None else f"gyro_{axis}"
+        recording.column(name)
+        quantity = parse_unit(recording.units[name]).quantity
+        if quantity not in ("rate", "output"):
+            raise UnitError(f"{recording.name}: column {name} is in {recording.units[name]}; expected a rate")
+        return [name]
+    triad = [name for name in ("gyro_x", "gyro_y", "gyro_z") if name in recording]
+    found = triad or [name for name in recording.columns if name == "gyro" or name.startswith("gyro_")]
+    if not found:
+        raise DataError(
+            f"{recording.name}: no gyroscope; expected gyro_x gyro_y gyro_z or one column gyro, found "
+            f"{' '.join(recording.columns)}; --column NAME says which column it is"
+        )
+    if len(found) not in (1, 3) or (len(found) == 3 and not triad):
+        raise DataError(
+            f"{recording.name}: found {' '.join(found)}; expected one gyroscope in each file; "
+            "--column NAME says which column it is"
+        )
+    return found
+
+
+def _axes(names: Sequence[str]) -> str:
+    return "three axes" if len(names) == 3 else "one axis"
+
+
+def _time(recording: Recording) -> Array:
+    if "time" not in recording:
+        raise DataError(f"{recording.name}: no column time; found {' '.join(recording.columns)}")
+    time = check_time(recording)
+    if len(time) < 2:
+        raise DataError(f"{recording.name}: a single sample; expected a recording")
+    return time
+
+
+def _in_unit_of(first: Recording, wanted: Sequence[str], recording: Recording, names: Sequence[str]) -> Array:
+    """Return the readings in the units of the first recording, shape (n, axes)."""
+    columns = []
+    for name, target in zip(names, wanted, strict=True):
+        try:
+            factor = conversion_factor(recording.units[name], first.units[target])
+        except UnitError as error:
+            raise UnitError(f"{recording.name}: column {name}: {error}, the unit of {first.name}") from None
+        columns.append(recording.columns[name] * factor)
+    return np.column_stack(columns)
+
+
+def _interpolated(wanted: Array, time: Array, values: Array) -> Array:
+    """Return readings at other times, shape (m, axes); NaN across gaps."""
+    found = np.column_stack([np.interp(wanted, time, column) for column in values.T])
+    right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
+    bridged = (time[right] - time[right - 1] > _WIDEST_GAP * usual_step(np.diff(time))[0]) & (time[right] != wanted)
+    found[bridged & (time[right - 1] != wanted)] = np.nan
+    return found
+
+
+def _joined(recording: Recording, time: Array, clock: Array) -> str:
+    rates = [1 / usual_step(np.diff(t))[0] for t in (time, clock)]
+    return f"{recording.name}: {rates[0]:.6g} Hz interpolated to the times of the first file, {rates[1]:.6g} Hz"
+
+
+def _offset(time: Array, values: Array, other: Array, others: Array) -> float | None:
+    """How much later the other clock shows the same motion, s; None where no single offset fits clearly.
+
+    The size of the rate, which is the same however a gyroscope is mounted, is correlated over all shifts that leave
+    half of the shorter recording.
+    """
+    step = max(usual_step(np.diff(time))[0], usual_step(np.diff(other))[0])
+    step = max(step, max(time[-1] - time[0], other[-1] - other[0]) / _MOST_POINTS)
+    a, b = _size_of_rate(time, values, step), _size_of_rate(other, others, step)
+    shorter = min(len(a), len(b))
+    if shorter < _FEWEST_POINTS:
+        return None
+    length = 1 << (len(a) + len(b)).bit_length()
+
+    def correlated(p: Array, q: Array) -> Array:
+        spectrum = np.fft.rfft(q, length) * np.conj(np.fft.rfft(p, length))
+        both = np.fft.irfft(spectrum, length)
+        return np.concatenate([both[length - len(a) + 1 :], both[: len(b)]])
+
+    ones = [np.ones(len(a)), np.ones(len(b))]
+    count = np.maximum(np.round(correlated(ones[0], ones[1])), 1)
+    mean_a, mean_b = correlated(a, ones[1]) / count, correlated(ones[0], b) / count
+    power_a = correlated(a**2, ones[1]) / count - mean_a**2
+    power_b = correlated(ones[0], b**2) / count - mean_b**2
+    floor = 1e-6 * max(float(a.var() + b.var()), 1e-300)
+    alike = (correlated(a, b) / count - mean_a * mean_b) / np.sqrt(np.maximum(power_a * power_b, floor**2))
+    alike[count < shorter / 2] = -1.0
+    best = int(np.argmax(alike))
+    if alike[best] < _ALIKE:
+        return None
+    below = np.flatnonzero(alike < alike[best] / 2)
+    left, right = below[below < best], below[below > best]
+    outside = np.concatenate([alike[: left[-1] if left.size else 0], alike[right[0] if right.size else len(alike) :]])
+    if outside.size and outside.max() > _SECOND * alike[best]:
+        return None  # a motion that repeats fits at several offsets
+    shift = float(best - (len(a) - 1))
+    if 0 < best < len(alike) - 1:
+        before, peak, after = alike[best - 1 : best + 2]
+        curve = before - 2 * peak + after
+        shift += 0.5 * (before - after) / curve if curve < 0 else 0.0
+    return float(other[0] - time[0] + shift * step)
+
+
+def _size_of_rate(time: Array, values: Array, step: float) -> Array:
+    """Size of the rate, without its median, at even steps of time."""
+    grid = np.arange(time[0], time[-1], step)
+    size = np.zeros(len(grid))
+    for column in values.T:
+        known = np.isfinite(column)
+        if known.any():
+            size += (np.interp(grid, time[known], column[known]) - np.median(column[known])) ** 2
+    return np.sqrt(size)

@@ -1,0 +1,193 @@
+"""The report of a test of a record by fresh attitudes: verdict, and each residual beside its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab._version import VERSION
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.compare import Check
+from imulab.procedures.tumble.engineering import micro_g, small_g
+from imulab.procedures.tumble.prior import FALSE_ALARM
+from imulab.records.calibration import Calibration
+from imulab.report import render_page
+from imulab.report.bulk import bulk, edge_marks, edge_note
+from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, Table
+from imulab.verdict import Bad, Note, verdict_of
+
+_BEYOND = 2.0
+"""Standard uncertainties beyond which a residual is marked."""
+
+
+def meaning(check: Check) -> str:
+    """Return what the test says, in words."""
+    if check.passed:
+        return "the attitudes agree with the record"
+    if _limit_alone(check):
+        return "no change of the unit is shown, but an attitude is beyond the limit"
+    return "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
+
+
+def next_step(check: Check, record: str, file: str) -> list[str]:
+    """Return what to do or to know where the test failed."""
+    if check.passed:
+        return []
+    if _limit_alone(check):
+        return ["the limit is smaller than the uncertainty of the attitudes can tell"]
+    return [
+        f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
+        "change"
+    ]
+
+
+def measured(check: Check, attitudes: Attitudes) -> str:
+    """Return p and the largest residual."""
+    n = len(attitudes)
+    test = "not tested, the record states no uncertainties"
+    if check.probability is not None:
+        p = f"p = {check.probability:.2g}" if check.probability else "p below 1e-300"
+        test = f"{p} (chi-square {check.chi_square:.3g} of {n})"
+    limit = "" if check.limit is None else f", limit {small_g(check.limit)}"
+    return (
+        f"{test}, {n} attitudes, largest |f| - g {small_g(check.residuals[check.worst])} "
+        f"({attitudes.label(check.worst)}){limit}"
+    )
+
+
+def _limit_alone(check: Check) -> bool:
+    return check.probability is not None and check.probability >= FALSE_ALARM
+
+
+def check_page(
+    check: Check, attitudes: Attitudes, held: Calibration, *, record: str, file: str, said: Sequence[str]
+) -> str:
+    """Return the report; `said` is what was warned of."""
+    failed = [] if check.passed else [Bad(meaning(check)), *next_step(check, record, file)]
+    return render_page(
+        f"Tumble check: {'pass' if check.passed else 'fail'}",
+        held.sensor.get("serial", "unit without serial number"),
+        exhibits_of_check(check, attitudes),
+        verdict=verdict_of([*failed, *said]),
+        notes=[note for note in said if isinstance(note, Note)],
+        provenance=[
+            ("record", f"{record}, created {held.created}"),
+            ("file", file),
+            ("gravity", f"{check.gravity.value:.9g} m/s^2"),
+            ("software", f"imulab {VERSION}"),
+        ],
+    )
+
+
+def exhibits_of_check(check: Check, attitudes: Attitudes) -> Exhibits:
+    """Return what the report shows."""
+    facts = [("attitudes", str(len(attitudes))), ("largest |f| − g", small_g(check.residuals[check.worst]))]
+    if check.probability is not None:
+        facts.insert(0, ("p, if nothing changed", f"{check.probability:.2g}" if check.probability else "below 1e-300"))
+    if check.limit is not None:
+        facts.append(("limit", small_g(check.limit)))
+    return Exhibits(
+        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}; {measured(check, attitudes)}.",
+        facts,
+        [_figure(check, attitudes), _table(check, attitudes)],
+    )
+
+
+def _beyond(check: Check) -> NDArray[np.bool_]:
+    """Return which attitudes are beyond the limit, or beyond twice their uncertainty."""
+    size = np.abs(check.residuals)
+    beyond = np.zeros(len(size), dtype=bool)
+    if check.limit is not None:
+        beyond |= size > check.limit
+    if check.standard_uncertainty is not None:
+        beyond |= size > _BEYOND * check.standard_uncertainty
+    return beyond
+
+
+def _figure(check: Check, attitudes: Attitudes) -> Figure:
+    number = list(range(1, len(attitudes) + 1))
+    residual = np.array([micro_g(value) for value in check.residuals.tolist()])
+    beyond = _beyond(check)
+    trace: dict[str, Any] = {
+        "type": "scatter",
+        "mode": "markers",
+        "x": number,
+        "y": residual.tolist(),
+        "marker": {
+            "size": 9,
+            "color": [BAD if mark else GOOD for mark in beyond.tolist()],
+            "symbol": ["diamond" if mark else "circle" for mark in beyond.tolist()],
+        },
+        "text": [attitudes.label(i) for i in range(len(attitudes))],
+        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
+    }
+    room, bars = 0.0, " The record states no uncertainties."
+    if check.standard_uncertainty is not None:
+        half = [_BEYOND * micro_g(value) for value in check.standard_uncertainty.tolist()]
+        trace["error_y"] = {"type": "data", "array": half, "color": QUIET, "thickness": 1, "width": 3}
+        room = float(np.median(half))
+        bars = (
+            " Bars: twice the standard uncertainty, from record and attitude; one in twenty lies farther off by chance."
+        )
+    far = bulk(residual, room=room)
+    marks = [] if far is None else edge_marks(far, residual, number, [small_g(v) for v in check.residuals.tolist()])
+    limit = [] if check.limit is None else [-micro_g(check.limit), micro_g(check.limit)]
+    count = int(beyond.sum())
+    return Figure(
+        title="Residual |f| − g of each fresh attitude under the record",
+        message=f"{count} of {len(number)} attitudes {'lies' if count == 1 else 'lie'} beyond "
+        f"{'the limit or ' if limit else ''}twice the standard uncertainty.",
+        caption=f"f is the specific force by the record, g local gravity.{bars}"
+        f"{' Dashed: the limit.' if limit else ''} Red diamonds lie beyond."
+        + edge_note(0 if far is None else int(far.beyond.sum())),
+        traces=[trace, *marks],
+        layout={
+            "xaxis": {
+                "title": {"text": "attitude"},
+                "dtick": max(1, round(len(number) / 20)),
+                "range": [0.4, len(number) + 0.6],
+                "gridcolor": "#e6eaed",
+                "zeroline": False,
+            },
+            "yaxis": {
+                "title": {"text": "|f| − g, µg"},
+                "gridcolor": "#e6eaed",
+                "zerolinecolor": QUIET,
+                **({} if far is None else {"range": [far.low, far.high]}),
+            },
+            "showlegend": False,
+            "shapes": [
+                {
+                    "type": "line",
+                    "xref": "paper",
+                    "x0": 0,
+                    "x1": 1,
+                    "y0": end,
+                    "y1": end,
+                    "line": {"color": BAD, "dash": "dash", "width": 1.5},
+                }
+                for end in limit
+            ],
+        },
+    )
+
+
+def _table(check: Check, attitudes: Attitudes) -> Table:
+    rows = []
+    beyond = _beyond(check)
+    for i, value in enumerate(check.residuals.tolist()):
+        u, ratio = "not stated", "–"
+        if check.standard_uncertainty is not None:
+            own = float(check.standard_uncertainty[i])
+            u, ratio = small_g(own), f"{value / own:+.1f}"
+        rows.append([attitudes.label(i), small_g(value), u, ratio, "beyond" if beyond[i] else ""])
+    return Table(
+        "Attitudes",
+        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all attitudes "
+        f"together, with what their errors share; it fails where p is below {100 * FALSE_ALARM:g} %.",
+        ["attitude", "|f| − g", "u", "(|f| − g) / u", "remark"],
+        rows,
+    )

@@ -1,0 +1,192 @@
+"""Is this a tumble test of an accelerometer at all? One clear sentence for each way in which it may not be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imulab.errors import DataError, RecordError
+from imulab.estimation.estimate import median
+from imulab.procedures.tumble.attitudes import Attitudes, Motion
+from imulab.procedures.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
+from imulab.procedures.tumble.solve import Solution
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+from imulab.units import from_si, parse_unit, to_si
+
+_MANY_ROWS = 200
+_ENOUGH_TO_TELL = 5
+_DEAD_SPAN = 0.02
+_GYRO_SPAN = 0.05
+_PROPORTIONAL = 0.9999
+_FARTHEST = 5.0
+_WORST_RMS = 0.1
+_LEAST_EIGENVALUE = 1e-12
+_SHAKES, _LEAST_SHORTENING = 3.0, 2e-5  # standard uncertainties of |f| in an attitude; of g
+
+
+def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
+    """Check that attitudes can be those of an accelerometer triad under `gravity`, m/s^2.
+
+    Raises
+    ------
+    DataError
+        A gyroscope's recording, a dead or doubled axis, a wrong unit.
+    """
+    _check_turned(attitudes)
+    _check_magnitude(attitudes, gravity)
+
+
+def _check_turned(attitudes: Attitudes) -> None:
+    name, unit = attitudes.recording.name, attitudes.unit
+    span = np.ptp(attitudes.mean, axis=0)
+    columns = [f"accel_{axis}" for axis in "xyz"]
+    for axis, column in enumerate(columns):
+        for other in range(axis):
+            if np.array_equal(attitudes.mean[:, axis], attitudes.mean[:, other]):
+                raise DataError(
+                    f"{name}: columns {columns[other]} and {column} hold the same samples; "
+                    f"expected three different axes"
+                )
+    if len(attitudes) >= _ENOUGH_TO_TELL and (span > 0).all():
+        centred = attitudes.mean - attitudes.mean.mean(axis=0)
+        centred = centred / np.linalg.norm(centred, axis=0)
+        correlation = centred.T @ centred
+        for axis, other in ((1, 0), (2, 0), (2, 1)):
+            if abs(correlation[axis, other]) > _PROPORTIONAL:
+                raise DataError(
+                    f"{name}: columns {columns[other]} and {columns[axis]} are proportional (correlation "
+                    f"{correlation[axis, other]:+.5f} over the attitudes); expected three different axes"
+                )
+    if attitudes.swing is not None and len(attitudes) >= _ENOUGH_TO_TELL:
+        swing = float(attitudes.swing.max())
+        if span.max() < _GYRO_SPAN * swing:
+            raise DataError(
+                f"{name}: columns accel_x accel_y accel_z: at rest the outputs change by {span.max():.3g} {unit} from "
+                f"attitude to attitude, while moving by {swing:.3g} {unit}; expected gravity to turn through the axes: "
+                "is this a gyroscope's recording?"
+            )
+    if len(attitudes) >= _ENOUGH_TO_TELL and span.min() < _DEAD_SPAN * span.max():
+        axis = int(np.argmin(span))
+        raise DataError(
+            f"{name}: column {columns[axis]}: the output changes by only {span[axis]:.3g} {unit} over the "
+            f"{len(attitudes)} attitudes, the other axes by up to {span.max():.3g} {unit}: a dead axis, or one that "
+            "was never turned towards the vertical"
+        )
+
+
+def _check_magnitude(attitudes: Attitudes, gravity: float) -> None:
+    unit = parse_unit(attitudes.unit)
+    if unit.quantity != "acceleration":
+        return
+    lengths = to_si(np.linalg.norm(attitudes.mean, axis=1), unit.symbol)
+    found = median(lengths)
+    if not gravity / 2 <= found <= 2 * gravity:
+        raise DataError(
+            f"{attitudes.recording.name}: columns accel_x accel_y accel_z: the specific force at rest is about "
+            f"{from_si(found, unit.symbol):.4g} {unit.symbol}, expected {from_si(gravity, unit.symbol):.4g} "
+            f"{unit.symbol}: is the unit wrong?"
+        )
+    magnitude = lengths / gravity
+    far = (magnitude < 1 / _FARTHEST) | (magnitude > _FARTHEST)
+    if far.any():
+        index = int(np.argmax(far))
+        raise DataError(
+            f"{attitudes.recording.name}: {attitudes.label(index)}, columns accel_x accel_y accel_z: "
+            f"the specific force is {from_si(magnitude[index] * gravity, unit.symbol):.4g} {unit.symbol}, expected "
+            f"about {from_si(gravity, unit.symbol):.4g} {unit.symbol}{_untimed(attitudes)}"
+        )
+
+
+def _untimed(attitudes: Attitudes) -> str:
+    """Return what to say of a table that may be a recording whose time was left out."""
+    if attitudes.trace is not None or len(attitudes) <= _MANY_ROWS:
+        return ""
+    return "; without a column time every row is an attitude: a recording needs one, or a layout with sample_rate"
+
+
+def check_residuals(attitudes: Attitudes, solution: Solution, gravity: float) -> None:
+    """Check after the fit that |f| = g holds at all.
+
+    Raises
+    ------
+    DataError
+        It is off by more than a tenth of g in the median attitude.
+    """
+    typical = median(np.abs(solution.deviations[0]))
+    if not typical < _WORST_RMS:
+        raise DataError(
+            f"{attitudes.recording.name}: the calibrated magnitudes miss gravity ({gravity:.5g} m/s^2) by "
+            f"{typical * gravity:.3g} m/s^2 in the median attitude: these are not static attitudes of an accelerometer"
+        )
+
+
+def shake_warnings(motion: Motion | None, solution: Solution) -> list[str]:
+    """Say that holds shake too fast for magnitudes to be averaged, if that may matter: a tilt to and fro shortens f."""
+    if motion is None:
+        return []
+    shake = median(motion.shake.sum(axis=1))
+    if shake / 2 < max(_SHAKES * median(np.sqrt(solution.own_variance[0])), _LEAST_SHORTENING):
+        return []
+    return [
+        f"the unit shakes by {1e3 * np.sqrt(shake):.2g} mg rms within an eighth of a second while it is held: if it "
+        f"tilts to and fro, as in a hand that trembles, scale factors are up to {1e6 * shake / 2:.2g} ppm too small; "
+        "put it on something firm"
+    ]
+
+
+def check_fresh(residuals: Array, gravity: float, name: str) -> None:
+    """Check that fresh attitudes can be held against a record at all: |f| - g of each, shape (n,), and g, m/s^2.
+
+    Raises
+    ------
+    DataError
+        The magnitudes are nowhere near gravity.
+    """
+    found = median(residuals) + gravity
+    if not gravity / 2 <= found <= 2 * gravity:
+        raise DataError(
+            f"{name}: columns accel_x accel_y accel_z: the specific force at rest is about {found:.4g} m/s^2 under the "
+            f"record, expected {gravity:.4g} m/s^2: a wrong unit, or a record of another unit?"
+        )
+
+
+def made_from(record: Calibration, recording: Recording) -> bool:
+    """Return whether a record was made from samples of this recording, and not from another window of its file."""
+    source, time = recording.source, recording.time
+    if source is None or source.sha256 not in [made.sha256 for made in record.sources]:
+        return False
+    held = record.data.get("attitudes", {})
+    if time is None or not len(time) or not held:
+        return True
+    return any(b >= time[0] and a <= time[-1] for a, b in zip(held["start"], held["stop"], strict=True))
+
+
+def check_prior(record: Calibration) -> None:
+    """Check that a record can be a prior: a normal distribution of all its parameters, in this model and gauge.
+
+    Raises
+    ------
+    RecordError
+        The message says what is missing.
+    """
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record cannot be a prior; expected a tumble record")
+    if not record.covariance.names:
+        raise RecordError("a record that states no uncertainties cannot be a prior")
+    order = record.model["order"]
+    if order not in range(HIGHEST_ORDER + 1):
+        raise RecordError(f"a record of order {order} cannot be a prior; expected 0 to {HIGHEST_ORDER}")
+    if record.model.get("cross"):
+        raise RecordError("a record with cross terms cannot be a prior")
+    if record.model["gauge"] != GAUGE:
+        raise RecordError(f"a record in the gauge {record.model['gauge']!r} cannot be a prior; expected {GAUGE!r}")
+    for name in parameter_names(order):
+        if name not in record.parameters or name not in record.covariance.names:
+            raise RecordError(f"the record has no {name}, or no covariance of it, and cannot be a prior")
+    block = record.covariance.block(parameter_names(order))
+    for name, variance in zip(parameter_names(order), np.diag(block).tolist(), strict=True):
+        if not 0 < variance < np.inf:
+            raise RecordError(f"the record's {name} has the variance {variance:g}; a prior needs more than 0 for each")
+    spread = np.sqrt(np.diag(block))
+    if not np.linalg.eigvalsh(block / np.outer(spread, spread))[0] > _LEAST_EIGENVALUE:
+        raise RecordError("the record's covariance is not positive definite, and cannot be a prior")

@@ -1,0 +1,196 @@
+"""Fresh attitudes against a record, to test whether it still holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imulab.errors import OptionError, RecordError
+from imulab.estimation.estimate import chi_square_probability, median
+from imulab.gravity import Gravity, local_gravity
+from imulab.procedures.tumble.apply import output_factor
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.checks import check_fresh, made_from
+from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
+from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of, scatter
+from imulab.procedures.tumble.record import Scaling, scaled_parameters
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.verdict import Note
+
+
+@dataclass(frozen=True)
+class Check:
+    """How well a record still holds.
+
+    Attributes
+    ----------
+    residuals
+        ``|f| - g`` of each attitude under the record, m/s^2, shape (n,).
+    standard_uncertainty
+        Of each, from the record's covariance and the attitude's noise, m/s^2, shape (n,); None where the record states
+        no uncertainties.
+    chi_square
+        ``r' (J V J' + C)^-1 r``, with as many degrees of freedom as attitudes; None likewise.
+    probability
+        Of so large a value, did the record hold; None likewise.
+    gravity
+        That was used.
+    limit
+        Largest ``| |f| - g |`` that passes, m/s^2; None: the test alone decides.
+    notes
+        What a user must know of the test, a sentence each.
+    """
+
+    residuals: Array
+    standard_uncertainty: Array | None
+    chi_square: float | None
+    probability: float | None
+    gravity: Gravity
+    limit: float | None
+    notes: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether the test finds no contradiction at 5 %, and every attitude is within the limit, if there is one."""
+        within = self.limit is None or bool((np.abs(self.residuals) <= self.limit).all())
+        return within and (self.probability is None or self.probability >= FALSE_ALARM)
+
+    @property
+    def worst(self) -> int:
+        """Index of the attitude that is farthest off."""
+        return int(np.argmax(np.abs(self.residuals)))
+
+
+def check_tumble(
+    record: Calibration,
+    attitudes: Attitudes,
+    *,
+    limit: float | None = None,
+    gravity: float | str | Gravity | None = None,
+) -> Check:
+    """Test whether fresh attitudes contradict an existing record, without refitting.
+
+    ``r' (J V J' + C)^-1 r`` against chi-square, with r the residuals ``|f| - g`` under the record, J their derivatives
+    by its parameters, V its covariance and C the attitudes' noise. A record that holds fails once in twenty tests.
+
+    Parameters
+    ----------
+    record
+        Of procedure tumble.
+    attitudes
+        From `find_attitudes`. Where nothing is known of their noise, that of the record's own attitudes counts.
+    limit
+        Largest ``| |f| - g |`` that passes, m/s^2, beside the test.
+    gravity
+        Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
+
+    Raises
+    ------
+    RecordError
+        The record is of another procedure, has cross terms, or states no uncertainties and there is no limit.
+    UnitError
+        The attitudes' unit cannot be converted to the record's.
+    OptionError
+        The limit is not above 0, or gravity cannot be.
+    DataError
+        The magnitudes are nowhere near gravity.
+    """
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")
+    if record.model.get("cross"):
+        raise RecordError("a record with cross terms cannot be checked; expected one without, of the same attitudes")
+    if limit is not None and not limit > 0:
+        raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
+    if limit is None and not record.covariance.names:
+        raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
+    local = _gravity(record, gravity, attitudes)
+    attitudes = _in_unit_of(record, attitudes)
+    g, order = local.value, int(record.model["order"])
+    scale = g * np.array([record.value(f"scale_factor_{axis}") for axis in "xyz"])
+    scaling = Scaling(np.zeros(3), np.abs(scale))
+    theta = scaled_parameters(np.array([record.value(name) for name in parameter_names(order)]), scaling, g)
+    norm, jacobian, _, _ = norm_and_jacobian(theta[None], (attitudes.mean / scaling.scale)[None], order)
+    covariance, said = _noise(record, attitudes, scaling)
+    motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
+    lengthening, own = length_noise(theta[None], jacobian, covariance[None], motion)
+    seen, rows = (norm - 1 - lengthening)[0], jacobian[0]
+    residuals = g * (norm[0] - 1 if motion is None else seen)
+    check_fresh(residuals, g, attitudes.recording.name)
+    notes = [*([local.note] if local.note else []), *said]
+    if made_from(record, attitudes.recording):
+        notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
+    if not record.covariance.names:
+        return Check(residuals, None, None, None, local, limit, tuple(notes))
+    own_variance = own[0] + _excess(record, g)
+    more = scatter(rows, seen, own_variance)
+    if more > 0:
+        notes.append(
+            f"the attitudes scatter by {1e6 * np.sqrt(more):.3g} µg beyond their noise, which no change of the record "
+            "explains and the test allows for: holds that were disturbed, or a model of too low an order"
+        )
+    known = known_of(record, scaling, local, attitudes.unit)
+    common = 0.0 if known.shared else (local.standard_uncertainty / g) ** 2
+    noise = np.diag(own_variance + more) + common
+    value, probability = contradiction(seen, rows, known.covariance, noise)
+    freedom = _freedom(record)
+    if freedom is not None:
+        from scipy.special import fdtrc
+
+        probability = float(fdtrc(len(seen), freedom, value / len(seen)))
+    total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
+    return Check(residuals, total, value, probability, local, limit, tuple(notes))
+
+
+def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:
+    """What was given, else the head's, else that of the record."""
+    if given is None and "gravity" not in attitudes.recording.metadata:
+        stated = record.model["gravity"]
+        value, uncertainty = float(stated["value"]), float(stated.get("standard_uncertainty", 0.0))
+        said = f"gravity {value:.6g} m/s^2 was taken from the record, as if measured at the same place"
+        return Gravity(value, str(stated["from"]), uncertainty, Note(said))
+    return local_gravity(given, attitudes.recording)
+
+
+def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
+    unit = str(record.model["output_unit"])
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, unit)
+    return replace(
+        attitudes,
+        mean=attitudes.mean * factor,
+        covariance=None if attitudes.covariance is None else attitudes.covariance * factor**2,
+        motion=None if attitudes.motion is None else attitudes.motion.scaled(np.full(3, 1 / factor)),
+        unit=unit,
+    )
+
+
+def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple[Array, list[str]]:
+    """Covariance of the attitudes, g^2, shape (n, 3, 3), and what is to be said of it."""
+    if attitudes.covariance is not None:
+        return attitudes.covariance / (scaling.scale[:, None] * scaling.scale), []
+    g, fit = float(record.model["gravity"]["value"]), record.fit
+    stated = record.data["attitudes"]["standard_uncertainty"]
+    chi_square = fit.get("reduced_chi_square")
+    sigma = median(np.array(stated)) if stated else float(np.sqrt(chi_square)) if chi_square else 0.0
+    said = Note(
+        f"nothing is known of the noise of these attitudes: the {1e6 * sigma / g:.3g} µg of those that the record was "
+        "made from were used; a recording, or std_* columns, would say"
+    )
+    return np.broadcast_to((sigma / g) ** 2 * np.eye(3), (len(attitudes), 3, 3)), [said]
+
+
+def _excess(record: Calibration, g: float) -> float:
+    """Variance of the record's own attitudes beyond their noise, if that was seen: fresh ones will have it too."""
+    fit = record.fit
+    freedom, reduced = fit.get("degrees_of_freedom"), fit.get("reduced_chi_square")
+    if fit.get("noise") != "known" or not freedom or not reduced or freedom < 1:
+        return 0.0
+    if chi_square_probability(reduced * freedom, freedom) > SCATTERED:
+        return 0.0
+    return (float(fit["excess"]["value"]) / g) ** 2
+
+
+def _freedom(record: Calibration) -> float | None:
+    """Degrees of freedom where the record's uncertainties rest on a scatter of few residuals; None: noise was known."""
+    return None if record.fit.get("noise") == "known" else float(record.fit["degrees_of_freedom"])

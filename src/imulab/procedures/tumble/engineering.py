@@ -1,0 +1,149 @@
+"""The parameters of a tumble record in the units that people read: mg, ppm, mrad, µg/g²."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from imulab.procedures.tumble.record import zero_outputs
+from imulab.records.calibration import Calibration
+from imulab.records.comparison import Change
+from imulab.report.elements import format_uncertain, plain_number
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+_OFF_NOMINAL = "ppm off nominal"
+"""A scale factor whose nominal value is known is read as its difference from it."""
+
+
+@dataclass(frozen=True)
+class EngineeringRow:
+    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ...
+
+    `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
+    """
+
+    name: str
+    value: float
+    standard_uncertainty: float | None
+    unit: str
+    given_order: float | None = None
+
+    def text(self) -> tuple[str, str]:
+        """Return value and uncertainty as text."""
+        return format_uncertain(self.value, self.standard_uncertainty)
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor and the unit in which the change of a parameter is read."""
+    output = str(record.model["output_unit"])
+    factor, _, unit = _converted(change.name, change.unit, output, parse_unit(output).quantity == "acceleration")
+    return factor, "ppm" if unit == _OFF_NOMINAL else unit
+
+
+def propagated_rows(record: Calibration) -> list[list[str]]:
+    """Return the Monte Carlo intervals beside the linear ones: name, both, ratio of their widths, unit."""
+    output = str(record.model["output_unit"])
+    physical = parse_unit(output).quantity == "acceleration"
+    coverage = record.fit.get("coverage_factor_95_given_order") or record.fit["coverage_factor_95"]
+    rows = []
+    for name, found in record.fit["monte_carlo"]["parameters"].items():
+        parameter = record.parameters[name]
+        factor, offset, unit = _converted(name, parameter.unit, output, physical)
+        u = parameter.standard_uncertainty_given_order or parameter.standard_uncertainty or 0.0
+        linear = [parameter.value - coverage * u, parameter.value + coverage * u]
+        texts = [
+            " to ".join(format_uncertain(end * factor + offset, u * abs(factor))[0] for end in ends)
+            for ends in (linear, found["interval_95"])
+        ]
+        ratio = (found["interval_95"][1] - found["interval_95"][0]) / (linear[1] - linear[0])
+        rows.append([name, *texts, f"{ratio:.3f}", unit])
+    return rows
+
+
+def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]]:
+    """Return predicted uncertainties (units of g) as name, text and engineering unit."""
+    rows = []
+    for name, value in uncertainties.items():
+        stem = name.rpartition("_")[0]
+        factor, unit = {"bias": (1e6, "µg"), "scale_factor": (1e6, "ppm"), "misalignment": (1e6, "µrad")}.get(
+            stem, (1e6, f"µg/g{'⁰¹²³⁴⁵'[int(stem[1:])] if stem[1:].isdigit() else ''}")
+        )
+        rows.append((name, plain_number(value * factor, 3), unit))
+    return rows
+
+
+def engineering_rows(record: Calibration) -> list[EngineeringRow]:
+    """Return the parameters in engineering units, the outputs at zero specific force included for counts and volts."""
+    rows = []
+    output = str(record.model["output_unit"])
+    physical = parse_unit(output).quantity == "acceleration"
+    zeros = {} if physical else zero_outputs(record)
+    for name, parameter in record.parameters.items():
+        stem, _, axis = name.rpartition("_")
+        factor, offset, unit = _converted(name, parameter.unit, output, physical)
+        rows.append(
+            EngineeringRow(
+                name,
+                parameter.value * factor + offset,
+                _scaled(parameter.standard_uncertainty, factor),
+                unit,
+                _scaled(parameter.standard_uncertainty_given_order, factor),
+            )
+        )
+        if stem == "bias" and axis == "z":
+            rows += [
+                EngineeringRow(f"zero_output_{a}", z.value, z.standard_uncertainty, output) for a, z in zeros.items()
+            ]
+    return rows
+
+
+def _scaled(uncertainty: float | None, factor: float) -> float | None:
+    return None if uncertainty is None else uncertainty * abs(factor)
+
+
+def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float, float, str]:
+    """Factor, offset and unit that turn a parameter of either triad into engineering units."""
+    stem = name.rpartition("_")[0]
+    if not stem.startswith("gyro_"):
+        return _engineering(stem, output, physical)
+    if stem == "gyro_bias":
+        return from_si(1.0, "deg/s"), 0.0, "deg/s"
+    if stem == "gyro_scale_factor":
+        sensed = unit.removesuffix("/(rad/s)")
+        if parse_unit(sensed).quantity == "rate":
+            return 1e6 / from_si(1.0, sensed), -1e6, _OFF_NOMINAL
+        return 1.0, 0.0, unit
+    if stem == "gyro_misalignment":
+        return 1e3, 0.0, "mrad"
+    return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
+
+
+def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, str]:
+    """Factor, offset and unit that turn an SI parameter into engineering units."""
+    if stem == "bias":
+        return from_si(1.0, "mg"), 0.0, "mg"
+    if stem == "scale_factor":
+        if physical:
+            return 1e6 / from_si(1.0, output), -1e6, _OFF_NOMINAL
+        return 1.0, 0.0, f"{output}/(m/s²)"
+    if stem == "misalignment":
+        return 1e3, 0.0, "mrad"
+    power = int(stem[1:] or "2")  # a cross term is k_xy: of the second degree, as k2
+    superscript = "⁰¹²³⁴⁵"[power]
+    return 1e6 * STANDARD_GRAVITY ** (power - 1), 0.0, f"µg/g{superscript}"
+
+
+def small_g(value: float) -> str:
+    """Return an acceleration in µg or mg, three significant digits."""
+    micro = micro_g(value)
+    return (
+        f"{micro:.3g} µg"
+        if abs(micro) < 999.5
+        else f"{micro / 1e3:.4g} mg"
+        if abs(micro) < 1e6
+        else f"{micro / 1e6:.3g} g"
+    )
+
+
+def micro_g(value: float) -> float:
+    """Return an acceleration in µg."""
+    return float(from_si(value, "ug"))

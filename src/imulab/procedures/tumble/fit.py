@@ -1,0 +1,346 @@
+"""Static attitudes to a calibration of the accelerometer triad."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import DataError, ObservabilityError, OptionError
+from imulab.estimation.estimate import (
+    Observability,
+    covariance,
+    huber_inflation,
+    observability,
+)
+from imulab.gravity import Gravity, local_gravity
+from imulab.procedures.tumble.advice import helpful_attitudes
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.axes import check_axes
+from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spread
+from imulab.procedures.tumble.checks import check_attitudes, check_residuals
+from imulab.procedures.tumble.findings import Found, Stated
+from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold, solve_linearised
+from imulab.procedures.tumble.model import parameter_count, parameter_names
+from imulab.procedures.tumble.montecarlo import propagate
+from imulab.procedures.tumble.options import FROM_DATA, check_options
+from imulab.procedures.tumble.order_zero import with_assumed_alignment
+from imulab.procedures.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order, solve_orders
+from imulab.procedures.tumble.outliers import NONE_ASIDE, Aside, set_aside
+from imulab.procedures.tumble.prior import GROUPS, Aged, Known, entries, findings, known_of, put_together
+from imulab.procedures.tumble.record import Scaling, make_record
+from imulab.procedures.tumble.solve import Problem, Solution, evaluate, forces, informed_rows, solve_norm
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.units import parse_unit, to_si
+
+
+@dataclass(frozen=True)
+class TumbleFit:
+    """Result of a tumble fit.
+
+    Attributes
+    ----------
+    calibration
+        The record, with parameters in SI and their covariance.
+    observability
+        Rank, condition number and the combination that the attitudes determine worst.
+    orders
+        The table of orders, where the order was chosen from the data; empty otherwise.
+    residuals
+        ``|f| - g`` of each attitude, m/s^2, shape (n,).
+    down_weights
+        Factors of Huber's loss, shape (n,); without it ones, and zeros for attitudes set aside.
+    """
+
+    calibration: Calibration
+    observability: Observability
+    orders: tuple[OrderRow, ...]
+    residuals: Array
+    down_weights: Array
+
+    def __repr__(self) -> str:
+        return f"TumbleFit({len(self.residuals)} attitudes, {self.calibration.fit['method']})"
+
+
+def fit_tumble(
+    attitudes: Attitudes,
+    *,
+    order: int | str = "auto",
+    gravity: float | str | Gravity | None = None,
+    method: str = "norm",
+    loss: str = "auto",
+    nonlinearity: tuple[float, float] | None = None,
+    prior: Calibration | None = None,
+    ageing: Sequence[float] = (),
+    monte_carlo: int | None = None,
+    cross: bool = False,
+    threshold: Sequence[float] | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+) -> TumbleFit:
+    """Calibrate an accelerometer triad from static attitudes.
+
+    Method ``norm`` minimises ``sum_p w_p (|f(M_p)| - g - (tr C_p - u' C_p u) / 2g)^2`` with ``w_p = 1 / u' C_p u``;
+    ``linearised`` is the published first-order iteration.
+
+    Parameters
+    ----------
+    attitudes
+        From `find_attitudes`.
+    order
+        1 to 5; ``"auto"``: the order that predicts best among those that the attitudes can see, with an uncertainty
+        that holds whatever the order; ``"blend"``: all of them, each as far as the data support it.
+    gravity
+        Local gravity, m/s^2, or a text such as ``"9.81362+-0.00002"``, whose standard uncertainty enters that of the
+        scale factors. Without it that of the recording's head is used, or standard gravity, with a warning.
+    method
+        ``"norm"`` or ``"linearised"``.
+    loss
+        ``"auto"``: attitudes that no order explains are set aside and named (``"square"`` with method linearised);
+        ``"square"``: all count; ``"huber"``: the pull of single disturbed ones is limited (method norm only).
+    nonlinearity
+        Standard deviations of k2 and k3 about zero, in units of 1/g and 1/g^2, if known; order auto or blend.
+    prior
+        Earlier tumble record of the same unit, taken as a normal distribution of the parameters, which is widened by
+        what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square and stated
+        or measured noise.
+    ageing
+        Standard deviations of what biases (m/s^2), scale factors (1) and misalignments (rad) changed since the prior
+        was made, as many as are known; the attitudes tell the others.
+    monte_carlo
+        Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
+    cross
+        Whether the model has cross terms k_xy, k_yz, k_zx, at an order that is given; no attitude is set aside then.
+    threshold
+        Changes of scale factors (1), biases (m/s^2) and misalignments (rad) from one pass to the next below which
+        method linearised rests; the source's 5 ppm, 2 ug and 3 arcsec if not given.
+    progress
+        Called with the number of trials done so far.
+
+    Raises
+    ------
+    ObservabilityError
+        The attitudes cannot separate the model's parameters; the message names them and what would help.
+    DataError
+        The attitudes cannot be those of an accelerometer triad in the given unit.
+    OptionError
+        An option has an unknown value, or does not go with another.
+    RecordError
+        The prior lacks a parameter, or has outputs in another unit.
+    """
+    check_options(
+        order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
+        nonlinearity=nonlinearity, cross=cross, threshold=threshold,
+    )  # fmt: skip
+    local = local_gravity(gravity, attitudes.recording)
+    check_attitudes(attitudes, local.value)
+    scaling = _scaling(attitudes, local.value)
+    reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
+    spread = scaling.scale[:, None] * scaling.scale
+    noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
+    motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
+    every = Problem(reading, noise, 1, robust=loss == "huber", motion=motion)
+    known = None
+    if prior is not None:
+        order = _prior_order(prior, order, attitudes)
+        known = known_of(prior, scaling, local, attitudes.unit)
+    aside, fitted = NONE_ASIDE, dict[int, Solution]()
+    if loss == "auto" and method == "norm" and not cross:
+        aside, fitted = set_aside(every, lambda of: _fits(of, order))
+    used, kept = every, attitudes
+    if aside.index:
+        used, kept = every.only(aside.others(len(attitudes))), attitudes.only(aside.others(len(attitudes)))
+    choice: OrderChoice | None = None
+    if order in FROM_DATA and len(kept) >= parameter_count(1):
+        choice = choose_order(used, local.value, fitted or solve_orders(used))
+    problem = replace(used, order=choice.order if choice else 1 if order in FROM_DATA else int(order), cross=cross)
+    aged = None
+    if known is not None:
+        aged = put_together(problem, known, local, _scaled_ageing(ageing, local.value))
+        problem = aged.problem
+    rest = SOURCE_THRESHOLD
+    if threshold is not None:
+        rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
+    solved = aged.solution if aged else fitted.get(problem.order)
+    solution, seen = _solve(problem, kept, rest if method == "linearised" else None, choice, solved)
+    matrix, freedom = (aged.covariance, aged.freedom) if aged else _covariance(problem, solution)
+    stated = None if matrix is None else Stated(matrix, freedom)
+    if choice is not None and stated is not None:
+        blended = with_known_spread(used, choice, nonlinearity) if nonlinearity else blend_orders(used, choice)
+        if order == "blend":
+            problem, solution = _at_blend(used, solution, blended)
+            stated = Stated(blended.covariance, blended.freedom, blended=blended)
+        else:
+            stated = Stated(blended.about(solution.theta[0]), blended.freedom, matrix, freedom, blended)
+    found = _found(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
+    check_residuals(kept, solution, local.value)
+    check_axes(attitudes, forces(found.problem, found.solution)[0])
+    trials = None
+    if monte_carlo is not None:
+        if matrix is None:
+            raise OptionError(
+                f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
+                f"columns); found {len(kept)} attitudes for {parameter_count(problem.order)} parameters"
+            )
+        trials = propagate(problem, solution, trials=monte_carlo, freedom=freedom, progress=progress)
+    record = make_record(
+        attitudes=kept,
+        gravity=local,
+        scaling=scaling,
+        problem=problem,
+        solution=solution,
+        stated=stated,
+        found=found,
+        observability=seen,
+        orders=choice.rows if choice else (),
+        options={"order": order, "method": method, "loss": loss, "gravity": local.value}
+        | ({} if nonlinearity is None else {"nonlinearity": list(nonlinearity)})
+        | ({} if monte_carlo is None else {"monte_carlo": monte_carlo})
+        | ({"cross": True} if cross else {})
+        | ({"threshold": rest.in_si(local.value)} if method == "linearised" else {}),
+        monte_carlo=trials,
+        **_prior_found(prior, known, aged, scaling, local, kept),
+    )
+    return TumbleFit(
+        calibration=with_assumed_alignment(record) if problem.order == 0 else record,
+        observability=seen,
+        orders=choice.rows if choice else (),
+        residuals=local.value * found.solution.deviations[0],
+        down_weights=found.solution.down_weights[0],
+    )
+
+
+def _prior_found(
+    prior: Calibration | None,
+    known: Known | None,
+    aged: Aged | None,
+    scaling: Scaling,
+    gravity: Gravity,
+    attitudes: Attitudes,
+) -> dict[str, Any]:
+    """Return what the record is to say of its prior."""
+    if prior is None or known is None or aged is None:
+        return {}
+    return {
+        "with_gravity": aged.with_gravity,
+        "entries": {"prior": entries(prior, known, aged, scaling, gravity)},
+        "findings": findings(prior, aged, attitudes.recording, len(attitudes)),
+    }
+
+
+def _fits(problem: Problem, order: int | str) -> dict[int, Solution]:
+    """Fit the orders that are asked for."""
+    return solve_orders(problem) if order in FROM_DATA else {int(order): solve_norm(replace(problem, order=int(order)))}
+
+
+def _found(attitudes: Attitudes, problem: Problem, solution: Solution, aside: Aside) -> Found:
+    """Return all attitudes under the solution, those set aside with the down-weight 0."""
+    if not aside.index:
+        return Found(attitudes, problem, solution, aside)
+    every = evaluate(problem, solution)
+    every.down_weights[0, list(aside.index)] = 0.0
+    return Found(attitudes, problem, every, aside)
+
+
+def _at_blend(problem: Problem, solution: Solution, blended: Blended) -> tuple[Problem, Solution]:
+    """Return problem and solution at the blend's own values."""
+    problem = replace(problem, order=blended.order)
+    at_blend = evaluate(problem, replace(solution, theta=blended.theta[None]))
+    return problem, replace(at_blend, down_weights=solution.down_weights)
+
+
+def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:
+    """Return the order of the prior, which is that of the fit."""
+    if prior.procedure != "tumble" or not prior.covariance.names:
+        raise OptionError("prior: expected a tumble record that states uncertainties")
+    if attitudes.covariance is None:
+        raise OptionError(
+            f"{attitudes.recording.name}: a prior needs the noise of the attitudes, to be weighed against: a "
+            "recording, or std_* columns"
+        )
+    own = int(prior.model["order"])
+    if order not in ("auto", own):
+        raise OptionError(f"order {order} with a prior of order {own}: expected order {own} or auto")
+    return own
+
+
+def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | None, ...]:
+    """Return what is known of the ageing of each group in g, 1 and rad, None where nothing is."""
+    known = [value / unit for value, unit in zip(ageing, (gravity, 1.0, 1.0), strict=False)]
+    return (*known, *[None] * (len(GROUPS) - len(known)))
+
+
+def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
+    """Nominal sensor: by its unit, or for counts and volts from the span of each axis."""
+    unit = parse_unit(attitudes.unit)
+    if unit.quantity == "acceleration":
+        return Scaling(np.zeros(3), np.full(3, gravity / to_si(1.0, unit.symbol)))
+    high, low = attitudes.mean.max(axis=0), attitudes.mean.min(axis=0)
+    return Scaling((high + low) / 2, np.maximum((high - low) / 2, (high - low).max() / 20))
+
+
+def _solve(
+    problem: Problem,
+    attitudes: Attitudes,
+    linearised: Threshold | None,
+    choice: OrderChoice | None,
+    solved: Solution | None,
+) -> tuple[Solution, Observability]:
+    """Solve the problem, unless that has been done by norm, and see what it determines.
+
+    `linearised` is where method linearised rests, None for method norm.
+    """
+    n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
+    if linearised is None and choice is not None:
+        solution, seen = choice.solution, choice.observability
+    else:
+        solution = solved or _solved(problem, attitudes, linearised)
+        seen = observability(*informed_rows(problem, solution.jacobian[0], absolute_weights(problem, solution)))
+    if seen.rank < size:
+        names = parameter_names(problem.order, problem.cross)
+        confused = seen.confused(names)
+        shown = " ".join(confused[:8]) + (f" and {len(confused) - 8} more" if len(confused) > 8 else "")
+        help_from = helpful_attitudes(problem.order, solution, count=2)
+        found = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
+        trace = f"; {attitudes.trace.describe()}" if attitudes.trace is not None and n < size else ""
+        raise ObservabilityError(
+            f"{attitudes.recording.name}: {n} attitudes{found} determine {seen.rank} of the {size} parameters of "
+            f"order {problem.order}; they cannot separate {shown}; attitudes with the upward direction near "
+            f"{help_from} would help most{trace}"
+        )
+    if not solution.converged[0]:
+        raise DataError(
+            f"{attitudes.recording.name}: the fit of order {problem.order} does not converge on these {n} attitudes "
+            f"(condition number {seen.condition:.0f}); use a lower order or more attitudes"
+        )
+    return solution, seen
+
+
+def _solved(problem: Problem, attitudes: Attitudes, linearised: Threshold | None) -> Solution:
+    n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
+    if linearised is not None and n >= size:
+        return solve_linearised(problem, attitudes.recording.name, linearised)
+    return solve_norm(problem)
+
+
+def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
+    """Covariance of theta given the order, (p, p), and the degrees of freedom of its scale (None: noise known)."""
+    n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
+    freedom = n - size
+    base = covariance(solution.jacobian, 1 / solution.variance)[0]
+    known = problem.covariance is not None
+    if problem.robust and freedom > 0:
+        factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
+        return base * factor, float(freedom)
+    if known:
+        return base, _finite(solution.freedom[0])
+    if freedom == 0:
+        return None, None
+    chi_square = float((solution.residuals[0] ** 2 / solution.variance[0]).sum())
+    return base * (chi_square / freedom), float(freedom)
+
+
+def _finite(freedom: float) -> float | None:
+    return float(freedom) if np.isfinite(freedom) else None

@@ -1,0 +1,299 @@
+"""The gyroscope triad on top of calibrated accelerometers.
+
+    M = S (T w + b + G f),  T with unit diagonal and six free off-diagonals
+
+w is the body rate and f the specific force in the accelerometers' frame, G the sensitivity to acceleration. Between two
+attitudes the turn that the gyroscopes see must carry the first direction of gravity into the second; the sum of the
+squared angles by which it misses is minimised over S and T (and b, if asked). At rest M = S (b + G f): b and G come
+from there.
+
+Source: Tedaldi, Pretto, Menegatti, ICRA 2014, section IV; the change of a turn with the rate: Bortz, IEEE Trans. AES-7
+(1971) 61; acceleration-sensitive drift: IEEE Std 528.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
+from imulab.estimation.estimate import Observability, covariance, observability
+from imulab.estimation.rows import leave_out
+from imulab.procedures.tumble.apply import output_factor, specific_force
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.directions import direction_covariance
+from imulab.procedures.tumble.findings import aside_of
+from imulab.procedures.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks, counted, evened
+from imulab.procedures.tumble.gyrolinear import Nonlinearity, test_linearity
+from imulab.procedures.tumble.gyrorest import SENSITIVITIES, clock_notes, find_holds
+from imulab.procedures.tumble.gyrosolve import Case, Solved, solve_turns
+from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.records.calibration import Calibration
+from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.verdict import Note
+
+PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
+_EVENER = 0.9
+_FOREIGN, _TOUCHED = 5.0, 1e-3 * STANDARD_GRAVITY
+
+
+@dataclass(frozen=True)
+class GyroFit:
+    """A gyroscope triad; arrays of shape (3,) or (3, 3), SI except for the output.
+
+    Attributes
+    ----------
+    scale_factor
+        Output per rad/s.
+    misalignment
+        T.
+    bias
+        rad/s.
+    sensitivity
+        G, rad/s per m/s^2; None where it was not fitted.
+    covariance
+        Of scale factors, the six misalignments and the biases, shape (12, 12).
+    sensitivity_uncertainty
+        Standard uncertainties of the sensitivities.
+    residuals
+        Angle by which each turn misses, rad, shape (m,).
+    start, stop
+        Time of each turn, s, shape (m,).
+    unit
+        Of the outputs.
+    fit_bias
+        Whether the biases were fitted to the turns instead of taken from rest.
+    observability
+        Of the parameters that were fitted to the turns.
+    clock
+        What the time is known by that the scale factors are referred to.
+    nonlinearity
+        Of the scale factors over the rate.
+    aside
+        Start, stop, s, and miss, rad, of turns that stand out and were set aside, shape (k, 3).
+    notes
+        What a user should know, a sentence each.
+    """
+
+    scale_factor: Array
+    misalignment: Array
+    bias: Array
+    sensitivity: Array | None
+    covariance: Array
+    sensitivity_uncertainty: Array | None
+    residuals: Array
+    start: Array
+    stop: Array
+    unit: str
+    fit_bias: bool
+    observability: Observability
+    clock: Clock
+    nonlinearity: Nonlinearity | None
+    aside: Array
+    notes: tuple[str, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        """Sum of the squared angles, rad^2."""
+        return float(np.sum(self.residuals**2))
+
+
+def fit_gyro(
+    record: Calibration,
+    attitudes: Attitudes,
+    recording: Recording,
+    *,
+    fit_bias: bool = False,
+    sensitivity: str = "auto",
+    clock: float = CRYSTAL,
+    clock_of: str = "gyro",
+) -> GyroFit:
+    """Calibrate a gyroscope triad from the turns between static attitudes.
+
+    Parameters
+    ----------
+    record
+        Tumble record of the accelerometers.
+    attitudes
+        From `find_attitudes` on the accelerometers' recording.
+    recording
+        Columns ``time`` and ``gyro_x``, ``_y``, ``_z`` on the same clock; may be the accelerometers' own recording.
+    fit_bias
+        Fit the biases to the turns too, instead of taking them from the outputs at rest.
+    sensitivity
+        Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the outputs at rest show it and
+        the turns miss less with it.
+    clock
+        Relative standard uncertainty of the rate of the clock: common to the three scale factors.
+    clock_of
+        Whose time counts where the two triads have clocks of their own: ``gyro``, or ``accel``: the gyroscopes' is
+        carried over to it.
+
+    Raises
+    ------
+    RecordError
+        The record is no tumble record.
+    SegmentError
+        Fewer than eight turns between attitudes.
+    DataError
+        The columns are missing or not finite, or the gyroscopes do not turn as gravity does.
+    ObservabilityError
+        The turns cannot separate the parameters.
+    OptionError
+        `sensitivity`, `clock` or `clock_of` has a value that cannot be.
+    """
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
+    if sensitivity not in SENSITIVITIES:
+        raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
+    if clock_of not in CLOCKS:
+        raise OptionError(f"clock of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
+    if not 0 <= clock < 1:
+        raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
+    if attitudes.trace is None:
+        raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
+    unit = recording.triad_unit("gyro")
+    check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
+    left_out = leave_out(recording, [f"gyro_{axis}" for axis in "xyz"])
+    time, output = check_time(recording), left_out.recording.triad("gyro")
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
+    means = attitudes.mean * factor
+    own = attitudes.recording.si("time")
+    moving = leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording
+    own_force = specific_force(record, moving.triad("accel") * factor)
+    force, knocked = specific_force(record, means), aside_of(record, attitudes)
+    case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)
+    found = solve_turns(case, time, sensitivity)
+    even, said = evened(time), []
+    if even is not None:
+        # Only the turns can tell stamps that jitter from samples that do.
+        other = solve_turns(case, even[0], sensitivity)
+        if other.typical_miss < _EVENER * found.typical_miss:
+            said = [
+                Note(
+                    f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
+                    f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
+                    f"{np.degrees(found.typical_miss):.2g} deg (median)"
+                )
+            ]
+            time, found = even[0], other
+    apart = attitudes.recording is not recording
+    comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
+    if clock_of == "accel":
+        if comparison is None:
+            raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
+        time = comparison.on_other(time)
+        found = solve_turns(case, time, sensitivity)
+    known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
+    rest = np.zeros(len(time), dtype=np.bool_)
+    for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
+        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
+        rest[a:b] = True
+    notes = [
+        *(f"gyro: {note}" for note in left_out.notes(rest)),
+        *said,
+        *found.notes,
+        *_record_notes(record, attitudes, case.force),
+        *known.notes(apart=apart),
+    ]
+    if apart and clock_of == "gyro":
+        notes += clock_notes(find_holds(attitudes, time, output, recording.name), attitudes, time)
+    segments, residual, jacobian = found.segments, found.residual, found.jacobian
+    miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), found.theta.size
+    # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
+    freedom = max(2 * len(miss) - size, 1)
+    seen = observability(jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
+    if seen.rank < size:
+        confused = " ".join(seen.confused(gyro_names()[:size]))
+        raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
+    if not found.converged:
+        raise DataError(
+            f"{recording.name}: the fit of the gyroscopes does not converge on these {len(miss)} turns "
+            f"(condition number {seen.condition:.0f}); use more turns, about more directions"
+        )
+    directions = direction_covariance(record, attitudes, means, case.force)
+    zero = None if fit_bias else found.rest.zero_uncertainty
+    shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
+    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
+    pulled = jacobian.T @ shared @ jacobian
+    # What the residuals scatter beyond all that is taken as a variance of their own, the same in each.
+    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
+    variance = max(left, 0.0) / freedom
+    matrix = bread @ pulled @ bread + variance * bread
+    linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
+    if linearity is not None:
+        notes += linearity.notes()
+    return _result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes))
+
+
+def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
+    """Say if the accelerometers' record is hardly of this unit."""
+    mine, its = record.sensor.get("serial"), attitudes.recording.metadata.get("serial")
+    found = [f"gyro: the record is of {mine}, the recording of {its}"] if mine and its and mine != its else []
+    length = np.linalg.norm(force, axis=1)
+    scatter, usual = float(length.std()), float(record.fit["rms"]["value"])
+    if scatter > _FOREIGN * usual + _TOUCHED:
+        found.append(
+            f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "
+            f"{from_si(usual, 'mg'):.3g} mg when it was made: is it of this unit?"
+        )
+    return found
+
+
+def gyro_names() -> list[str]:
+    """Return the names of the parameters in the order of the covariance."""
+    return [
+        *(f"gyro_scale_factor_{axis}" for axis in "xyz"),
+        *(f"gyro_misalignment_{pair}" for pair in PAIRS),
+        *(f"gyro_bias_{axis}" for axis in "xyz"),
+    ]
+
+
+def _result(
+    found: Solved,
+    matrix: Array,
+    miss: Array,
+    unit: str,
+    fit_bias: bool,
+    seen: Observability,
+    clock: Clock,
+    linearity: Nonlinearity | None,
+    notes: tuple[str, ...],
+) -> GyroFit:
+    """Turn scaled parameters into the triad."""
+    theta, scale, rest = found.theta, found.scale, found.rest
+    scale_factor = scale * (1 + theta[:3])
+    misalignment = np.eye(3)
+    misalignment[ROWS, COLUMNS] = theta[3:9]
+    moved = theta[9:12] if fit_bias else np.zeros(3)
+    bias = (rest.zero + scale * moved) / scale_factor
+    everything = np.zeros((12, 12))
+    everything[: len(matrix), : len(matrix)] = matrix
+    if not fit_bias:
+        everything[range(9, 12), range(9, 12)] = (rest.zero_uncertainty / scale) ** 2
+    derivative = np.diag(np.concatenate([scale, np.ones(6), scale / scale_factor]))
+    derivative[range(9, 12), range(3)] = -bias * scale / scale_factor
+    # A clock that is fast makes all scale factors too large by as much, and what is divided by them too small.
+    common = clock.uncertainty * np.concatenate([scale_factor, np.zeros(6), -bias])
+    return GyroFit(
+        scale_factor=scale_factor,
+        misalignment=misalignment,
+        bias=bias,
+        sensitivity=None if rest.slope is None else rest.slope / scale_factor[:, None],
+        covariance=derivative @ everything @ derivative.T + np.outer(common, common),
+        sensitivity_uncertainty=(
+            None if rest.slope_uncertainty is None else rest.slope_uncertainty / scale_factor[:, None]
+        ),
+        residuals=miss,
+        start=found.segments.start,
+        stop=found.segments.stop,
+        unit=unit,
+        fit_bias=fit_bias,
+        observability=seen,
+        clock=clock,
+        nonlinearity=linearity,
+        aside=found.aside,
+        notes=notes,
+    )

@@ -1,0 +1,169 @@
+"""The gyroscopes while the accelerometers are at rest: when they are still, what they put out, and how f moves that.
+
+Attitudes are found from the accelerometers, which hardly feel a slow beginning of a turn, a twist about the vertical or
+a touch. The gyroscopes do: their own stillness decides which samples tell the zero, and where a turn begins and ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import DataError
+from imulab.estimation.estimate import f_test
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.recording import Array
+
+SENSITIVITIES = ("auto", "yes", "no")
+_EDGE = 0.1  # s back into the 0.3 s of each hold that segmentation drops
+_STILL = 5.0
+_MARGIN = 0.1  # s
+_DEEPEST = 2.0  # s
+_MAD = 1.4826
+_SIGNIFICANT = 0.01
+_QUIET = 0.75
+_FLAT_TOP = 4  # readings in a row
+_CUT_OFF = 3.0  # steps of the output
+_LATE = 0.3  # s
+
+
+@dataclass(frozen=True)
+class Holds:
+    """Attitudes as samples of the gyroscopes; all of shape (n,).
+
+    Attributes
+    ----------
+    start, stop
+        First sample, and one past the last.
+    arrive, leave
+        Sample where the turn before ends, and where the next one begins: beyond any motion that the gyroscopes see in
+        the first two and the last two seconds of the hold (of a shorter one, to its middle).
+    still
+        Whether a sample of the recording is no motion, shape (samples,); says nothing outside of the holds.
+    """
+
+    start: NDArray[np.intp]
+    stop: NDArray[np.intp]
+    arrive: NDArray[np.intp]
+    leave: NDArray[np.intp]
+    still: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Output at rest: zero (3,), change with specific force (3, 3) or None, and their standard uncertainties."""
+
+    zero: Array
+    slope: Array | None
+    zero_uncertainty: Array
+    slope_uncertainty: Array | None
+
+
+def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> Holds:
+    """Find when the gyroscopes are still: within five standard deviations of the hold's median, in all three.
+
+    Raises
+    ------
+    DataError
+        There are no samples during an attitude.
+    """
+    start, stop = np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).T
+    if (stop <= start).any():
+        label = attitudes.label(int(np.argmax(stop <= start)))
+        raise DataError(f"{name}: no samples during {label}: do the two recordings share one clock?")
+    median = np.array([np.median(output[a:b], axis=0) for a, b in zip(start, stop, strict=True)])
+    spread = [np.median(np.abs(output[a:b] - m), axis=0) for a, b, m in zip(start, stop, median, strict=True)]
+    sigma = np.maximum(_MAD * np.median(spread, axis=0), _resolution(output))
+    first = np.searchsorted(time, attitudes.start - _EDGE)
+    last = np.minimum(np.searchsorted(time, attitudes.stop + _EDGE), len(time) - 1)
+    rate = float((stop - start).sum()) / max(float((time[stop - 1] - time[start]).sum()), 1e-9)
+    margin, middle = max(1, round(_MARGIN * rate)), (start + stop) // 2
+    early, late = np.minimum(middle, first + round(_DEEPEST * rate)), np.maximum(middle, last - round(_DEEPEST * rate))
+    still = np.ones(len(time), dtype=np.bool_)
+    arrive, leave = first.copy(), last.copy()
+    for k in range(len(start)):
+        here = slice(first[k], last[k] + 1)
+        still[here] = (np.abs(output[here] - median[k]) <= _STILL * sigma).all(axis=1)
+        if not still[start[k] : stop[k]].any():
+            still[here] = True  # it turns all the time: nothing tells rest from motion
+        moved = first[k] + np.flatnonzero(~still[here])
+        before, after = moved[moved < early[k]], moved[moved >= late[k]]
+        if before.size:
+            arrive[k] = min(before[-1] + margin, early[k])
+        if after.size:
+            leave[k] = max(after[0] - margin, late[k])
+    return Holds(start, stop, arrive, leave, still)
+
+
+def clock_notes(holds: Holds, attitudes: Attitudes, time: Array) -> list[str]:
+    """Say if the gyroscopes, on another clock perhaps, move into one end of the holds and not into the other."""
+    into = np.median(time[holds.arrive] - attitudes.start), np.median(attitudes.stop - time[holds.leave])
+    for late, other, when in ((*into, "stop turning {:.1f} s after"), (*into[::-1], "start turning {:.1f} s before")):
+        if late > _LATE and other < late / 2:
+            return [f"gyro: the gyroscopes {when.format(late)} the accelerometers (median): does one clock drive both?"]
+    return []
+
+
+def beyond_range(output: Array) -> NDArray[np.bool_]:
+    """Return which samples lie in a flat top at the largest or smallest output of an axis, shape (n, 3).
+
+    Four readings in a row, cut off where the output was still changing: the top of a slow turn in coarse steps is none,
+    nor are readings that are each logged several times.
+    """
+    clipped = np.zeros(output.shape, dtype=np.bool_)
+    least = _CUT_OFF * _resolution(output)
+    for axis, values in enumerate(output.T):
+        repeats = np.diff(np.flatnonzero(np.concatenate([[True], np.diff(values) != 0, [True]])))
+        flat = _FLAT_TOP * float(np.median(repeats))
+        for extreme in (values.max(), values.min()):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], values == extreme, [False]]).astype(np.int8)))
+            for start, stop in edges.reshape(-1, 2).tolist():
+                before, after = values[max(start - 1, 0)], values[min(stop, len(values) - 1)]
+                if stop - start >= flat and max(abs(before - extreme), abs(after - extreme)) > least[axis]:
+                    clipped[start:stop, axis] = True
+    return clipped
+
+
+def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest:
+    """Zero and g-sensitivity from the mean still outputs of each quiet hold, least squares over the holds.
+
+    Quiet is a hold that is still for three quarters of its samples; where fewer than half are, that half.
+    """
+    edges = np.column_stack([holds.start, holds.stop]).ravel()
+    kept = np.where(holds.still[:, None], np.column_stack([output, np.ones(len(output))]), 0.0)
+    sums = np.add.reduceat(np.vstack([kept, np.zeros((1, 4))]), edges, axis=0)[::2]
+    fraction = sums[:, 3] / (holds.stop - holds.start)
+    quiet = fraction >= min(_QUIET, float(np.median(fraction)))
+    mean, force = (sums[:, :3] / sums[:, 3:])[quiet], force[quiet]
+    n = len(mean)
+    middle = (holds.start + holds.stop)[quiet] / 2
+    when = (middle - middle.mean()) / max(float(np.ptp(middle)), 1.0)
+    flat = mean - mean.mean(axis=0)
+    # A zero that drifts goes with some direction of f by chance: held against, and found beside, a slope in time.
+    drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), force, when])
+    left = _left(whole, mean)
+    costs = float((_left(drift, mean) ** 2).sum()), float((left**2).sum())
+    shown = n > 7 and f_test(costs[0], 6, costs[1], 15, 3 * n) < _SIGNIFICANT
+    if sensitivity == "no" or (sensitivity == "auto" and not shown):
+        scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
+        return Rest(mean.mean(axis=0), None, scatter, None)
+    solution = np.asarray(np.linalg.lstsq(whole, mean, rcond=None)[0], dtype=np.float64)
+    root = np.sqrt(np.diag(np.linalg.inv(whole.T @ whole)))
+    spread = np.sqrt((left**2).sum(axis=0) / max(n - 5, 1))
+    wander = np.sqrt((_left(whole[:, :4], mean) ** 2).sum(axis=0) / max(n - 4, 1))
+    uncertainty: Array = spread[:, None] * root[1:4]
+    return Rest(solution[0], solution[1:4].T, np.maximum(spread, wander) * root[0], uncertainty)
+
+
+def _left(design: Array, values: Array) -> Array:
+    """What a least-squares fit of each column leaves."""
+    left: Array = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    return left
+
+
+def _resolution(output: Array) -> Array:
+    """Smallest step between the values of each axis, shape (3,)."""
+    values = [np.unique(column) for column in output.T]
+    return np.array([np.diff(v).min() if v.size > 1 else 0.0 for v in values])

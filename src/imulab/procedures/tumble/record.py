@@ -1,0 +1,394 @@
+"""The calibration record of a tumble test: parameters in SI, and what its figures need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from imulab.estimation.estimate import Observability, chi_square_probability, coverage_factor, leverage
+from imulab.gravity import Gravity, gravity_findings
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.checks import shake_warnings
+from imulab.procedures.tumble.findings import (
+    FEW_DEGREES,
+    Found,
+    Stated,
+    aside_warnings,
+    assumption_notes,
+    freedom_finding,
+    size_warnings,
+    uncertainty_entries,
+    vertical_warnings,
+)
+from imulab.procedures.tumble.model import (
+    AXES,
+    GAUGE,
+    gravity_slope,
+    parameter_names,
+    parameter_units,
+    powers_of_gravity,
+)
+from imulab.procedures.tumble.montecarlo import MonteCarlo
+from imulab.procedures.tumble.orders import OrderRow
+from imulab.procedures.tumble.patterns import direction_findings, time_findings
+from imulab.procedures.tumble.solve import Problem, Solution, data_freedom, forces
+from imulab.recording import Array
+from imulab.records.calibration import Calibration, Covariance, Parameter
+
+_STANDS_OUT = 5.0
+_TOO_GOOD = 1e-3
+_MOST_NAMED = 8
+_DOWN_WEIGHTED = 0.5
+_NOT_BY_CHANCE = 0.01
+_HIGH_CONDITION = 300.0
+_TO_MICRO = 1e6
+
+
+_REMEDIES = {
+    ("norm", "square"): "--loss auto sets it aside",
+    ("norm", "auto"): "it was not set aside: --loss huber limits its pull",
+    ("linearised", "square"): "--method norm --loss auto sets it aside",
+    ("linearised", "auto"): "--method norm sets it aside",
+}
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Nominal zero and scale (output per g) of each axis, shape (3,), that the fit works relative to."""
+
+    zero: Array
+    scale: Array
+
+
+def make_record(
+    *,
+    attitudes: Attitudes,
+    gravity: Gravity,
+    scaling: Scaling,
+    problem: Problem,
+    solution: Solution,
+    stated: Stated | None,
+    found: Found,
+    observability: Observability,
+    orders: tuple[OrderRow, ...],
+    options: Mapping[str, Any],
+    monte_carlo: MonteCarlo | None = None,
+    with_gravity: bool = False,
+    entries: Mapping[str, Any] = MappingProxyType({}),
+    findings: Sequence[str] = (),
+) -> Calibration:
+    """Turn a solution in units of g into the record.
+
+    ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; covariances are carried along by
+    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `with_gravity`
+    says that the covariance holds it already; `entries` and `findings` are added to the fit's and to the warnings.
+    """
+    g, order = gravity.value, problem.order
+    names = parameter_names(order, problem.cross)
+    units = parameter_units(order, attitudes.unit, problem.cross)
+    values, derivative = _to_si(solution.theta[0], scaling, g, order)
+    shared = (not with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values, order)
+    matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
+    given = np.full(len(names), np.nan)
+    if stated is not None and stated.given_order is not None:
+        given = np.sqrt(np.diag(derivative @ stated.given_order @ derivative.T) + shared**2)
+    recording = attitudes.recording
+    n, size = len(attitudes), len(names)
+    chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
+    freedom = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
+    known = problem.covariance is not None
+    if not known:
+        chi_square *= g**2
+    model: dict[str, Any] = {
+        "order": order,
+        "gravity": gravity.entry(),
+        "output_unit": attitudes.unit,
+        "gauge": GAUGE,
+        **({"cross": True} if problem.cross else {}),
+    }
+    if attitudes.temperature is not None:
+        model["temperature"] = {"value": attitudes.temperature, "unit": "degC"}
+    return Calibration(
+        procedure="tumble",
+        parameters={
+            name: Parameter(
+                float(values[i]),
+                None if matrix is None else float(np.sqrt(matrix[i, i])),
+                unit,
+                standard_uncertainty_given_order=None if np.isnan(given[i]) else float(given[i]),
+            )
+            for i, (name, unit) in enumerate(zip(names, units, strict=True))
+        },
+        covariance=Covariance((), ())
+        if matrix is None
+        else Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
+        model=model,
+        fit={
+            "method": options["method"],
+            "loss": options["loss"],
+            "attitudes": n,
+            "set_aside": [number + 1 for number in found.aside.index],
+            "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
+            "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
+            "degrees_of_freedom": n - size if problem.prior is None else freedom,
+            "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
+            "noise": "known" if known else "estimated from the residuals",
+            "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
+            **uncertainty_entries(stated),
+            "rank": observability.rank,
+            "condition_number": observability.condition,
+            "iterations": int(solution.iterations[0]),
+            "orders": [dict(vars(row)) for row in orders],
+            **({"shared": {gravity.name: dict(zip(names, shared.tolist(), strict=True))}} if shared.any() else {}),
+            **_propagated(monte_carlo, scaling, gravity, order),
+            **entries,
+        },
+        options=dict(options),
+        data=_data(found.attitudes, scaling, found.problem, found.solution, g),
+        sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
+        sources=(recording.source,) if recording.source else (),
+        warnings=(
+            *_warnings(attitudes, gravity, problem, solution, observability, options),
+            *_scatter_warnings(problem, solution, chi_square, freedom),
+            *shake_warnings(problem.motion, solution),
+            *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
+            *vertical_warnings(found, str(options["method"])),
+            *aside_warnings(found, options),
+            *assumption_notes(stated),
+            *findings,
+        ),
+    )
+
+
+def zero_outputs(record: Calibration) -> dict[str, Parameter]:
+    """Return what each axis puts out at zero specific force, S b, with its uncertainty, in the output's unit."""
+    found = {}
+    for axis in AXES:
+        b, s = record.parameters[f"bias_{axis}"], record.parameters[f"scale_factor_{axis}"]
+        uncertainty = None
+        if record.covariance.names:
+            block = record.covariance.block([f"bias_{axis}", f"scale_factor_{axis}"])
+            gradient = np.array([s.value, b.value])
+            uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
+        found[axis] = Parameter(s.value * b.value, uncertainty, str(record.model["output_unit"]))
+    return found
+
+
+def _propagated(trials: MonteCarlo | None, scaling: Scaling, gravity: Gravity, order: int) -> dict[str, Any]:
+    """Mean, standard deviation and 95 % interval of every parameter over the trials, in SI."""
+    if trials is None:
+        return {}
+    drawn = np.random.default_rng(2).standard_normal((len(trials.theta), 1))
+    values = _si_values(trials.theta, scaling, gravity.value + gravity.standard_uncertainty * drawn, order)
+    low, high = np.quantile(values, [0.025, 0.975], axis=0)
+    columns = zip(parameter_names(order), values.mean(axis=0), values.std(axis=0, ddof=1), low, high, strict=True)
+    return {
+        "monte_carlo": {
+            "trials": len(values),
+            "failed": trials.failed,
+            "parameters": {
+                name: {"mean": float(m), "standard_deviation": float(s), "interval_95": [float(a), float(b)]}
+                for name, m, s, a, b in columns
+            },
+        }
+    }
+
+
+def _si_values(theta: Array, scaling: Scaling, g: float | Array, order: int) -> Array:
+    """Parameter vectors in SI, shape (b, p); one gravity, or one for each, shape (b, 1)."""
+    scale_factor = scaling.scale * theta[:, 3:6] / g
+    bias = (scaling.zero + scaling.scale * theta[:, 0:3]) / scale_factor
+    powers = powers_of_gravity(order, theta.shape[1])
+    return np.hstack([bias, scale_factor, theta[:, 6:9], theta[:, 9:] / g**powers])
+
+
+def scaled_parameters(values: Array, scaling: Scaling, g: float) -> Array:
+    """Return parameters in SI, shape (p,), as scaled ones: the inverse of `_si_values`."""
+    bias, scale_factor = values[:3], values[3:6]
+    powers = np.repeat(np.arange(1, len(values) // 3 - 2), 3)
+    return np.concatenate(
+        [
+            (scale_factor * bias - scaling.zero) / scaling.scale,
+            scale_factor * g / scaling.scale,
+            values[6:9],
+            values[9:] * g**powers,
+        ]
+    )
+
+
+def si_derivative(theta: Array, scaling: Scaling, g: float) -> Array:
+    """Return the derivatives of the parameters in SI by the scaled ones, shape (p, p)."""
+    return _to_si(theta, scaling, g, len(theta) // 3 - 2)[1]
+
+
+def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
+    """Return the parameter vector in SI and its derivative with respect to theta, shape (p, p)."""
+    values = _si_values(theta[None], scaling, g, order)[0]
+    bias, scale_factor, sigma = values[:3], values[3:6], theta[3:6]
+    powers = powers_of_gravity(order, len(theta))
+    derivative = np.diag(
+        np.concatenate([scaling.scale / scale_factor, scaling.scale / g, np.ones(len(theta[6:9])), g**-powers])
+    )
+    derivative[range(3), range(3, 6)] = -bias / sigma
+    return values, derivative
+
+
+def _leave_one_out(
+    orders: tuple[OrderRow, ...], problem: Problem, solution: Solution, method: str, g: float
+) -> dict[str, Any] | None:
+    """Error of each attitude predicted from the others, rms: from the table of orders, or by the linear formula."""
+    for row in orders:
+        if row.order == problem.order and row.leave_one_out is not None and method == "norm" and not problem.cross:
+            return {"value": row.leave_one_out, "unit": "m/s^2"}
+    if problem.reading.shape[1] <= solution.theta.shape[1]:
+        return None
+    free = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-12)
+    felt = solution.down_weights[0] * solution.residuals[0] / free
+    return {"value": g * float(np.sqrt(np.mean(felt**2))), "unit": "m/s^2"}
+
+
+def _data(attitudes: Attitudes, scaling: Scaling, problem: Problem, solution: Solution, g: float) -> dict[str, Any]:
+    known = problem.covariance is not None
+    before = np.linalg.norm(problem.reading[0], axis=1) - 1
+    uncertainty = np.sqrt(solution.own_variance[0]) * g
+    data: dict[str, Any] = {
+        "attitudes": {
+            "label": [attitudes.label(i) for i in range(len(attitudes))],
+            "start": attitudes.start.tolist(),
+            "stop": attitudes.stop.tolist(),
+            "samples": attitudes.samples.tolist(),
+            "mean": attitudes.mean.tolist(),
+            "covariance": None if attitudes.covariance is None else attitudes.covariance.tolist(),
+            "force": (g * forces(problem, solution)[0]).tolist(),
+            "residual": (g * solution.deviations[0]).tolist(),
+            "residual_before": (g * before).tolist(),
+            "standard_uncertainty": uncertainty.tolist() if known else None,
+            "lengthening": (g * solution.lengthening[0]).tolist(),
+            "down_weight": solution.down_weights[0].tolist(),
+        }
+    }
+    if attitudes.trace is not None:
+        trace = attitudes.trace
+        data["trace"] = {
+            "time": np.round(trace.time, 6).tolist(),
+            "deviation": (np.sqrt(trace.variance) / float(np.mean(scaling.scale)) * g).tolist(),
+            "threshold": float(np.sqrt(trace.threshold) / np.mean(scaling.scale) * g),
+            "unit": "m/s^2",
+        }
+    return data
+
+
+def _warnings(
+    attitudes: Attitudes,
+    gravity: Gravity,
+    problem: Problem,
+    solution: Solution,
+    observability: Observability,
+    options: Mapping[str, Any],
+) -> list[str]:
+    return [
+        *attitudes.recording.notes,
+        *attitudes.notes,
+        *gravity_findings(gravity, attitudes.recording),
+        *_attitude_warnings(attitudes, problem, solution, options),
+        *_freedom_warnings(problem, solution, observability),
+        *size_warnings(attitudes, solution),
+    ]
+
+
+def beyond_noise(problem: Problem, chi_square: float, freedom: float) -> bool:
+    """Whether attitudes scatter so much that their own noise would do it once in a hundred tests or less."""
+    known = problem.covariance is not None and freedom >= 1
+    return known and chi_square_probability(chi_square, freedom) < _NOT_BY_CHANCE
+
+
+def _scatter_warnings(problem: Problem, solution: Solution, chi_square: float, freedom: float) -> list[str]:
+    """Say that the attitudes scatter beyond their noise, which the uncertainties hold anyway, or far below it."""
+    known = problem.covariance is not None and problem.prior is None and not problem.robust
+    if known and freedom > 0 and chi_square_probability(chi_square, freedom) > 1 - _TOO_GOOD:
+        return [
+            "the attitudes scatter less than their own noise lets expect (reduced chi-square "
+            f"{chi_square / freedom:.3g}): that noise is overstated, and every uncertainty is about "
+            f"{np.sqrt(freedom / max(chi_square, 1e-12)):.2g} times too large"
+        ]
+    if not beyond_noise(problem, chi_square, freedom):
+        return []
+    added = f"; {_TO_MICRO * solution.excess[0]:.3g} µg were added to each attitude's uncertainty"
+    return [
+        "the attitudes scatter more than their own noise explains (reduced chi-square "
+        f"{chi_square / freedom:.3g}){added if solution.excess[0] > 0 else ''}"
+    ]
+
+
+def _pattern_warnings(attitudes: Attitudes, problem: Problem, solution: Solution, *, order_chosen: bool) -> list[str]:
+    """Say what the residuals follow, of the attitudes that do not stand out; with a prior they follow that too."""
+    if problem.prior is not None:
+        return []
+    kept = np.where(solution.down_weights < _DOWN_WEIGHTED, 0.0, solution.down_weights)
+    kept[0, list(_outliers(problem, solution))] = 0.0
+    regular = replace(solution, down_weights=kept)
+    return [
+        *direction_findings(problem, regular, order_chosen=order_chosen),
+        *time_findings(attitudes, problem, regular),
+    ]
+
+
+def _attitude_warnings(
+    attitudes: Attitudes, problem: Problem, solution: Solution, options: Mapping[str, Any]
+) -> list[str]:
+    deviation = 1e3 * solution.deviations[0]
+    if problem.robust:
+        down = solution.down_weights[0]
+        which = np.flatnonzero(down < _DOWN_WEIGHTED).tolist()
+        single = [
+            f"down-weighted to {down[i]:.2f}: {attitudes.label(i)}, residual {deviation[i]:+.3f} mg" for i in which
+        ]
+    else:
+        single = [
+            f"{attitudes.label(i)} stands out by {standard:.0f} standard deviations "
+            f"(residual {deviation[i]:+.3f} mg); {_REMEDIES[options['method'], options['loss']]}"
+            for i, standard in _outliers(problem, solution).items()
+        ]
+    more = [f"and {len(single) - _MOST_NAMED} more attitudes like these"] if len(single) > _MOST_NAMED else []
+    return single[:_MOST_NAMED] + more
+
+
+def _freedom_warnings(problem: Problem, solution: Solution, observability: Observability) -> list[str]:
+    n, size = problem.reading.shape[1], solution.theta.shape[1]
+    found = []
+    if observability.condition > _HIGH_CONDITION:
+        confused = observability.confused(parameter_names(problem.order, problem.cross))
+        found.append(
+            f"condition number {observability.condition:.0f}: these attitudes hardly separate {' '.join(confused[:6])}"
+        )
+    if n == size and problem.covariance is None:
+        found.append(
+            f"{n} attitudes for {size} parameters leave nothing to estimate the noise from: no uncertainty is stated"
+        )
+    few = freedom_finding(n, size, problem.order)
+    if few is not None and problem.prior is None:
+        found.append(few)
+    return found
+
+
+def _outliers(problem: Problem, solution: Solution) -> dict[int, float]:
+    """Return the attitudes that stand out, and by how many standard deviations.
+
+    Each residual is held against the scatter of the others, with itself left out (externally studentised; Belsley, Kuh
+    and Welsch 1980), or against its own noise where that is more; the limit is one false alarm in a thousand tests.
+    """
+    n, size = problem.reading.shape[1], solution.theta.shape[1]
+    freedom = n - size
+    if freedom < FEW_DEGREES:
+        return {}
+    share = np.maximum(1 - leverage(solution.jacobian, solution.weights)[0], 1e-3)
+    standard = np.abs(solution.residuals[0]) / np.sqrt(solution.own_variance[0] * share)
+    others = np.sqrt(np.maximum(((standard**2 * share).sum() - standard**2) / (freedom - 1), 0.0))
+    least = 1.0 if problem.covariance is not None else 1e-12
+    standard = standard / np.maximum(others, least)
+    limit = max(_STANDS_OUT, coverage_factor(freedom - 1, 1 - 1e-3 / n))
+    return {i: float(standard[i]) for i in np.flatnonzero(standard > limit).tolist()}

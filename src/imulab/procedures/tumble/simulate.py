@@ -1,0 +1,278 @@
+"""A simulated tumble test: a unit turned by hand through static attitudes, with its truth.
+
+The forward model is written here on its own, apart from the inverse that `imulab.procedures.tumble.model` fits with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import OptionError
+from imulab.recording import Array, Recording
+from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
+
+_HIGHEST_ORDER = 5
+_MOST_SAMPLES = 1e7
+_RING_FREQUENCY = 12.0  # Hz
+_RING_DECAY = 0.08  # s
+_KNOCK = 30.0  # m/s^2
+_HAND_SWAY = 0.6  # m/s^2
+_MEMS_NONLINEARITY = {2: 5e-3, 3: 2e-3, 4: 1e-3, 5: 5e-4}  # in inverse powers of g
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Attitude over time: the upward direction and the rate in the body frame, shape (n, 3), and the hold."""
+
+    time: Array
+    upward: Array
+    rate: Array
+    hold: np.ndarray
+    since_hold: Array
+
+
+def simulate_tumble(
+    *,
+    attitudes: int | Array = 24,
+    order: int = 1,
+    truth: Mapping[str, float] | None = None,
+    gravity: float = STANDARD_GRAVITY,
+    sample_rate: float = 100.0,
+    hold: float = 5.0,
+    move: float = 2.0,
+    noise: float = 0.7e-3 * STANDARD_GRAVITY,
+    unit: str = "m/s^2",
+    scale: float | None = None,
+    knock: int | None = None,
+    knock_shift: float = 5e-3 * STANDARD_GRAVITY,
+    gyro: bool = True,
+    temperature: float = 24.0,
+    seed: int = 1,
+) -> Recording:
+    """Simulate a tumble recording with columns time, accel_*, gyro_*, temperature, truth_accel_*.
+
+    Between holds the unit turns about one axis with a smooth rate, swayed by the hand; each hold begins with a short
+    ringing. ``M = S (A + b)``, ``A = s + k2 s^2 + ...``, ``s = T f`` plus white noise; the truth is in the metadata.
+
+    Parameters
+    ----------
+    attitudes
+        Number of attitudes, spread evenly over the sphere, or upward directions in the body frame, shape (n, 3).
+    order
+        Order of the nonlinearity of a random truth.
+    truth
+        Parameters in SI by the names of a record; without it a random MEMS-size sensor.
+    gravity
+        m/s^2.
+    sample_rate
+        Hz.
+    hold, move
+        Duration of each static attitude and of the motion between two, s.
+    noise
+        Standard deviation of one sample, m/s^2.
+    unit
+        Unit of the accelerometer columns; ``count`` also rounds to whole counts.
+    scale
+        Nominal scale factor, output per m/s^2; for acceleration units the conversion factor.
+    knock
+        Number of an attitude (from 1) that is knocked half-way and keeps a shifted zero, or None.
+    knock_shift
+        That shift, along the vertical, m/s^2.
+    gyro
+        Whether the recording has gyroscope columns.
+    temperature
+        degC.
+    seed
+        Of the random numbers.
+
+    Raises
+    ------
+    OptionError
+        A value is out of range.
+    """
+    _check(order, sample_rate, hold, move, noise, gravity)
+    if seed < 0:
+        raise OptionError(f"seed {seed}: expected a whole number from 0")
+    rng = np.random.default_rng(seed)
+    directions = _spread(attitudes, rng) if isinstance(attitudes, int) else np.asarray(attitudes, dtype=np.float64)
+    if knock is not None and not 1 <= knock <= len(directions):
+        raise OptionError(f"knock {knock}: expected the number of an attitude, 1 to {len(directions)}")
+    nominal = _nominal_scale(unit, scale)
+    sensor = dict(truth) if truth is not None else _random_sensor(rng, order, nominal)
+    samples = len(directions) * (hold + move) * sample_rate
+    if samples > _MOST_SAMPLES:
+        raise OptionError(f"{samples:.3g} samples of all attitudes together: expected at most {_MOST_SAMPLES:.0e}")
+    path = _path(directions, sample_rate, hold, move, rng)
+    force = gravity * path.upward
+    felt = force + _disturbances(path, hold, knock, rng)
+    if knock is not None:
+        struck = (path.hold == knock - 1) & (path.since_hold >= hold / 2)
+        felt[struck] += knock_shift * path.upward[struck]
+    output = _forward(felt + noise * rng.standard_normal(felt.shape), sensor)
+    if parse_unit(unit).symbol == "count":
+        output = np.round(output)
+    columns = {"time": path.time} | {f"accel_{a}": output[:, i].copy() for i, a in enumerate("xyz")}
+    units = {"time": "s"} | {f"accel_{a}": unit for a in "xyz"}
+    if gyro:
+        rates, gyro_truth = _gyro(path.rate, rng)
+        sensor |= gyro_truth
+        columns |= {f"gyro_{a}": rates[:, i].copy() for i, a in enumerate("xyz")}
+        units |= {f"gyro_{a}": "deg/s" for a in "xyz"}
+    columns["temperature"] = np.round(temperature + 0.05 * rng.standard_normal(len(path.time)), 2)
+    columns |= {f"truth_accel_{a}": force[:, i].copy() for i, a in enumerate("xyz")}
+    units |= {"temperature": "degC"} | {f"truth_accel_{a}": "m/s^2" for a in "xyz"}
+    metadata = {"serial": f"SIM-{seed:04d}", "model": "simulated triad", "gravity": f"{gravity!r} m/s^2"}
+    metadata |= {f"truth_{name}": repr(float(value)) for name, value in sensor.items()}
+    return Recording(columns=columns, units=units, metadata=metadata, name="simulated tumble")
+
+
+def _check(order: int, sample_rate: float, hold: float, move: float, noise: float, gravity: float) -> None:
+    if not 1 <= order <= _HIGHEST_ORDER:
+        raise OptionError(f"order {order}: expected 1 to {_HIGHEST_ORDER}")
+    for name, value, low, high in (
+        ("sample rate", sample_rate, 10.0, 1e5),
+        ("hold", hold, 0.5, 3600.0),
+        ("move", move, 0.2, 3600.0),
+        ("noise", noise, 0.0, 1e3),
+        ("gravity", gravity, 0.5, 50.0),
+    ):
+        if not low <= value <= high:
+            raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
+
+
+def _spread(count: int, rng: np.random.Generator) -> Array:
+    """Directions spread evenly over the sphere and loosely turned, shape (count, 3)."""
+    if not 2 <= count <= 10_000:
+        raise OptionError(f"attitudes {count}: expected 2 to 10000")
+    index = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * index / count), np.pi * (1 + 5**0.5) * index
+    points = np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    points = rng.permutation(points @ turn.T) + 0.05 * rng.standard_normal((count, 3))
+    directions: Array = points / np.linalg.norm(points, axis=1, keepdims=True)
+    return directions
+
+
+def _nominal_scale(unit: str, scale: float | None) -> float:
+    known = parse_unit(unit)
+    if known.quantity == "acceleration":
+        return conversion_factor("m/s^2", known.symbol)
+    if known.quantity != "output":
+        raise OptionError(f"unit {unit}: expected m/s^2 g mg count V")
+    return scale if scale is not None else {"V": 1.0, "mV": 1000.0}.get(known.symbol, 4096.0) / STANDARD_GRAVITY
+
+
+def _random_sensor(rng: np.random.Generator, order: int, nominal: float) -> dict[str, float]:
+    """MEMS-size errors: scale 3 %, bias 50 mg, misalignment 2 deg, k2 5 mg/g^2, ..."""
+    g = STANDARD_GRAVITY
+    sensor = {f"bias_{a}": 0.05 * g * rng.uniform(-1, 1) for a in "xyz"}
+    sensor |= {f"scale_factor_{a}": nominal * (1 + 0.03 * rng.uniform(-1, 1)) for a in "xyz"}
+    sensor |= {f"misalignment_{p}": np.radians(2) * rng.uniform(-1, 1) for p in ("yx", "zx", "zy")}
+    for power in range(2, order + 1):
+        size = _MEMS_NONLINEARITY[power] / g ** (power - 1)
+        sensor |= {f"k{power}_{a}": size * rng.uniform(-1, 1) for a in "xyz"}
+    return sensor
+
+
+def _forward(force: Array, sensor: Mapping[str, float]) -> Array:
+    """Outputs of the triad for specific forces, shape (n, 3)."""
+    fx, fy, fz = force.T
+    sensed = {
+        "x": fx,
+        "y": sensor["misalignment_yx"] * fx + fy,
+        "z": sensor["misalignment_zx"] * fx + sensor["misalignment_zy"] * fy + fz,
+    }
+    output = np.empty_like(force)
+    for column, (axis, s) in enumerate(sensed.items()):
+        reading = s + sum(sensor.get(f"k{power}_{axis}", 0.0) * s**power for power in range(2, _HIGHEST_ORDER + 1))
+        output[:, column] = sensor[f"scale_factor_{axis}"] * (reading + sensor[f"bias_{axis}"])
+    return output
+
+
+def _path(directions: Array, sample_rate: float, hold: float, move: float, rng: np.random.Generator) -> _Path:
+    """Hold each direction, and turn to the next about one axis with a minimum-jerk angle."""
+    count = len(directions)
+    resting, moving = round(hold * sample_rate), round(move * sample_rate)
+    samples = count * resting + (count - 1) * moving
+    index = np.arange(samples)
+    number, phase = index // (resting + moving), index % (resting + moving)
+    tau = np.clip((phase - resting + 1) / (moving + 1), 0.0, 1.0)
+    angle = tau**3 * (10 - 15 * tau + 6 * tau**2)
+    speed = 30 * tau**2 * (1 - tau) ** 2 * sample_rate / (moving + 1)
+    axis, full = _turns(directions, rng)
+    axis, full = np.vstack([axis, axis[-1:]])[number], np.append(full, 0.0)[number]
+    # The body turns by +angle about the axis, so that the upward direction turns by -angle in its frame.
+    turned = _rotate(directions[number], axis, -full * angle)
+    return _Path(
+        time=index / sample_rate,
+        upward=turned,
+        rate=axis * (full * speed)[:, None],
+        hold=np.where(phase < resting, number, -1),
+        since_hold=phase / sample_rate,
+    )
+
+
+def _turns(directions: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Axis and angle that turn the body from each direction up to the next one up, shapes (n - 1, 3) and (n - 1,)."""
+    here, there = directions[:-1], directions[1:]
+    across, between = np.cross(there, here), here + there
+    tilt = rng.uniform(-0.7, 0.7, len(here))[:, None]
+    axis = np.cos(tilt) * _unit(across, [1.0, 0.0, 0.0]) + np.sin(tilt) * _unit(between, [0.0, 0.0, 1.0])
+    axis = _unit(axis, [1.0, 0.0, 0.0])
+    a = here - axis * np.einsum("ni,ni->n", axis, here)[:, None]
+    b = there - axis * np.einsum("ni,ni->n", axis, there)[:, None]
+    angle = np.arctan2(np.einsum("ni,ni->n", axis, np.cross(b, a)), np.einsum("ni,ni->n", a, b))
+    return axis, angle
+
+
+def _unit(vectors: Array, instead: list[float]) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Array = np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), instead)
+    return unit
+
+
+def _rotate(vectors: Array, axis: Array, angle: Array) -> Array:
+    """Rodrigues' rotation of each vector about its axis."""
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    along = axis * np.einsum("ni,ni->n", axis, vectors)[:, None]
+    turned: Array = vectors * cosine + np.cross(axis, vectors) * sine + along * (1 - cosine)
+    return turned
+
+
+def _disturbances(path: _Path, hold: float, knock: int | None, rng: np.random.Generator) -> Array:
+    """Sway while the hand moves the unit, ringing when it is put down and when it is knocked, m/s^2."""
+    count = len(path.time)
+    moving = path.hold < 0
+    sway = np.zeros((count, 3))
+    for frequency in (1.3, 2.9, 6.1):
+        phase = rng.uniform(0, 2 * np.pi, 3)
+        sway += _HAND_SWAY * np.sin(2 * np.pi * frequency * path.time[:, None] + phase)
+    sway *= moving[:, None]
+    ring = np.exp(-path.since_hold / _RING_DECAY) * np.sin(2 * np.pi * _RING_FREQUENCY * path.since_hold)
+    sway += np.where(moving, 0.0, ring)[:, None] * rng.uniform(0.2, 1.0, 3)
+    if knock is not None:
+        since = path.since_hold - hold / 2
+        struck = (path.hold == knock - 1) & (since >= 0)
+        pulse = _KNOCK * np.exp(-np.maximum(since, 0) / _RING_DECAY) * np.cos(2 * np.pi * _RING_FREQUENCY * since)
+        sway += np.where(struck, pulse, 0.0)[:, None] * np.array([1.0, -0.6, 0.4])
+    return sway
+
+
+def _gyro(rate: Array, rng: np.random.Generator) -> tuple[Array, dict[str, float]]:
+    """Outputs of a gyroscope triad, deg/s: M = S (T w + b), and its truth in SI."""
+    bias = np.radians(0.3) * rng.uniform(-1, 1, 3)
+    scale = 1 + 0.01 * rng.uniform(-1, 1, 3)
+    misalignment = np.eye(3) + np.radians(1) * rng.uniform(-1, 1, (3, 3)) * (1 - np.eye(3))
+    sensed = rate @ misalignment.T + bias + np.radians(0.05) * rng.standard_normal(rate.shape)
+    truth = {f"gyro_bias_{a}": float(bias[i]) for i, a in enumerate("xyz")}
+    truth |= {f"gyro_scale_factor_{a}": float(np.degrees(scale[i])) for i, a in enumerate("xyz")}
+    truth |= {
+        f"gyro_misalignment_{a}{b}": float(misalignment[i, j])
+        for i, a in enumerate("xyz")
+        for j, b in enumerate("xyz")
+        if i != j
+    }
+    return np.degrees(sensed * scale), truth

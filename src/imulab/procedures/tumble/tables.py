@@ -1,0 +1,150 @@
+"""The tables of a tumble record, from the record alone."""
+
+from __future__ import annotations
+
+from imulab.procedures.tumble.engineering import engineering_rows, micro_g, propagated_rows
+from imulab.records.calibration import Calibration
+from imulab.report.elements import Table, format_uncertain, plain_number
+
+_AGREE = 10.0
+"""Per cent by which the widths of two kinds of intervals may differ before it matters."""
+
+
+def _basis(record: Calibration) -> str:
+    """Say what the uncertainties rest on."""
+    fit = record.fit
+    freedom = fit.get("effective_degrees_of_freedom", fit["degrees_of_freedom"])
+    if fit["noise"] != "known" and freedom is None:
+        return "As many parameters as attitudes: nothing tells the noise, and no uncertainty is stated."
+    if fit["noise"] != "known":
+        return f"Noise estimated from the residuals; Student's t with {freedom:.0f} degrees of freedom."
+    if not fit["excess"]["value"] or freedom is None:
+        return "Noise known from the attitudes' own scatter; normal quantiles."
+    return (
+        f"Noise known from the attitudes' own scatter, with {micro_g(fit['excess']['value']):.3g} µg more for each "
+        f"attitude, as its residual makes plausible; Student's t with {freedom:.0f} effective degrees of freedom."
+    )
+
+
+def parameters_table(record: Calibration) -> Table:
+    """Return the parameters with their uncertainties."""
+    blend = record.fit.get("blend")
+    factors = {False: record.fit["coverage_factor_95"], True: record.fit.get("gyro", {}).get("coverage_factor_95")}
+    rows = []
+    for row in engineering_rows(record):
+        factor = factors[row.name.startswith("gyro_")]
+        value, uncertainty = row.text()
+        interval = "not stated"
+        if row.standard_uncertainty is not None and factor is not None:
+            half = factor * row.standard_uncertainty
+            interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
+        given = [] if blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]
+        rows.append([row.name, value, uncertainty, *given, interval, row.unit])
+    basis = _basis(record)
+    if blend is not None:
+        basis += (
+            f" The standard uncertainty holds whatever the order is, up to {blend['highest_order']}; beside it what it "
+            f"would be if order {record.model['order']} were known to be right."
+        )
+    turned = ""
+    if "gyro" in record.fit:
+        degrees = record.fit["gyro"]["degrees_of_freedom"]
+        turned = f" Gyroscopes: M = S (T ω + b + G f), Student's t with {degrees} degrees of freedom."
+    return Table(
+        title="Parameters",
+        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.{turned}",
+        columns=[
+            "parameter",
+            "value",
+            "standard uncertainty",
+            *([] if blend is None else [f"if order {record.model['order']} is right"]),
+            "95 % interval",
+            "unit",
+        ],
+        rows=rows,
+    )
+
+
+def propagated_table(record: Calibration) -> Table:
+    """Return the intervals by propagation of distributions beside the linear ones."""
+    trials = record.fit["monte_carlo"]
+    rows = propagated_rows(record)
+    failed = f", {trials['failed']} more did not converge" if trials["failed"] else ""
+    return Table(
+        title="Monte Carlo",
+        message=_agreement(rows),
+        caption=f"95 % intervals of {trials['trials']} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
+        "from 1 means that the model is not linear over its own uncertainty: trust the trials then.",
+        columns=["parameter", "linear", "Monte Carlo", "ratio of widths", "unit"],
+        rows=rows,
+    )
+
+
+def _agreement(rows: list[list[str]]) -> str:
+    """Say within what the linear and the Monte Carlo intervals agree."""
+    name, *_, ratio, _ = max(rows, key=lambda row: abs(float(row[3]) - 1))
+    percent = 100 * abs(float(ratio) - 1)
+    if percent <= _AGREE:
+        return f"The linear and the Monte Carlo intervals agree: their widths within {percent:.2g} % ({name})."
+    return (
+        f"The linear and the Monte Carlo intervals differ: their widths by up to {percent:.2g} % ({name}). Use the "
+        "Monte Carlo intervals."
+    )
+
+
+def shares_table(record: Calibration) -> Table:
+    """Return what each parameter owes to the prior."""
+    prior = record.fit["prior"]
+    rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior["shares"].items()]
+    return Table(
+        title="Prior and data",
+        caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior['created']}) or "
+        "these attitudes; variance now over that of the prior with what it aged since.",
+        columns=["parameter", "from the prior", "from the data"],
+        rows=rows,
+    )
+
+
+def orders_table(record: Calibration) -> Table:
+    """Return what the choice of the order rests on."""
+    rows, highlight = [], None
+    for index, row in enumerate(record.fit["orders"]):
+        if row["order"] == record.model["order"]:
+            highlight = index
+        probability = row["f_probability"]
+        rows.append(
+            [
+                str(row["order"]),
+                str(row["parameters"]),
+                plain_number(micro_g(row["rms"]), 4),
+                plain_number(micro_g(row["leave_one_out"]), 4) if row["leave_one_out"] is not None else "–",
+                f"{probability:.2g}" if probability is not None else "–",
+                f"{row['bic']:.1f}" if row["bic"] is not None else "–",
+                plain_number(micro_g(predicted), 3)
+                if (predicted := row.get("largest_uncertainty")) is not None
+                else "–",
+                plain_number(row["condition_number"], 3),
+                "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
+            ]
+        )
+    huber = " Rms of all attitudes, a down-weighted one by its weight." if record.fit["loss"] == "huber" else ""
+    return Table(
+        title="Choice of the order",
+        caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
+        "attitudes it has not seen better (leave-one-out), by more than the error of that comparison, if the F-test "
+        "finds the gain significant, and if the attitudes can observe it: nowhere on the sphere may the predicted "
+        f"uncertainty of |f| exceed 4 times the scatter at order 1.{huber}",
+        columns=[
+            "order",
+            "parameters",
+            "rms, µg",
+            "leave-one-out, µg",
+            "F-test p",
+            "BIC",
+            "largest u(|f|), µg",
+            "condition",
+            "observable",
+        ],
+        rows=rows,
+        highlight=highlight,
+    )

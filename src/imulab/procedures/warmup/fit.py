@@ -1,0 +1,231 @@
+"""Power cycles to a warm-up table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import DataError, OptionError, listed
+from imulab.procedures.warmup.curves import Curves, make_curves
+from imulab.procedures.warmup.cycles import Cycle, common_axes, find_power_cycle, with_axes
+from imulab.procedures.warmup.judge import (
+    CANDIDATES,
+    Judged,
+    Repeatability,
+    choose,
+    cycle_weights,
+    judge,
+    judge_none,
+    repeatability,
+    worst_between,
+)
+from imulab.procedures.warmup.model import BEYOND, EXITS, MODELS, SOURCE_TEMPERATURES, Table
+from imulab.procedures.warmup.record import make_record
+from imulab.procedures.warmup.solve import coefficient_covariance, statistics
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+
+POOLS = ("unit", "type")
+TOLERANCE = 1.0
+"""How far a power-on temperature may lie from its calibration temperature, K."""
+SETTLING_SHARE = 0.05
+"""A curve counts as settled below this share of the largest |Z| of its kind."""
+
+
+@dataclass(frozen=True)
+class WarmupFit:
+    """Result of a warm-up fit.
+
+    Attributes
+    ----------
+    calibration
+        The record.
+    table
+        What the unit subtracts.
+    models
+        What was compared: no compensation, and each model with its errors.
+    repeatability
+        Of power cycles, and of units.
+    curves
+        The cycles side by side.
+    """
+
+    calibration: Calibration
+    table: Table
+    models: tuple[Judged, ...]
+    repeatability: Repeatability
+    curves: Curves
+
+    def __repr__(self) -> str:
+        return f"WarmupFit({self.table.model}, {len(self.curves.cycles)} cycles)"
+
+
+def fit_warmup(
+    cycles: Sequence[Cycle | Recording],
+    *,
+    model: str = "auto",
+    temperatures: Sequence[float] = SOURCE_TEMPERATURES,
+    tolerance: float = TOLERANCE,
+    settling_time: float | None = None,
+    settling_limit: Mapping[str, float] | None = None,
+    exit_rule: str = "zero",
+    taper_time: float = 60.0,
+    pool: str = "unit",
+    axes: Sequence[str] | None = None,
+    beyond: str = "zero",
+) -> WarmupFit:
+    """Fit the curve of an output's zero after power-on, ``Z(t; T)``, to power cycles at several temperatures.
+
+    Each cycle is referenced to its own settled mean (t >= T_M); the fit is to t < T_M.
+
+    Parameters
+    ----------
+    cycles
+        One per power cycle; recordings are averaged first.
+    model
+        ``interval-cubic`` (the source's), ``knot-cubic``, ``knot-log-cubic``, ``exponential``, or ``auto``: the one
+        that best predicts cycles and temperatures left out of the fit.
+    temperatures
+        Calibration temperatures, degC: edges of the intervals, or knots.
+    tolerance
+        How far a power-on temperature may lie from one of them, K.
+    settling_time
+        T_M, s; chosen from the data if not given.
+    settling_limit
+        Kind (``gyro``, ``accel``) to the size of Z, SI, that counts as settled; 5 % of the largest if not given.
+    exit_rule, taper_time
+        What the unit does from T_M on, and how long a taper takes, s.
+    pool
+        ``unit``: all cycles are of one unit. ``type``: several units share a table, with a random effect per unit.
+    axes
+        Columns to fit; all gyro_* and accel_* if not given.
+    beyond
+        What the unit does at power-on temperatures beyond the outer ones: ``zero``, nothing; ``hold``, as there.
+
+    Raises
+    ------
+    DataError
+        The cycles do not make a test: too few, at other temperatures, of several units, too short, moving.
+    UnitError
+        Units differ between files.
+    OptionError
+        An option has a value that cannot be used.
+
+    Source: start-up zero error compensation of MEMS inertial instruments (patent record 38161583), and
+    Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
+    """
+    at = check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool, beyond)
+    if not cycles:
+        raise DataError("no power cycles: expected at least one file for each calibration temperature")
+    found = [find_power_cycle(item) if isinstance(item, Recording) else item for item in cycles]
+    if axes is not None:
+        found = [with_axes(cycle, tuple(axes)) for cycle in found]
+    order = common_axes(found)
+    found = [with_axes(cycle, order) for cycle in found]
+    _check_units(found, pool)
+    limit = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE) | dict(settling_limit or {})
+    curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limit)
+    spread = repeatability(curves)
+    by_unit = pool == "type" and np.unique(curves.unit).size > 1
+    weights = cycle_weights(curves, spread) if by_unit else np.ones(len(found))
+    rows = [judge_none(curves)] + [
+        judge(curves, name, count, weights, by_unit=by_unit) for name, count in CANDIDATES if model in ("auto", name)
+    ]
+    chosen = choose(curves, rows)
+    covariance = _covariance(curves, chosen, by_unit)
+    table = chosen.table.with_rules(exit_rule, taper_time, beyond, tolerance)
+    record = make_record(
+        curves=curves,
+        rows=rows,
+        chosen=chosen,
+        table=table,
+        spread=spread,
+        covariance=covariance,
+        settled=settled,
+        by_unit=by_unit,
+        worst=worst_between(curves, chosen, spread),
+        options={
+            "model": model,
+            "temperatures": at.tolist(),
+            "tolerance": tolerance,
+            "settling_time": settling_time,
+            "exit": exit_rule,
+            "pool": pool,
+            "beyond": beyond,
+        },
+    )
+    return WarmupFit(record, table, tuple(rows), spread, curves)
+
+
+def _covariance(curves: Curves, chosen: Judged, by_unit: bool) -> Array | None:
+    if chosen.solution is None:
+        return None
+    cluster = np.arange(len(curves.cycles))
+    if by_unit:
+        cluster = curves.unit * len(curves.temperatures) + curves.group
+    sums = statistics(curves, chosen.model, chosen.solution.scales)
+    return coefficient_covariance(curves, chosen.solution, sums, cluster)
+
+
+def check_options(
+    model: str,
+    temperatures: Sequence[float],
+    tolerance: float,
+    settling_time: float | None,
+    exit_rule: str,
+    taper_time: float,
+    pool: str,
+    beyond: str = "zero",
+) -> Array:
+    """Check what can be checked before there is data, and return the temperatures, degC, shape (k,).
+
+    Raises
+    ------
+    OptionError
+        An option has a value that cannot be used.
+    """
+    for name, value, known in (
+        ("model", model, (*MODELS, "auto")),
+        ("exit", exit_rule, EXITS),
+        ("pool", pool, POOLS),
+        ("beyond", beyond, BEYOND),
+    ):
+        if value not in known:
+            raise OptionError(f"{name} {value!r}: expected one of {listed(known, value)}")
+    at = np.array(temperatures, dtype=np.float64)
+    if at.ndim != 1 or len(at) < 2 or not np.isfinite(at).all() or not (np.diff(at) > 0).all():
+        raise OptionError(
+            f"temperatures {' '.join(f'{t:g}' for t in np.ravel(at))}: expected two or more, ascending, in degC"
+        )
+    if not 0 < tolerance < np.diff(at).min() / 2:
+        raise OptionError(
+            f"tolerance {tolerance:g} K: expected more than 0 and less than half of the {np.diff(at).min():g} K "
+            "between neighbouring temperatures"
+        )
+    if settling_time is not None and not 0 < settling_time < 1e6:
+        raise OptionError(f"settling time {settling_time:g} s: expected more than 0")
+    if not 0 < taper_time < 1e6:
+        raise OptionError(f"taper time {taper_time:g} s: expected more than 0")
+    return at
+
+
+def _check_units(cycles: Sequence[Cycle], pool: str) -> None:
+    if pool == "type":
+        unnamed = [cycle.name for cycle in cycles if not cycle.serial]
+        if unnamed:
+            raise DataError(
+                f"{unnamed[0]}: no serial in the head of the file; --pool type needs it to tell units apart"
+            )
+        return
+    serials: dict[str, str] = {}
+    for cycle in cycles:
+        if cycle.serial:
+            serials.setdefault(cycle.serial, cycle.name)
+    if len(serials) > 1:
+        (first, one), (second, other) = list(serials.items())[:2]
+        raise DataError(
+            f"{other}: of unit {second}, but {one} is of {first}: expected power cycles of one unit (--pool type fits "
+            "one table to several)"
+        )

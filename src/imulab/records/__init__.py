@@ -1,0 +1,1 @@
+"""Calibration records: what was found, written whole, read back checked, and compared."""

@@ -1,0 +1,191 @@
+"""One record of a unit against another of the same procedure: what changed, in units of the combined uncertainty."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import RecordError
+from imulab.estimation.estimate import chi_square_probability, coverage_factor
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+
+_FALSE_ALARM = 0.05
+_SINGULAR = 1e-9
+"""Eigenvalues of the correlations below this share of the largest belong to parameters that follow from others."""
+_OF_A_LEVEL = re.compile(r"_(K|zeta|cross)_\d+$")
+_SAME_LEVEL = 0.01
+_ALIKE = {"degC": (1.0, 0.0), "s": (0.0, 0.1)}
+"""Quantities of two models count as different beyond this, absolute and relative; others beyond 1e-6 relative."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of one parameter: the difference, and its standard uncertainty, None where one record states none."""
+
+    name: str
+    difference: float
+    standard_uncertainty: float | None
+    unit: str
+    significant: bool
+
+    @property
+    def deviations(self) -> float | None:
+        """Difference in units of its standard uncertainty, None where there is none."""
+        return self.difference / self.standard_uncertainty if self.standard_uncertainty else None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two records of one unit.
+
+    Attributes
+    ----------
+    changes
+        Parameters that both have, second record less first.
+    probability
+        Of differences as large as all of them together, were nothing changed (chi-square with both covariances); None
+        where a covariance is missing.
+    left_out
+        Parameters that one record alone has, or that mean something else in the other.
+    models
+        In what the two models differ (order, gravity, temperature ...), a text each: a change may come from that.
+    """
+
+    changes: tuple[Change, ...]
+    probability: float | None
+    left_out: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()
+
+
+def compare_records(first: Calibration, second: Calibration) -> Comparison:
+    """Compare two records of one unit by one procedure, in units of their combined uncertainty.
+
+    A change counts as significant where it exceeds what chance gives one of all the parameters in twenty comparisons
+    (Bonferroni), by Student's t where a noise was estimated. A parameter without an uncertainty is shown, not judged.
+
+    Raises
+    ------
+    RecordError
+        They are of different procedures or in different units, or one states no uncertainty.
+    """
+    if first.procedure != second.procedure:
+        raise RecordError(
+            f"cannot compare a {first.procedure} record with a {second.procedure} record; expected two of one procedure"
+        )
+    _check_units(first, second)
+    shared = [name for name in first.parameters if name in second.parameters and _same_meaning(name, first, second)]
+    judged = [name for name in shared if _uncertainty(name, first, second)]
+    if not judged:
+        raise RecordError("a record without uncertainties cannot be compared")
+    share = 1 - _FALSE_ALARM / len(judged)
+    changes = []
+    for name in shared:
+        uncertainty = _uncertainty(name, first, second)
+        difference = second.parameters[name].value - first.parameters[name].value
+        known = [freedom for record in (first, second) if (freedom := _freedom(record, name)) is not None]
+        limit = coverage_factor(float(sum(known)) if known else None, share) if uncertainty else np.inf
+        significant = uncertainty is not None and abs(difference) > limit * uncertainty
+        changes.append(Change(name, difference, uncertainty, first.parameters[name].unit, bool(significant)))
+    either = dict.fromkeys([*first.parameters, *second.parameters])
+    return Comparison(
+        tuple(changes),
+        _joint(first, second, judged, changes),
+        tuple(name for name in either if name not in shared),
+        tuple(_model_differences(first.model, second.model)),
+    )
+
+
+def _check_units(first: Calibration, second: Calibration) -> None:
+    units = [record.model.get("output_unit") for record in (first, second)]
+    if units[0] != units[1]:
+        raise RecordError(f"the records have different output units: {units[0]} and {units[1]}")
+    for name, parameter in first.parameters.items():
+        other = second.parameters.get(name, parameter).unit
+        if parameter.unit != other:
+            raise RecordError(f"the records have {name} in different units: {parameter.unit} and {other}")
+
+
+def _model_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
+    """Entries of the models that both have and that differ: words, numbers, quantities with a unit, sets of these."""
+    for key, mine in first.items():
+        its = second.get(key)
+        if isinstance(mine, dict) and isinstance(its, dict):
+            yield from (f"{key} {text}" for text in _quantity_differences(mine, its))
+        elif isinstance(mine, str | int) and isinstance(its, str | int) and mine != its:
+            yield f"{key} {mine} and {its}"
+
+
+def _quantity_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
+    """The difference of two quantities with a unit, or those of two sets of entries."""
+    if not {"value", "unit"} <= first.keys() & second.keys():
+        yield from _model_differences(first, second)
+        return
+    values, unit = (first["value"], second["value"]), first["unit"]
+    absolute, relative = _ALIKE.get(unit, (0.0, 1e-6))
+    if unit == second["unit"] and abs(values[0] - values[1]) > absolute + relative * max(map(abs, values)):
+        yield f"{values[0]:.7g} and {values[1]:.7g} {unit}"
+
+
+def _same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
+    """Whether a parameter is of the same thing: those of a level are numbered, whatever the level."""
+    if not _OF_A_LEVEL.search(name):
+        return True
+    levels = [[level["specific_force"]["value"] for level in r.sections.get("levels", ())] for r in (first, second)]
+    return len(levels[0]) == len(levels[1]) and all(
+        abs(a - b) <= _SAME_LEVEL * abs(a) for a, b in zip(*levels, strict=True)
+    )
+
+
+def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | None:
+    """Return the uncertainty of a difference; None where one of the two is not stated."""
+    a, b = (record.parameters[name].standard_uncertainty for record in (first, second))
+    if a is None or b is None:
+        return None
+    return float(np.sqrt(max(a**2 + b**2 - _shared(first, second, [name])[0, 0], 0.0))) or None
+
+
+def _shared(first: Calibration, second: Calibration, names: list[str]) -> Array:
+    """Covariance that a difference does not have, since both records have the error in common (gravity of a place)."""
+    found = np.zeros((len(names), len(names)))
+    mine, its = (record.fit.get("shared", {}) for record in (first, second))
+    for what in mine.keys() & its.keys():
+        one, other = (np.array([terms[what].get(name, 0.0) for name in names]) for terms in (mine, its))
+        found += np.outer(one, other) + np.outer(other, one)
+    return found
+
+
+def _freedom(record: Calibration, name: str) -> float | None:
+    """Return the degrees of freedom of a parameter's uncertainty; None where the noise was known."""
+    fit = record.fit
+    if "effective_degrees_of_freedom" in fit:
+        effective: float | None = fit["effective_degrees_of_freedom"]
+        return effective
+    if fit.get("noise") == "known" and not fit.get("excess", {}).get("value"):
+        return None
+    stated = fit.get("degrees_of_freedom", fit.get("repeatability"))
+    if isinstance(stated, dict):  # of each parameter, or of the scatter that all of them come from
+        stated = stated.get(name, stated.get("degrees_of_freedom"))
+    return float(stated) if isinstance(stated, int | float) and stated > 0 else None
+
+
+def _joint(first: Calibration, second: Calibration, judged: list[str], changes: Sequence[Change]) -> float | None:
+    if any(name not in record.covariance.names for record in (first, second) for name in judged):
+        return None
+    total = sum(_block(record, judged) for record in (first, second)) - _shared(first, second, judged)
+    scale = np.sqrt(np.diag(total))
+    vector = np.array([change.difference for change in changes if change.name in judged]) / scale
+    values, vectors = np.linalg.eigh(total / np.outer(scale, scale))
+    free = values > _SINGULAR * values[-1]
+    chi_square = float(((vector @ vectors[:, free]) ** 2 / values[free]).sum())
+    return chi_square_probability(chi_square, int(free.sum()))
+
+
+def _block(record: Calibration, names: list[str]) -> Array:
+    index = [record.covariance.names.index(name) for name in names]
+    block: Array = record.covariance.array()[np.ix_(index, index)]
+    return block

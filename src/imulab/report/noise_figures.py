@@ -1,0 +1,247 @@
+"""The report of the noise of a recording at rest: coefficients, Allan curves with their intervals, and the samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from imulab._version import VERSION
+from imulab.recording import Array, Recording
+from imulab.report import panels, render_page
+from imulab.report.bulk import bulk, edge_marks, edge_note
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, Table, format_uncertain, plain_number
+from imulab.verdict import Note, verdict_of
+
+_HOUR = 3600.0
+_DEGREE = math.pi / 180
+_BLOCKS = 400
+_COLOURS = (GOOD, BAD, "#8e6bbd", "#c99a2e", "#4f9d69", INK)
+_DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
+_MARKS = ("circle", "square", "diamond", "triangle-up", "x", "star")
+_MOST_LINES = len(_COLOURS)
+_MOST_NAMED = 6
+
+
+def noise_page(found: dict[str, Any], recording: Recording) -> str:
+    """Return the report of an analysis by `imulab.estimation.column_noise.analyse` and of the recording that it was made from."""
+    verdict = verdict_of(found["warnings"])
+    return render_page(
+        "Noise at rest",
+        found["sensor"].get("serial", found["file"]),
+        exhibits_of_noise(found, recording),
+        verdict=verdict,
+        notes=[note for note in found["warnings"] if isinstance(note, Note)],
+        provenance=[
+            ("file", found["file"]),
+            ("samples", f"{found['samples']} at {found['sample_rate']['value']:.6g} Hz"),
+            ("averaging times", found["taus"]),
+            *((f"sensor {key}", value) for key, value in found["sensor"].items()),
+            ("software", f"imulab {VERSION}"),
+        ],
+    )
+
+
+def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
+    """Return what the report shows."""
+    length = found["samples"] / found["sample_rate"]["value"]
+    kinds: dict[str, list[str]] = {}
+    for name, column in found["columns"].items():
+        kinds.setdefault(column["unit"], []).append(name)
+    rows = coefficient_rows(found)
+    white = [row for row in rows if row[1] in ("angle random walk", "velocity random walk")]
+    known = [f"{row[0]} {row[2]} ± {row[3]} {row[4]}" for row in white if row[2] != "not determined"]
+    more = f" and {len(known) - _MOST_NAMED} more columns in the table" if len(known) > _MOST_NAMED else ""
+    lost = f"; not determined for {len(white) - len(known)} of {len(white)} columns" if len(known) < len(white) else ""
+    items: list[Figure | Table] = [
+        Table(
+            "Noise coefficients",
+            "Value and standard uncertainty u. Angle (velocity) random walk: the white noise of the rate (specific "
+            "force). Bias instability: the level of 1/f noise, below which no averaging helps. Rate (acceleration) "
+            "random walk: how the zero wanders.",
+            ["column", "coefficient", "value", "u", "unit"],
+            rows,
+        )
+    ]
+    for names in kinds.values():
+        items += [_curves(found, names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)]
+    items += [_samples(found, recording, page) for page in panels.pages(list(found["columns"]))]
+    return Exhibits(
+        headline=f"At rest for {length:.4g} s; white noise, as angle or velocity random walk: "
+        + (f"{'; '.join(known[:_MOST_NAMED])}{more}{lost}." if known else "not determined."),
+        facts=[
+            ("length", f"{length:.4g} s"),
+            ("sampling rate", f"{found['sample_rate']['value']:.6g} Hz"),
+            ("columns", str(len(found["columns"]))),
+        ],
+        items=items,
+    )
+
+
+def interval(column: dict[str, Any]) -> tuple[Array, Array]:
+    """Return the 95 % interval of a column's Allan deviation, by chi-square with its degrees of freedom."""
+    from scipy.special import chdtri
+
+    deviation, u = np.array(column["deviation"]), np.array(column["standard_uncertainty"])
+    known = u > 0
+    freedom = np.where(known, (deviation / np.where(known, u, 1.0)) ** 2 / 2, 1.0)
+    low, high = (deviation * np.where(known, np.sqrt(freedom / chdtri(freedom, tail)), 1.0) for tail in (0.025, 0.975))
+    return low, high
+
+
+def _curves(found: dict[str, Any], names: list[str]) -> Figure:
+    unit, factor = shown_unit(found["columns"][names[0]]["unit"], "bias_instability")
+    traces: list[dict[str, Any]] = []
+    lowest: list[tuple[float, float, str]] = []
+    for k, name in enumerate(names):
+        column = found["columns"][name]
+        shown = np.array(column["deviation"]) > 0
+        if not shown.any():
+            continue
+        low, high = (factor * end[shown] for end in interval(column))
+        tau, deviation = np.array(column["tau"])[shown], factor * np.array(column["deviation"])[shown]
+        at = int(np.argmin(deviation))
+        lowest.append((float(deviation[at]), float(tau[at]), name))
+        traces += [
+            {
+                "type": "scatter", "mode": "lines", "x": _plain([*tau, *tau[::-1]]), "y": _plain([*low, *high[::-1]]),
+                "fill": "toself", "fillcolor": _faint(_COLOURS[k]), "line": {"width": 0}, "hoverinfo": "skip",
+                "showlegend": False,
+            },
+            {
+                "type": "scatter", "mode": "lines+markers", "name": name, "x": _plain(tau), "y": _plain(deviation),
+                "line": {"color": _COLOURS[k], "dash": _DASHES[k]}, "marker": {"symbol": _MARKS[k], "size": 6},
+                "hovertemplate": f"{name}<br>%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>",
+            },
+        ]  # fmt: skip
+    message = "All samples are the same."
+    if lowest:
+        level, at_time, which = min(lowest)
+        message = f"The lowest point is {plain_number(level, 3)} {unit} at {plain_number(at_time, 2)} s ({which})."
+    log = {"type": "log", "dtick": 1, "exponentformat": "none", "gridcolor": "#e6eaed"}
+    return Figure(
+        title=f"Allan deviation, {', '.join(names)}",
+        message=message,
+        caption="Deviation between neighbouring means over the averaging time. Shaded: 95 % interval, "
+        "wide on the right where there are few averages. Slope −1/2: white noise. Flat: bias instability. Slope "
+        "+1/2: a random walk of the zero.",
+        traces=traces,
+        layout={
+            "xaxis": {**log, "title": {"text": "averaging time, s"}},
+            "yaxis": {**log, "title": {"text": f"Allan deviation, {unit}"}, "automargin": True},
+            "legend": LEGEND,
+        },
+        height=430,
+    )
+
+
+def _samples(found: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:
+    """Range and mean of the samples in equal blocks, so that a spike is seen whatever the length."""
+    layout = panels.grid()
+    traces: list[dict[str, Any]] = []
+    beyond = 0
+    rate = found["sample_rate"]["value"]
+    for index, name in enumerate(names):
+        unit, factor = {"rad/s": ("deg/s", 1 / _DEGREE), "m/s^2": ("mg", 1e3 / 9.80665)}.get(
+            found["columns"][name]["unit"], (found["columns"][name]["unit"], 1.0)
+        )
+        values = recording.si(name)
+        values = factor * (values[np.isfinite(values)] - found["columns"][name]["mean"])
+        size = max(1, len(values) // _BLOCKS)
+        blocks = values[: len(values) // size * size].reshape(-1, size)
+        time = (np.arange(len(blocks)) + 0.5) * size / rate
+        low, mean, high = blocks.min(axis=1), blocks.mean(axis=1), blocks.max(axis=1)
+        x, y = panels.names(index)
+        where = {"type": "scatter", "mode": "lines", "xaxis": x, "yaxis": y, "hoverinfo": "skip"}
+        traces += [
+            {**where, "x": _plain([*time, *time[::-1]]), "y": _plain([*low, *high[::-1]]), "fill": "toself",
+             "fillcolor": _faint(GOOD), "line": {"width": 0}},
+            {**where, "x": _plain(time), "y": _plain(mean), "line": {"color": GOOD, "width": 1}},
+        ]  # fmt: skip
+        panels.panel(layout, index, len(names), f"{name}, {unit}")
+        layout[panels.axis_key(x)]["title"] = {"text": "time, s", "font": {"size": 11}, "standoff": 4}
+        ends = np.concatenate([low, high])
+        far = bulk(ends)
+        if far is not None:
+            labels = [f"{value:.3g}" for value in ends.tolist()]
+            traces += edge_marks(far, ends, [*time.tolist(), *time.tolist()], labels, axes=(x, y))
+            layout[panels.axis_key(y)]["range"] = [far.low, far.high]
+            beyond += int(far.beyond.sum())
+    return Figure(
+        title=f"The samples less their mean, {', '.join(names)}",
+        message="Some samples lie far off the rest: was the unit touched, or are readings false?"
+        if beyond
+        else "No sample lies far off the rest.",
+        caption="In equal blocks of time: shaded from the smallest to the largest sample, line: the mean. A unit at "
+        "rest shows a level band; a step or a bump is a disturbance, which the coefficients suffer from."
+        + edge_note(beyond),
+        traces=traces,
+        layout=layout,
+        height=panels.height(len(names)),
+    )
+
+
+def _faint(colour: str) -> str:
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},0.18)"
+
+
+def _plain(values: Any) -> list[float]:
+    return [float(f"{value:.5g}") for value in values]
+
+
+def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:
+    """Return column, coefficient, value, uncertainty and unit of everything that an analysis found."""
+    rows = []
+    for name, column in found["columns"].items():
+        for key, title in (
+            ("angle_random_walk", "angle random walk"),
+            ("bias_instability", "bias instability"),
+            ("rate_random_walk", "rate random walk"),
+            ("quantisation", "quantisation"),
+        ):
+            if key == "quantisation" and not _visible(column[key]):
+                continue
+            unit, factor = shown_unit(column["unit"], key)
+            texts = ("not determined", "")
+            if column[key]["value"] is not None:
+                texts = format_uncertain(*(column[key][part] * factor for part in ("value", "standard_uncertainty")))
+            label = (
+                title
+                if column["unit"] != "m/s^2"
+                else title.replace("angle", "velocity").replace("rate", "acceleration")
+            )
+            rows.append([name, label, *texts, unit])
+    return rows
+
+
+def _visible(found: dict[str, Any]) -> bool:
+    """Whether a coefficient is beyond three times its uncertainty."""
+    return found["value"] is not None and bool(found["value"] > 3 * found["standard_uncertainty"])
+
+
+def shown_unit(unit: str, key: str) -> tuple[str, float]:
+    """Return the engineering unit of a coefficient, and the factor from SI to it."""
+    hour = math.sqrt(_HOUR)
+    if unit == "rad/s":
+        return {
+            "angle_random_walk": ("deg/sqrt(h)", hour / _DEGREE),
+            "bias_instability": ("deg/h", _HOUR / _DEGREE),
+            "rate_random_walk": ("deg/h/sqrt(h)", _HOUR * hour / _DEGREE),
+            "quantisation": ("arcsec", _HOUR / _DEGREE),
+        }[key]
+    if unit == "m/s^2":
+        return {
+            "angle_random_walk": ("m/s/sqrt(h)", hour),
+            "bias_instability": ("ug", 1e6 / 9.80665),
+            "rate_random_walk": ("ug/sqrt(h)", 1e6 * hour / 9.80665),
+            "quantisation": ("mm/s", 1e3),
+        }[key]
+    return {
+        "angle_random_walk": (f"{unit}/sqrt(Hz)", 1.0),
+        "bias_instability": (unit, 1.0),
+        "rate_random_walk": (f"{unit}/sqrt(s)", 1.0),
+        "quantisation": (f"{unit} s", 1.0),
+    }[key]

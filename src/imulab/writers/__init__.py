@@ -1,0 +1,149 @@
+"""Recordings to native CSV and Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from imulab.atomic_write import replacing
+from imulab.errors import OptionError
+from imulab.recording import CORRECTED_BY, Recording
+from imulab.writers.decimals import decimal_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_ROWS_AT_ONCE = 65536
+_ROW_GROUP = 1 << 18
+
+
+def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
+    """Write a recording, or its consecutive blocks, as native CSV or Parquet by the ending of the name.
+
+    Numbers read back exactly; columns keep their names, order and units; metadata becomes head comments
+    ``# key: value`` or Parquet metadata. The file is written whole or not at all.
+
+    Raises
+    ------
+    OptionError
+        The name ends in neither .csv nor .parquet, or the file cannot be written there.
+    """
+    kind = Path(path).suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet")
+    with replacing(path) as stream:
+        (write_csv_to if kind == ".csv" else write_parquet_to)(blocks, stream)
+
+
+def check_writable(path: str) -> None:
+    """Check before the work that `write` can write a file of this name.
+
+    Raises
+    ------
+    OptionError
+        It cannot, or the library for it is not here.
+    """
+    kind = Path(path).suffix.lower()
+    if kind not in (".csv", ".parquet"):
+        raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet")
+    if kind == ".parquet":
+        _pyarrow()
+
+
+def write_csv(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
+    """Write a recording, or its consecutive blocks, as native CSV; see `write`.
+
+    Raises
+    ------
+    OptionError
+        The name does not end in .csv, or the file cannot be written there.
+    """
+    if Path(path).suffix.lower() != ".csv":
+        raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv")
+    write(blocks, path)
+
+
+def write_csv_to(blocks: Recording | Iterable[Recording], stream: BinaryIO) -> None:
+    """Write a recording, or its consecutive blocks, as native CSV to an open binary stream."""
+    head = True
+    for block in _several(blocks):
+        if head:
+            stream.write(_head(block).encode("utf-8"))
+            head = False
+        columns = list(block.columns.values())
+        for start in range(0, len(block), _ROWS_AT_ONCE):
+            part = [column[start : start + _ROWS_AT_ONCE] for column in columns]
+            stream.write(decimal_rows(np.column_stack(part)) if part else b"\n")
+
+
+def write_parquet_to(blocks: Recording | Iterable[Recording], stream: BinaryIO) -> None:
+    """Write a recording, or its consecutive blocks, as Parquet to an open binary stream.
+
+    Raises
+    ------
+    OptionError
+        The library for Parquet is not here.
+    """
+    arrow = _pyarrow()
+    from pyarrow import parquet
+
+    writer = None
+    waiting: list[Any] = []
+    try:
+        for block in _several(blocks):
+            titles = [_title(name, unit) for name, unit in block.units.items()]
+            table = arrow.table([arrow.array(column) for column in block.columns.values()], names=titles)
+            if writer is None:
+                table = table.replace_schema_metadata(_clean(block.metadata) | _corrected_by(block))
+                # Measured doubles hardly repeat: a dictionary costs time and saves nothing.
+                writer = parquet.ParquetWriter(stream, table.schema, compression="zstd", use_dictionary=False)
+            waiting.append(table.replace_schema_metadata(writer.schema.metadata))
+            if sum(part.num_rows for part in waiting) >= _ROW_GROUP:
+                writer.write_table(arrow.concat_tables(waiting))
+                waiting = []
+        if writer is not None and waiting:
+            writer.write_table(arrow.concat_tables(waiting))
+    finally:
+        if writer is not None:
+            writer.close()
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow
+    except ImportError:
+        raise OptionError("writing Parquet needs pyarrow, which is not here: pip install 'imulab[tables]'") from None
+    return pyarrow
+
+
+def _several(blocks: Recording | Iterable[Recording]) -> Iterator[Recording]:
+    yield from [blocks] if isinstance(blocks, Recording) else blocks
+
+
+def _title(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit != "1" else name
+
+
+def _clean(metadata: Mapping[str, str]) -> dict[str, str]:
+    return {_one_line(key): _one_line(value) for key, value in metadata.items()}
+
+
+def _corrected_by(recording: Recording) -> dict[str, str]:
+    return {CORRECTED_BY: "\n".join(map(_one_line, recording.corrected_by))} if recording.corrected_by else {}
+
+
+def _head(recording: Recording) -> str:
+    for name in recording.columns:
+        if not name or set(name) & set(',"[]#\r\n') or name != name.strip():
+            raise OptionError(f"{recording.name}: column name {name!r} cannot be written to CSV")
+    pairs = [*_clean(recording.metadata).items(), *((CORRECTED_BY, _one_line(one)) for one in recording.corrected_by)]
+    comments = "".join(f"# {key}: {value}\n" for key, value in pairs)
+    titles = ",".join(_title(name, unit) for name, unit in recording.units.items())
+    return f"{comments}{titles}\n"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.splitlines())
