@@ -17,10 +17,10 @@ from imulab.procedures.centrifuge.manifest import Manifest, Run
 from imulab.procedures.centrifuge.simulate import Simulation, Truth, typical_truth
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
 from imulab.procedures.gyro_array.model import find_elements
+from imulab.procedures.reports import compare_records
 from imulab.procedures.tumble.gyro import fit_gyro
 from imulab.procedures.tumble.plan import plan_tumble
 from imulab.recording import Recording
-from imulab.records.comparison import compare_records
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from reference import tumble as reference

@@ -16,7 +16,8 @@ from imulab.device.tables import pack
 from imulab.device.unit import ArraySettings, Stream, Unit, array_table
 from imulab.exporters import export
 from imulab.exporters.c import _header
-from imulab.procedures.device_tables import MODELS, tables_of
+from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.warmup.model import MODELS
 
 G = madeup.G
 MANY = 1_000_000

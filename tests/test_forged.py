@@ -10,11 +10,12 @@ import pytest
 import imulab as il
 import madeup
 from imulab.cli import main
-from imulab.device.blob import load_blob, tables_of_all
+from imulab.device.blob import load_blob
 from imulab.device.tables import pack
 from imulab.errors import RecordError
 from imulab.exporters import ExportOptions
 from imulab.procedures.tumble.simulate import simulate_tumble
+from imulab.procedures.unit_tables import tables_of_all
 from imulab.recording import Recording
 from imulab.records.calibration import loads
 from imulab.records.json_text import content_sha256

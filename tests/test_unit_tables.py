@@ -11,7 +11,9 @@ import madeup
 from imulab.device.tables import KINDS, pack
 from imulab.device.unit import ArraySettings, Unit, array_table
 from imulab.errors import RecordError
-from imulab.procedures.device_tables import monotone_range, tables_of, warmup_table
+from imulab.procedures.tumble.device import monotone_range
+from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.warmup.device import warmup_table
 from imulab.records.calibration import Parameter
 
 

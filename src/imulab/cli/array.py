@@ -185,7 +185,7 @@ def calibrate(
 ) -> None:
     """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
     from imulab.cli.tumble import finish
-    from imulab.procedures.tasks import run_task
+    from imulab.procedures.run import run_task
 
     check_outputs([output, report], [name for name in (still, moving, layout) if name])
     files = [still] if moving is None else [still, moving]

@@ -90,8 +90,7 @@ def _those(names: Sequence[str], working: Sequence[str]) -> str:
 
 def write(record: Calibration, output: str | None, report: str | None) -> None:
     """Write record and report, both or none."""
-    from imulab.procedures.reports import exhibits_of
-    from imulab.report import render
+    from imulab.procedures.reports import rendered
 
     with ExitStack() as stack:
         to_record = stack.enter_context(replacing(output)) if output else None
@@ -99,4 +98,4 @@ def write(record: Calibration, output: str | None, report: str | None) -> None:
         if to_record:
             to_record.write(record.to_json().encode("utf-8"))
         if to_report:
-            to_report.write(render(record, exhibits_of(record)).encode("utf-8"))
+            to_report.write(rendered(record).encode("utf-8"))

@@ -179,7 +179,7 @@ def reduce(
 
     from imulab.cli.tumble import finish
     from imulab.procedures.centrifuge.manifest import load_manifest
-    from imulab.procedures.tasks import run_task
+    from imulab.procedures.run import run_task
 
     test = load_manifest(manifest)
     files = [str(Path(manifest).parent / run.file) for run in test.runs]

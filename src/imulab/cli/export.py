@@ -40,7 +40,7 @@ def export(
     """Write calibration records in the form of firmware, an autopilot or a toolbox."""
     from imulab.exporters import EXPORTERS, ExportOptions
     from imulab.exporters import export as write
-    from imulab.procedures.device_tables import tables_of
+    from imulab.procedures.unit_tables import tables_of
     from imulab.records.calibration import load
     from imulab.verdict import SENTENCES
 

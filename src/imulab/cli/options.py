@@ -75,7 +75,7 @@ def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recor
 
 
 class GivenFiles:
-    """Access to the files that a command names, for `imulab.procedures.tasks`."""
+    """Access to the files that a command names, for `imulab.procedures`."""
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Read a recording as a whole, and warn where it was cut."""

@@ -201,8 +201,8 @@ def _show_formats(names: list[str]) -> None:
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:
     from imulab.cli.show import describe_changes
+    from imulab.procedures.reports import compare_records
     from imulab.records.calibration import load
-    from imulab.records.comparison import compare_records
 
     records = [load(first), load(second)]
     comparison = compare_records(*records)

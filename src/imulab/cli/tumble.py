@@ -187,7 +187,7 @@ def fit(
 
     Prints what was found; -o writes the calibration record, --report its figures.
     """
-    from imulab.procedures.tasks import run_task
+    from imulab.procedures.run import run_task
 
     check_outputs([output, report], [name for name in (file, layout, prior) if name])
     options = {
@@ -225,8 +225,7 @@ def finish(
 ) -> None:
     """Write a record and its report, both or none, and say what was found, in full or as `describe` has it."""
     from imulab.atomic_write import replacing
-    from imulab.procedures.reports import exhibits_of
-    from imulab.report import render
+    from imulab.procedures.reports import rendered
 
     with ExitStack() as stack:
         # Both files are opened before either is finished, so that neither is left alone behind an error.
@@ -235,7 +234,7 @@ def finish(
         if to_record:
             to_record.write(record.to_json().encode("utf-8"))
         if to_report:
-            to_report.write(render(record, exhibits_of(record)).encode("utf-8"))
+            to_report.write(rendered(record).encode("utf-8"))
     if json:
         print(record.to_json(), end="")
     else:

@@ -209,7 +209,7 @@ def fit(
     Prints the comparison of the models; -o writes the calibration record, --report its figures.
     """
     from imulab.cli.tumble import finish
-    from imulab.procedures.tasks import run_task
+    from imulab.procedures.run import run_task
 
     check_outputs([output, report], [*files, *([layout] if layout else [])])
     options = {

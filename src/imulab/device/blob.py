@@ -14,7 +14,6 @@ from imulab.device.tables import KINDS, TEXT, Table, pack
 from imulab.device.unit import Unit
 from imulab.errors import RecordError
 from imulab.printable import first_hidden
-from imulab.procedures.device_tables import tables_of
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
 from imulab.records.shape import check_blob_text
 
@@ -47,25 +46,6 @@ def make_blob(records: Sequence[Calibration], tables: Sequence[Table]) -> bytes:
         "sections": [{"kind": table.kind, **table.columns} for table in tables],
     }
     return pack(tables, 4, plain_values(text, ""))
-
-
-def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[Table]:
-    """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
-
-    Raises
-    ------
-    RecordError
-        Two records give the same section, or are of different units.
-    """
-    serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
-    if len(serials) > 1:
-        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
-    tables = [table for record in records for table in tables_of(record, fusion)]
-    kinds = [table.kind for table in tables]
-    twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
-    if twice:
-        raise RecordError(f"two records give a {twice[0]} table; a unit has one")
-    return tables
 
 
 def is_blob(path: str | Path) -> bool:

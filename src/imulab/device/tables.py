@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import RecordError
-from imulab.records.calibration import BLOB_MAGIC
+from imulab.recording import Array
+from imulab.records.calibration import BLOB_MAGIC, Calibration
 
 VERSION = 1
 TEXT = 0
@@ -82,3 +83,46 @@ def pack(tables: Sequence[Table], width: int, text: Mapping[str, Any] | None = N
     body = b"".join(struct.pack("<II", kind, len(payload)) + payload for kind, payload in sections)
     head = BLOB_MAGIC + struct.pack("<HHI", VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4)
     return head + body + struct.pack("<I", zlib.crc32(head + body))
+
+
+def whole(value: int) -> NDArray[np.int64]:
+    """Return a whole number as the value of a field."""
+    return np.array(int(value), dtype=np.int64)
+
+
+def values_of(record: Calibration, names: Sequence[str], unit: str) -> Array:
+    """Return the values of parameters, in this unit.
+
+    Raises
+    ------
+    RecordError
+        One is in another unit.
+    KeyError
+        The record lacks one.
+    """
+    values = []
+    for name in names:
+        parameter = record.parameters[name]
+        if parameter.unit != unit:
+            raise RecordError(f"the record has {name} in {parameter.unit!r}, expected {unit!r}")
+        values.append(parameter.value)
+    return np.array(values, dtype=np.float64)
+
+
+def nonzero(scale: Array) -> Array:
+    """Return scale factors; none is 0.
+
+    Raises
+    ------
+    RecordError
+        One is.
+    """
+    if not (scale != 0).all():
+        raise RecordError("the record has a scale factor of 0")
+    return scale
+
+
+def field_of(table: Table, name: str) -> NDArray[Any]:
+    """Return the values of a table's field."""
+    (values,) = [field.values for field in table.fields if field.name == name]
+    return np.asarray(values)

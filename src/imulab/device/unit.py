@@ -32,7 +32,7 @@ class Unit:
     Parameters
     ----------
     blob
-        The bytes of `imulab.procedures.device_tables.pack`, or of an exported blob.
+        The bytes of `imulab.device.tables.pack`, or of an exported blob.
 
     Raises
     ------

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imulab.atomic_write import replacing
-from imulab.device.blob import make_blob, tables_of_all
+from imulab.device.blob import make_blob
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
+from imulab.procedures.unit_tables import tables_of_all
 from imulab.records.calibration import Calibration
 
 

@@ -18,7 +18,7 @@ from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions
 from imulab.printable import printable
-from imulab.procedures.refit import linear_record
+from imulab.procedures.registry import procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import plain_number
@@ -28,11 +28,6 @@ AXES = "xyz"
 _CROSS = ("k_xy", "k_yz", "k_zx")
 _NEGLIGIBLE = 1e-6
 _GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
-_ELSEWHERE = {
-    "warmup": "{target} has no parameter that follows the time since power-on",
-    "gyro_array": "{target} fuses no array of gyroscopes",
-    "centrifuge": "{target} has no parameter for drift that depends on acceleration",
-}
 
 
 @dataclass(frozen=True)
@@ -109,12 +104,11 @@ def one_unit(records: Sequence[Calibration], target: str) -> Unit:
         The record lacks a parameter.
     """
     for record in records:
-        if record.procedure != "tumble":
-            reason = _ELSEWHERE.get(record.procedure, "{target} cannot hold it").format(target=target)
-            if record.procedure == "warmup" and target in ("px4", "ardupilot"):
-                reason += ", only ones that follow temperature"
+        reason = procedure_of(record).elsewhere
+        if reason is not None:
             raise OptionError(
-                f"{target}: a {record.procedure} record cannot be exported: {reason}; use --to c or --to blob"
+                f"{target}: a {record.procedure} record cannot be exported: {reason.format(target=target)}; "
+                "use --to c or --to blob"
             )
     if len(records) != 1:
         raise OptionError(f"{target}: expected one tumble record, found {len(records)}")
@@ -228,7 +222,8 @@ def held_accelerometers(
     if error <= _NEGLIGIBLE * STANDARD_GRAVITY:
         return accel, error, []
     what = "bias, scale factor and misalignment" if misalignment else "bias and scale factor"
-    record = linear_record(unit.record, misalignment=misalignment)
+    refit = procedure_of(unit.record).refit
+    record = None if refit is None else refit(unit.record, misalignment=misalignment)
     if record is None:
         held = unit.record.data.get("attitudes")
         why = (

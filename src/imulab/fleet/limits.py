@@ -15,7 +15,7 @@ from typing import Any
 
 from imulab.errors import ReadError, UnitError, listed
 from imulab.fleet.display import to_parameter_unit
-from imulab.procedures.tasks import TASKS
+from imulab.procedures.registry import PROCEDURES
 from imulab.toml import load_toml
 
 
@@ -47,8 +47,8 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
     table = load_toml(path, str(path), "limits")
     found: dict[tuple[str, str], Limits] = {}
     for procedure, entries in table.items():
-        if procedure not in TASKS:
-            raise ReadError(f"{path}: unknown procedure {procedure!r}; known procedures: {listed(TASKS, procedure)}")
+        if procedure not in PROCEDURES:
+            raise ReadError(f"{path}: unknown procedure {procedure!r}; known procedures: {listed(PROCEDURES, procedure)}")
         if not isinstance(entries, dict):
             raise ReadError(f'{path}: {procedure}: expected lines such as bias_x = {{ upper = 20, unit = "mg" }}')
         known = [name for owner, name in units if owner == procedure]

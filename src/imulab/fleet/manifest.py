@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from imulab.errors import OptionError, ReadError, listed
 from imulab.fleet.sources import local_file, parent_of
-from imulab.procedures.tasks import TASKS
+from imulab.procedures.registry import PROCEDURES
 
 COLUMNS = ("serial", "procedure", "file")
 _SERIAL = re.compile(r"[^\W_][\w .+=@()-]*")
@@ -39,7 +39,7 @@ class FleetManifest:
 
 def modules_of(fleet: FleetManifest) -> list[str]:
     """Return the modules that those need who work on a fleet."""
-    needed = dict.fromkeys(name for unit in fleet.units for name in TASKS[unit.procedure].modules)
+    needed = dict.fromkeys(name for unit in fleet.units for name in PROCEDURES[unit.procedure].task.modules)
     return ["imulab.fleet.work", *needed]
 
 
@@ -134,7 +134,7 @@ def _check_columns(titles: Sequence[str], name: str) -> None:
         if title not in titles:
             found = " ".join(titles)
             raise OptionError(f"{name}: no column {title}; found {found if len(found) < 300 else found[:300] + ' ...'}")
-    known = [*COLUMNS, *dict.fromkeys(option for task in TASKS.values() for option in task.options)]
+    known = [*COLUMNS, *dict.fromkeys(option for entry in PROCEDURES.values() for option in entry.task.options)]
     for index, title in enumerate(titles):
         if title.replace("-", "_") not in known:
             raise OptionError(f"{name}: unknown column {title!r}; known columns: {listed(known, title)}")
@@ -145,11 +145,11 @@ def _check_columns(titles: Sequence[str], name: str) -> None:
 def _unit(place: str, cells: Mapping[str, str]) -> Unit:
     serial, procedure = cells["serial"], cells["procedure"]
     _check_serial(serial, place)
-    if procedure not in TASKS:
+    if procedure not in PROCEDURES:
         raise OptionError(
-            f"{place}, column procedure: unknown procedure {procedure!r}; known procedures: {listed(TASKS, procedure)}"
+            f"{place}, column procedure: unknown procedure {procedure!r}; known procedures: {listed(PROCEDURES, procedure)}"
         )
-    task = TASKS[procedure]
+    task = PROCEDURES[procedure].task
     files = tuple(file.strip() for file in cells["file"].split(";"))
     fewest, most = task.count
     if not all(files) or len(files) < fewest or (most is not None and len(files) > most):

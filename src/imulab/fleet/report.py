@@ -22,12 +22,12 @@ from imulab.fleet.statistics import (
 )
 from imulab.fleet.store import Store
 from imulab.fleet.work import Summary
+from imulab.procedures.registry import PROCEDURES
 from imulab.report import render_page
 from imulab.report.elements import Exhibits, Figure, Table
 
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
-_TITLES = {"tumble": "Tumble", "array": "Gyro array", "warmup": "Warm-up", "centrifuge": "Centrifuge"}
 
 
 def write_fleet_report(folder: str, output: str, *, limits: str | None = None, history: str | None = None) -> None:
@@ -114,7 +114,7 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
         said.append(f"{_named(sorted(moved))} changed since the last calibration")
     items: list[Figure | Table | None] = [reporttables.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
-        title = _TITLES.get(procedure, procedure)
+        title = PROCEDURES[procedure].line_title
         mine = [item for item in statistics if item.procedure == procedure]
         enough = max(len(item.values) for item in mine) >= _FEWEST_TO_DRAW
         items += [

@@ -20,7 +20,7 @@ from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
 from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, summarise
-from imulab.procedures.tasks import TASKS
+from imulab.procedures.registry import PROCEDURES
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""
@@ -154,7 +154,7 @@ def read_by(fleet: FleetManifest) -> dict[str, str]:
         return {}
     found = {_full(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
     for unit in fleet.units:
-        paths = [unit.options[key] for key in TASKS[unit.procedure].paths if key in unit.options]
+        paths = [unit.options[key] for key in PROCEDURES[unit.procedure].task.paths if key in unit.options]
         for name in (*unit.files, *paths):
             if not is_url(name):
                 found[_full(os.path.join(fleet.base, name))] = name  # noqa: PTH118

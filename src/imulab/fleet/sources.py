@@ -143,7 +143,7 @@ def sha256_of(path: Path, name: str) -> str:
 
 
 class UnitFiles:
-    """Access to one unit's files for `imulab.procedures.tasks`; remembers the hash of each and what the first head says.
+    """Access to one unit's files for `imulab.procedures`; remembers the hash of each and what the first head says.
 
     Attributes
     ----------

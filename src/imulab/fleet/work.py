@@ -12,7 +12,7 @@ from imulab.errors import ImulabError
 from imulab.fleet.manifest import Unit
 from imulab.fleet.sources import UnitFiles
 from imulab.fleet.store import MOST_ATTEMPTS, Store, asked_of
-from imulab.procedures.tasks import run_task
+from imulab.procedures.run import run_task
 from imulab.records.calibration import Calibration, Parameter
 
 DONE, KEPT, FAILED, LEFT = "done", "kept", "failed", "left"

@@ -1,12 +1,9 @@
-"""Records and blobs to corrected recordings: the C core does the arithmetic, one dispatch over its sections.
-
-Not named after its function: a submodule ``imulab.apply`` would take the place of ``imulab.apply()`` once imported.
-"""
+"""Records and blobs to corrected recordings: the C core does the arithmetic, the registry knows each section."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from typing import Any
@@ -14,26 +11,14 @@ from typing import Any
 from imulab.device.blob import Blob
 from imulab.device.unit import Unit
 from imulab.errors import DataError, RecordError
-from imulab.procedures.centrifuge.apply import apply_centrifuge, beyond_levels, highest_force
-from imulab.procedures.device_tables import tables_of
-from imulab.procedures.tumble.apply import apply_gyro, apply_tumble, beyond_test
-from imulab.procedures.warmup.apply import apply_warmup, record_table, unchanged
-from imulab.procedures.warmup.poweron import LATEST_START
+from imulab.procedures.procedure import Section
+from imulab.procedures.registry import procedure_of, section
+from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
-from imulab.units import from_si
 from imulab.verdict import SENTENCES, Note
 
 _FAR_IN_TEMPERATURE = 20.0
-
-_Correct = Callable[[Unit, Mapping[str, Any], Recording], Recording]
-_APPLY: dict[str, _Correct] = {
-    "tumble": apply_tumble,
-    "gyro": apply_gyro,
-    "centrifuge": apply_centrifuge,
-    "warmup": apply_warmup,
-}
-_BEYOND = {"tumble": beyond_test, "centrifuge": beyond_levels}
 
 
 @dataclass(frozen=True)
@@ -55,15 +40,13 @@ class Loaded:
     """
 
     unit: Unit
-    sections: tuple[tuple[str, Mapping[str, Any]], ...]
+    sections: tuple[tuple[Section, Mapping[str, Any]], ...]
     name: str
     holds: tuple[str, ...]
     again: bool = False
 
 
-def loaded(
-    record: Calibration | Blob, name: str | None = None, *, again: bool = False, latest_start: float = LATEST_START
-) -> Loaded:
+def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool = False, **columns: Any) -> Loaded:
     """Return a record (in double) or a blob (with its floats) ready to run.
 
     Parameters
@@ -74,38 +57,34 @@ def loaded(
         What the corrected recording calls it; procedure and serial number, or the blob's file, if not given.
     again
         Whether to correct a recording a second time.
-    latest_start
-        A recording that starts later after power-on is refused by a warm-up table, s.
+    columns
+        What the command says to the sections: `latest_start` (a recording that starts later after power-on is refused
+        by a warm-up table, s).
 
     Raises
     ------
     RecordError
         There is nothing to apply in it, or it lacks a parameter.
     """
-
-    def started(kind: str, columns: Mapping[str, Any]) -> tuple[str, Mapping[str, Any]]:
-        return kind, {**columns, "latest_start": latest_start} if kind == "warmup" else columns
-
     if isinstance(record, Blob):
-        # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
-        sections = [
-            started(str(section["kind"]), section) for section in record.text["sections"] if section["kind"] != "array"
-        ]
-        unknown = [kind for kind, _ in sections if kind not in _APPLY]
+        given = [(str(entry["kind"]), entry) for entry in record.text["sections"]]
+        known = [(section(kind), {**entry, **columns}) for kind, entry in given]
+        unknown = [kind for (kind, _), (found, _) in zip(given, known, strict=True) if found is None]
         if unknown:
             raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
-        if not sections:
+        # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
+        chain = tuple((found, entry) for found, entry in known if found is not None and found.apply is not None)
+        if not chain:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         holds = (sha256(record.data).hexdigest(), *map(str, record.text.get("records", ())))
-        return Loaded(Unit(record.data), tuple(sections), name or record.name, holds, again)
-    if record.procedure == "gyro_array":
-        raise RecordError("a gyro_array record cannot be applied: 'imulab array fuse --calibration' takes it")
-    if record.procedure == "warmup":
-        record_table(record)  # says in words what the core would refuse by a number
+        return Loaded(Unit(record.data), chain, name or record.name, holds, again)
+    made_by = procedure_of(record)
+    if made_by.not_applied:
+        raise RecordError(f"a {record.procedure} record cannot be applied: {made_by.not_applied}")
     tables = tables_of(record)
-    known = name or f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
-    corrections = tuple(started(table.kind, table.columns) for table in tables)
-    return Loaded(Unit.of(*tables), corrections, known, (record.sealed()[0],), again)
+    called = name or f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
+    chain = tuple((made_by.section(table.kind), {**table.columns, **columns}) for table in tables)
+    return Loaded(Unit.of(*tables), chain, called, (record.sealed()[0],), again)
 
 
 def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: bool = False) -> Recording:
@@ -131,8 +110,9 @@ def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: b
             "expected the recording as it was measured, or --again (again=True)"
         )
     corrected = recording
-    for kind, columns in sections_for(ready.sections, recording):
-        corrected = _APPLY[kind](ready.unit, columns, corrected)
+    for part, columns in sections_for(ready.sections, recording):
+        assert part.apply is not None
+        corrected = part.apply(ready.unit, columns, corrected)
     if corrected is recording:
         return recording
     return replace(corrected, corrected_by=(*recording.corrected_by, f"{ready.name} sha256:{ready.holds[0]}"))
@@ -147,10 +127,10 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
         None of the records corrects anything in it; and what `apply` raises.
     """
     chain = [record if isinstance(record, Loaded) else loaded(record) for record in records]
-    warm_up = any(kind == "warmup" for ready in chain for kind, _ in ready.sections)
+    since_power_on = any(part.since_power_on for ready in chain for part, _ in ready.sections)
     end = -math.inf
     for number, given in enumerate(blocks):
-        if warm_up and given.time is not None and len(given):  # within a block `apply` looks itself
+        if since_power_on and given.time is not None and len(given):  # within a block `apply` looks itself
             if not given.time[0] > end:
                 raise DataError(
                     f"{given.name}: {given.place(0)}, column time: time does not rise: expected more than {end:.9g} s, "
@@ -167,35 +147,33 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
 
 def _why_unchanged(chain: Iterable[Loaded], recording: Recording) -> Iterator[str]:
     for ready in chain:
-        for kind, columns in ready.sections:
-            if kind == "warmup" and (message := unchanged(columns, recording)):
+        for part, columns in ready.sections:
+            if part.unchanged is not None and (message := part.unchanged(columns, recording)):
                 yield message
 
 
 def sections_for(
-    sections: Iterable[tuple[str, Mapping[str, Any]]], recording: Recording
-) -> list[tuple[str, Mapping[str, Any]]]:
+    sections: Sequence[tuple[Section, Mapping[str, Any]]], recording: Recording
+) -> Sequence[tuple[Section, Mapping[str, Any]]]:
     """Return the sections that a recording has the columns for, where it has those of one triad of two."""
-    absent = {kind for kind, triad in (("tumble", "accel"), ("gyro", "gyro")) if not _has_any(recording, triad)}
-    kept = [section for section in sections if section[0] not in absent]
-    return kept or list(sections)  # with nothing to correct, the section itself says which columns it expects
+    kept = [part for part in sections if part[0].triad is None or _has_any(recording, part[0].triad)]
+    return kept or sections  # with nothing to correct, the section itself says which columns it expects
 
 
 def _has_any(recording: Recording, triad: str) -> bool:
     return any(f"{triad}_{axis}" in recording for axis in "xyz")
 
 
-def _missing_triad(record: Calibration | Blob, recording: Recording) -> list[str]:
+_SENSORS = {"accel": "accelerometers", "gyro": "gyroscopes"}
+
+
+def _parts(record: Calibration | Blob) -> list[tuple[Section | None, Mapping[str, Any]]]:
+    """The sections of a record or blob, with what each says of its columns."""
     if isinstance(record, Blob):
-        kinds = {str(section["kind"]) for section in record.text["sections"]}
-    else:
-        kinds = {"tumble", "gyro"} if "gyro_bias_x" in record.parameters else set()
-    triads = {"accel": "accelerometers", "gyro": "gyroscopes"}
-    absent = [triad for triad in triads if not _has_any(recording, triad)]
-    if not {"tumble", "gyro"} <= kinds or len(absent) != 1:
+        return [(section(str(entry["kind"])), entry) for entry in record.text["sections"]]
+    if procedure_of(record).not_applied:
         return []
-    (there,) = triads.keys() - set(absent)
-    return [Note(f"{recording.name}: no {triads[absent[0]]} in it: its {triads[there]} alone are corrected")]
+    return [(section(table.kind), table.columns) for table in tables_of(record)]
 
 
 def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
@@ -208,22 +186,16 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
         mine, its = sensor.get(key), recording.metadata.get(key)
         if mine and its and mine != its:
             found.append(f"{recording.name}: {key} {its}, but the record was made for {mine}")
-    found += _missing_triad(record, recording)
-    messages = []
-    for columns in _warmup_columns(record):
-        there = [axis for axis in columns["axes"] if axis in recording]
-        if message := unchanged(columns, recording):
-            messages.append(message)
-        elif 0 < len(there) < len(columns["axes"]):
-            absent = [axis for axis in columns["axes"] if axis not in there]
-            messages.append(
-                Note(
-                    f"{recording.name}: no {' '.join(absent)} in it: {' '.join(there)} alone are corrected for warm-up"
-                )
-            )
-    if isinstance(record, Blob) or record.procedure == "warmup":
-        return [*found, *messages]
-    made = record.model.get("temperature")
+    parts = [(part, columns) for part, columns in _parts(record) if part is not None]
+    triads = [part.triad for part, _ in parts if part.triad]
+    absent = [triad for triad in triads if not _has_any(recording, triad)]
+    if absent and len(absent) < len(triads):
+        there = " and ".join(_SENSORS[triad] for triad in triads if triad not in absent)
+        missing = " and ".join(_SENSORS[triad] for triad in absent)
+        found.append(Note(f"{recording.name}: no {missing} in it: its {there} alone are corrected"))
+    for part, columns in parts:
+        found += [] if part.remarks is None else part.remarks(columns, recording)
+    made = None if isinstance(record, Blob) else record.model.get("temperature")
     here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
         return found
@@ -234,27 +206,15 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     ]
 
 
-def _warmup_columns(record: Calibration | Blob) -> list[Mapping[str, Any]]:
-    """What the sections of the record's or blob's warm-up tables say of themselves."""
-    if isinstance(record, Blob):
-        return [section for section in record.text["sections"] if section["kind"] == "warmup"]
-    return [table.columns for table in tables_of(record)] if record.procedure == "warmup" else []
-
-
 def beyond_test_of(record: Calibration | Blob, recording: Recording) -> tuple[int, float]:
     """Return how many samples lie far beyond what the record was made at, and the largest, m/s^2."""
-    if isinstance(record, Blob):
-        return 0, 0.0
-    beyond = _BEYOND.get(record.procedure)
-    return (0, 0.0) if beyond is None else beyond(record, recording)
+    beyond = None if isinstance(record, Blob) else procedure_of(record).beyond
+    return (0, 0.0) if beyond is None or isinstance(record, Blob) else beyond(record, recording)
 
 
 def beyond_message(record: Calibration | Blob, count: int, largest: float) -> str:
     """Say that `count` samples, up to `largest`, m/s^2, lie beyond what the record was made at."""
-    most = f"{from_si(largest, 'g'):.1f} g"
-    if isinstance(record, Calibration) and record.procedure == "centrifuge":
-        return (
-            f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {most}), the highest level "
-            "of the record's test: K(a) is extrapolated there"
-        )
-    return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"
+    assert not isinstance(record, Blob)
+    message = procedure_of(record).beyond_message
+    assert message is not None
+    return message(record, count, largest)

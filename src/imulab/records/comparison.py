@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +16,6 @@ from imulab.records.calibration import Calibration
 _FALSE_ALARM = 0.05
 _SINGULAR = 1e-9
 """Eigenvalues of the correlations below this share of the largest belong to parameters that follow from others."""
-_OF_A_LEVEL = re.compile(r"_(K|zeta|cross)_\d+$")
-_SAME_LEVEL = 0.01
 _ALIKE = {"degC": (1.0, 0.0), "s": (0.0, 0.1)}
 """Quantities of two models count as different beyond this, absolute and relative; others beyond 1e-6 relative."""
 
@@ -62,11 +59,14 @@ class Comparison:
     models: tuple[str, ...] = ()
 
 
-def compare_records(first: Calibration, second: Calibration) -> Comparison:
+def compared(
+    first: Calibration, second: Calibration, same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
+) -> Comparison:
     """Compare two records of one unit by one procedure, in units of their combined uncertainty.
 
     A change counts as significant where it exceeds what chance gives one of all the parameters in twenty comparisons
     (Bonferroni), by Student's t where a noise was estimated. A parameter without an uncertainty is shown, not judged.
+    `same_meaning` says whether a parameter means the same in both, where its name does not.
 
     Raises
     ------
@@ -78,7 +78,11 @@ def compare_records(first: Calibration, second: Calibration) -> Comparison:
             f"cannot compare a {first.procedure} record with a {second.procedure} record; expected two of one procedure"
         )
     _check_units(first, second)
-    shared = [name for name in first.parameters if name in second.parameters and _same_meaning(name, first, second)]
+    shared = [
+        name
+        for name in first.parameters
+        if name in second.parameters and (same_meaning is None or same_meaning(name, first, second))
+    ]
     judged = [name for name in shared if _uncertainty(name, first, second)]
     if not judged:
         raise RecordError("a record without uncertainties cannot be compared")
@@ -129,16 +133,6 @@ def _quantity_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -
     absolute, relative = _ALIKE.get(unit, (0.0, 1e-6))
     if unit == second["unit"] and abs(values[0] - values[1]) > absolute + relative * max(map(abs, values)):
         yield f"{values[0]:.7g} and {values[1]:.7g} {unit}"
-
-
-def _same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
-    """Whether a parameter is of the same thing: those of a level are numbered, whatever the level."""
-    if not _OF_A_LEVEL.search(name):
-        return True
-    levels = [[level["specific_force"]["value"] for level in r.sections.get("levels", ())] for r in (first, second)]
-    return len(levels[0]) == len(levels[1]) and all(
-        abs(a - b) <= _SAME_LEVEL * abs(a) for a, b in zip(*levels, strict=True)
-    )
 
 
 def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | None:

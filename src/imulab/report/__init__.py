@@ -10,30 +10,22 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
-from imulab.atomic_write import write_text
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits, Figure, Table
 from imulab.report.narrow import narrow
 from imulab.verdict import SENTENCES, Verdict
 
-_TITLES = {
-    "tumble": "Tumble calibration",
-    "gyro_array": "Gyro array",
-    "warmup": "Warm-up table",
-    "centrifuge": "Centrifuge test",
-}
 _HEADS = {"good": "Good", "look": "Look first", "bad": "Stop"}
 _LINK = re.compile(r"<(?=\s*/?\s*a\b)", re.IGNORECASE)
 _NUMBER = re.compile(r"[<>±+−-]?\s?\d[\d.,]*(?:e[-+]?\d+)?(?![\w.-])|nan\b")
 
 
-def render(record: Calibration, exhibits: Exhibits) -> str:
+def render(record: Calibration, exhibits: Exhibits, title: str) -> str:
     """Return the report of a record as HTML text."""
     return render_page(
-        _TITLES.get(record.procedure, record.procedure.capitalize()),
+        title,
         record.sensor.get("serial", "unit without serial number"),
         exhibits,
         verdict=record.verdict,
@@ -106,17 +98,6 @@ def render_index(title: str, lead: str, cards: list[Card]) -> str:
             title=title, lead=lead, cards=cards, draw=_draw([card.figure for card in cards]), plotly=_plotly()
         )
     )
-
-
-def write(record: Calibration, exhibits: Exhibits, path: str | Path) -> None:
-    """Write the report of a record, whole or not at all.
-
-    Raises
-    ------
-    OptionError
-        The file cannot be written there.
-    """
-    write_text(path, render(record, exhibits))
 
 
 @cache

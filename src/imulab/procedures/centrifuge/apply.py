@@ -61,6 +61,14 @@ def beyond_levels(record: Calibration, recording: Recording) -> tuple[int, float
     return int(np.count_nonzero(size > _BEYOND * top)), float(size.max(initial=0.0))
 
 
+def beyond_message(record: Calibration, count: int, largest: float) -> str:
+    """Say that so many samples, the largest in m/s^2, lie beyond the highest level."""
+    return (
+        f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {from_si(largest, 'g'):.1f} g), "
+        "the highest level of the record's test: K(a) is extrapolated there"
+    )
+
+
 def highest_force(record: Calibration) -> float:
     """Return the specific force of the highest level, m/s^2.
 

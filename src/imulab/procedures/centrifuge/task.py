@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import ReadError
-from imulab.procedures.task import Files, Task, source_of
+from imulab.procedures.procedure import Files, Task, source_of
 
 if TYPE_CHECKING:
     from imulab.recording import Source
@@ -49,7 +49,6 @@ def _centrifuge_fit(
 
 
 TASK = Task(
-    procedure="centrifuge",
     files="the manifest of one test",
     count=(1, 1),
     options=("method", "curve", "layout"),

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
-from imulab.procedures.task import Files, Task
+from imulab.procedures.procedure import Files, Task
 from imulab.quantities import chosen, interval, quantity
 
 if TYPE_CHECKING:
@@ -66,7 +66,6 @@ def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
 
 
 TASK = Task(
-    procedure="gyro_array",
     files="STILL, or STILL;MOVING",
     count=(1, 2),
     options=("interval", "averaging", "method", "memory", "layout", "topic", "instance", "window"),

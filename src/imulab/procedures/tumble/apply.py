@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.device.unit import Unit
 from imulab.errors import DataError, UnitError
-from imulab.procedures.device_tables import tables_of
+from imulab.procedures.tumble.device import tables_of
 from imulab.procedures.tumble.model import AXES
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
@@ -115,3 +115,9 @@ def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
     reading = np.abs(recording.triad("accel") * factor / scale - bias)
     largest = np.where(np.isfinite(reading), reading, 0.0).max(axis=1, initial=0.0)
     return int(np.count_nonzero(largest > _FAR * STANDARD_GRAVITY)), float(largest.max(initial=0.0))
+
+
+def beyond_message(record: Calibration, count: int, largest: float) -> str:
+    """Say that so many samples, the largest in m/s^2, lie beyond what shows the nonlinearity."""
+    most = f"{from_si(largest, 'g'):.1f} g"
+    return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"

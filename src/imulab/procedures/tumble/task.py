@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import DataError, OptionError, RecordError
-from imulab.procedures.task import Files, Task
+from imulab.procedures.procedure import Files, Task
 from imulab.quantities import chosen, quantity, whole_number
 from imulab.units import STANDARD_GRAVITY
 
@@ -134,7 +134,6 @@ def _prior(file: str, recording: Recording, access: Files) -> Calibration:
 
 
 TASK = Task(
-    procedure="tumble",
     files="one recording or table of attitudes",
     count=(1, 1),
     options=(

@@ -15,6 +15,7 @@ from imulab.procedures.warmup.poweron import LATEST_START, check_clock, check_st
 from imulab.recording import Array, Recording, check_time
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor
+from imulab.verdict import Note
 
 _TICK, _LONG, _LONG_TICK = 1e-6, 2000.0, 1e-4  # s: the core counts time in ticks, 2^32 of them
 _LAST_TICK = 2**32 - 1
@@ -128,6 +129,17 @@ def unchanged(columns: Mapping[str, Any], recording: Recording) -> str | None:
             f"({ends:g} s): nothing corrected"
         )
     return None
+
+
+def remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
+    """Return what a user should know about correcting a recording: why it stays as it is, or which axes it lacks."""
+    if message := unchanged(columns, recording):
+        return [message]
+    there = [axis for axis in columns["axes"] if axis in recording]
+    absent = [axis for axis in columns["axes"] if axis not in there]
+    if not there or not absent:
+        return []
+    return [Note(f"{recording.name}: no {' '.join(absent)} in it: {' '.join(there)} alone are corrected for warm-up")]
 
 
 def record_table(record: Calibration) -> Table:

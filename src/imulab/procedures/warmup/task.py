@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
-from imulab.procedures.task import Files, Task, source_of
+from imulab.procedures.procedure import Files, Task, source_of
 from imulab.quantities import chosen, number, quantity
 
 if TYPE_CHECKING:
@@ -121,7 +121,6 @@ def _limit(text: str, option: str) -> dict[str, float]:
 
 
 TASK = Task(
-    procedure="warmup",
     files="the recordings of its power cycles",
     count=(1, None),
     options=(

@@ -1,0 +1,190 @@
+"""What a procedure is to the rest of the package: its fit, what its record gives a unit, and how it is shown.
+
+An entry names functions of its folder by `deferred`, so that the registry costs nothing until one of them is called.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from imulab.device.tables import Table
+    from imulab.device.unit import Unit
+    from imulab.recording import Recording, Source
+    from imulab.records.calibration import Calibration
+    from imulab.records.comparison import Change
+    from imulab.report.elements import Exhibits
+
+
+def deferred(where: str) -> Callable[..., Any]:
+    """Return a function that is imported when it is first called; `where` is ``"imulab.module:name"``."""
+    module, _, name = where.partition(":")
+
+    def call(*given: Any, **named: Any) -> Any:
+        return getattr(import_module(module), name)(*given, **named)
+
+    call.__name__ = name
+    return call
+
+
+class Files(Protocol):
+    """Where a fit gets what its files hold; `name` is what the command line or the manifest calls a file."""
+
+    def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
+        """Return a recording as a whole; options as for `imulab.read`."""
+
+    def record(self, name: str) -> Calibration:
+        """Return a calibration record."""
+
+    def blocks(self, name: str, layout: str | None, **part: Any) -> Iterator[Recording]:
+        """Return a recording in blocks; options as for `imulab.read_blocks`."""
+
+    def path(self, name: str) -> Path:
+        """Return where a file lies on this machine."""
+
+    def beside(self, name: str, file: str) -> str:
+        """Return the name of a file that file `name` names relative to itself."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """How a procedure is run on the files of one unit.
+
+    Attributes
+    ----------
+    files
+        What the files are, for messages.
+    count
+        Fewest and most files; None for any number.
+    options
+        Names of the options of its fit.
+    paths
+        Those of them that name a file.
+    modules
+        What its fit loads: whoever has several processes fit loads them once, before.
+    values
+        Texts of options and how messages call an option (``"--{}"``) to checked values; raises OptionError.
+    fit
+        Names of the files, values, access to files and a progress callback to the record.
+    """
+
+    files: str
+    count: tuple[int, int | None]
+    options: tuple[str, ...]
+    paths: tuple[str, ...]
+    modules: tuple[str, ...]
+    values: Callable[[Mapping[str, str], str], dict[str, Any]]
+    fit: Callable[[Sequence[str], Mapping[str, Any], Files, Callable[[int], None]], Calibration]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One kind of section in a unit's tables: the struct ``il_<kind>`` of the C core.
+
+    Attributes
+    ----------
+    kind
+        Name of the struct.
+    golden
+        Table and random numbers to the vectors of an exported unit's self-test: input, and what the core makes of it.
+    apply
+        The unit, what the section says of its columns, and a recording to the corrected recording; None where a section
+        corrects no columns of their own.
+    triad
+        ``accel`` or ``gyro`` where the section corrects that triad: it is left out where a recording has none of it.
+    unchanged
+        What the section says of its columns and a recording to the reason why it leaves it as it is, or None.
+    remarks
+        The same to what a user should know about correcting that recording, `unchanged` included.
+    since_power_on
+        Whether the correction follows the time since power-on.
+    """
+
+    kind: str
+    golden: Callable[[Table, np.random.Generator], dict[str, Any]]
+    apply: Callable[[Unit, Mapping[str, Any], Recording], Recording] | None = None
+    triad: str | None = None
+    unchanged: Callable[[Mapping[str, Any], Recording], str | None] | None = None
+    remarks: Callable[[Mapping[str, Any], Recording], list[str]] | None = None
+    since_power_on: bool = False
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """A procedure's entry in the registry.
+
+    Attributes
+    ----------
+    name
+        In records.
+    command
+        On the command line and in manifests of fleets.
+    title
+        Of its reports.
+    line_title
+        Of its part in the report of a fleet.
+    task
+        How it is run on the files of one unit.
+    exhibits
+        Record to headline, facts, figures and tables.
+    tables
+        Record to the tables of a unit, in the order in which they are applied.
+    fuses
+        Whether `tables` takes the method and memory (`Fusion`) by which the unit is to fuse.
+    sections
+        The kinds of these tables.
+    elsewhere
+        Why another program's file cannot hold its records; ``{target}`` is that program. None where they can.
+    not_applied
+        Why its records correct no recording by `apply`, and what takes them; None where they do.
+    change_unit
+        Change of a parameter and record to the factor from SI and the unit in which it is read; by unit if None.
+    same_meaning
+        Name of a parameter and two records to whether it means the same in both; by its unit alone if None.
+    beyond
+        Record and recording to how many samples lie beyond what the record was made at, and the largest specific force
+        among them, m/s^2; None where no such limit is known.
+    beyond_message
+        Record, that number and that force to what a user should know.
+    refit
+        Record (and whether to keep the misalignment) to one without nonlinearity, or None where it cannot be.
+    """
+
+    name: str
+    command: str
+    title: str
+    line_title: str
+    task: Task
+    exhibits: Callable[[Calibration], Exhibits]
+    tables: Callable[..., tuple[Table, ...]]
+    sections: tuple[Section, ...]
+    fuses: bool = False
+    elsewhere: str | None = None
+    not_applied: str | None = None
+    change_unit: Callable[[Change, Calibration], tuple[float, str]] | None = None
+    same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
+    beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None
+    beyond_message: Callable[[Calibration, int, float], str] | None = None
+    refit: Callable[..., Calibration | None] | None = None
+
+    def section(self, kind: str) -> Section:
+        """Return one of its kinds of section."""
+        return next(known for known in self.sections if known.kind == kind)
+
+
+def source_of(access: Files, name: str, called: str | None = None) -> Source | None:
+    """Return a file as a source of a record, under the name that the record calls it; None for what is no file."""
+    from imulab.recording import Source
+
+    path = access.path(name)
+    if name == "-" or not path.is_file():
+        return None
+    with path.open("rb") as stream:
+        return Source(called or name, hashlib.file_digest(stream, "sha256").hexdigest())

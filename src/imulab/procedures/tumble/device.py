@@ -1,0 +1,107 @@
+"""A tumble record as the tables that the C core runs, and the vectors by which an exported unit tests itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imulab.device.tables import Field, Table, field_of, nonzero, values_of, whole
+from imulab.device.unit import Unit
+from imulab.errors import RecordError
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.units import STANDARD_GRAVITY
+
+_AXES = "xyz"
+_CROSSED = 256
+"""Added to the order of a table that has cross terms."""
+_VECTORS = 64
+
+
+def tables_of(record: Calibration) -> tuple[Table, ...]:
+    """Return the tables of a tumble record: accelerometers, and gyroscopes where it has them.
+
+    Raises
+    ------
+    RecordError
+        A parameter is in another unit, or has a value that cannot be.
+    KeyError
+        The record lacks a parameter.
+    """
+    order, output = record.model["order"], str(record.model["output_unit"])
+    if type(order) is not int or not 0 <= order <= 5:
+        raise RecordError(f"the record has order {order!r}, expected a whole number from 0 to 5")
+    scale = values_of(record, [f"scale_factor_{axis}" for axis in _AXES], f"{output}/(m/s^2)")
+    nonlinearity = np.array(
+        [
+            values_of(record, [f"k{p}_{axis}" for axis in _AXES], "1/(m/s^2)" + (f"^{p - 1}" if p > 2 else ""))
+            for p in range(2, order + 1)
+        ]
+    ).reshape(-1, 3)
+    ends = np.array([monotone_range(nonlinearity[:, axis]) for axis in range(3)])
+    largest = float(np.finfo(np.float32).max)
+    crossed = "k_xy" in record.parameters
+    table = Table(
+        "tumble",
+        (
+            Field("order", whole(max(order, 1) + _CROSSED * crossed)),
+            Field("gain", 1.0 / nonzero(scale)),
+            Field("bias", values_of(record, [f"bias_{axis}" for axis in _AXES], "m/s^2")),
+            Field("misalignment", values_of(record, [f"misalignment_{pair}" for pair in ("yx", "zx", "zy")], "rad")),
+            Field("low", np.clip(ends[:, 0], -largest, largest)),
+            Field("high", np.clip(ends[:, 1], -largest, largest)),
+            Field("nonlinearity", nonlinearity),
+            *([Field("cross", values_of(record, ["k_xy", "k_yz", "k_zx"], "1/(m/s^2)"))] if crossed else []),
+        ),
+        {"output_unit": output},
+    )
+    return (table, *_gyro(record)) if "gyro_bias_x" in record.parameters else (table,)
+
+
+def _gyro(record: Calibration) -> tuple[Table, ...]:
+    scale = np.array([record.value(f"gyro_scale_factor_{axis}") for axis in _AXES])
+    misalignment = np.eye(3)
+    for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
+        misalignment[i, j] = record.value(f"gyro_misalignment_{_AXES[i]}{_AXES[j]}")
+    sensitive = "gyro_g_sensitivity_xx" in record.parameters
+    fields = [
+        Field("has_sensitivity", whole(sensitive)),
+        Field("gain", 1.0 / nonzero(scale)),
+        Field("bias", np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES])),
+        Field("turn", np.linalg.inv(misalignment)),
+    ]
+    if sensitive:
+        g = [[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES]
+        fields.append(Field("sensitivity", np.array(g)))
+    return (Table("gyro", tuple(fields), {"output_unit": str(record.model["gyro_output_unit"])}),)
+
+
+def monotone_range(nonlinearity: Array) -> tuple[float, float]:
+    """Return the readings between the turning points of ``s + k2 s^2 + ...`` next to zero, infinite without any."""
+    powers = np.concatenate([[0.0, 1.0], nonlinearity])
+    slope = np.polynomial.polynomial.polyder(powers)
+    turns = np.polynomial.polynomial.polyroots(slope)
+    real = turns[np.abs(turns.imag) < 1e-12 * np.maximum(np.abs(turns), 1.0)].real
+    low, high = real[real < 0].max(initial=-np.inf), real[real > 0].min(initial=np.inf)
+    ends = [float(np.polynomial.polynomial.polyval(s, powers)) if np.isfinite(s) else s for s in (low, high)]
+    return ends[0], ends[1]
+
+
+def golden_accelerometers(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+    """Return outputs within 2 g, or as far as the polynomials rise, and their specific forces."""
+    reach = 0.9 * np.minimum(2 * STANDARD_GRAVITY, np.minimum(-field_of(table, "low"), field_of(table, "high")))
+    output = (rng.uniform(-1, 1, (_VECTORS, 3)) * reach + field_of(table, "bias")) / field_of(table, "gain")
+    output[1, 1] = np.nan
+    force, _ = Unit.of(table).tumble(list(output.T))
+    return {"": _VECTORS, "scale": 2 * STANDARD_GRAVITY, "output": output, "force": np.column_stack(force)}
+
+
+def golden_gyroscopes(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+    """Return outputs under a specific force, and their rates."""
+    rates = rng.uniform(-5, 5, (_VECTORS, 3))  # rad/s, about 300 deg/s
+    force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (_VECTORS, 3))
+    output = (rates + field_of(table, "bias")) / field_of(table, "gain")
+    output[1, 2] = np.nan
+    rate, _ = Unit.of(table).gyro(list(output.T), list(force.T))
+    return {"": _VECTORS, "scale": 5.0, "output": output, "force": force, "rate": np.column_stack(rate)}

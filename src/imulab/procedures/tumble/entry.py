@@ -1,0 +1,36 @@
+"""The entry of the tumble test in the registry."""
+
+from __future__ import annotations
+
+from imulab.procedures.procedure import Procedure, Section, deferred
+from imulab.procedures.tumble.task import TASK
+
+_HERE = "imulab.procedures.tumble"
+
+ENTRY = Procedure(
+    name="tumble",
+    command="tumble",
+    title="Tumble calibration",
+    line_title="Tumble",
+    task=TASK,
+    exhibits=deferred(f"{_HERE}.figures:exhibits"),
+    tables=deferred(f"{_HERE}.device:tables_of"),
+    sections=(
+        Section(
+            "tumble",
+            golden=deferred(f"{_HERE}.device:golden_accelerometers"),
+            apply=deferred(f"{_HERE}.apply:apply_tumble"),
+            triad="accel",
+        ),
+        Section(
+            "gyro",
+            golden=deferred(f"{_HERE}.device:golden_gyroscopes"),
+            apply=deferred(f"{_HERE}.apply:apply_gyro"),
+            triad="gyro",
+        ),
+    ),
+    change_unit=deferred(f"{_HERE}.engineering:change_unit"),
+    beyond=deferred(f"{_HERE}.apply:beyond_test"),
+    beyond_message=deferred(f"{_HERE}.apply:beyond_message"),
+    refit=deferred(f"{_HERE}.refit:refit_linear"),
+)

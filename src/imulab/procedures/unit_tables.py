@@ -1,0 +1,47 @@
+"""The tables of a unit: the numbers of its records in the order of the C core's structs, and of their application."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from imulab.device.array_settings import Fusion
+from imulab.device.tables import Table
+from imulab.errors import RecordError
+from imulab.procedures.registry import procedure_of
+from imulab.records.calibration import Calibration
+
+
+def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table, ...]:
+    """Return the tables of a record, in the order in which they are applied.
+
+    An array fuses by `fusion`; by what its record carries where that is None.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter or has one that cannot be.
+    """
+    try:
+        made_by = procedure_of(record)
+        return made_by.tables(record, fusion) if made_by.fuses else made_by.tables(record)
+    except KeyError as error:
+        raise RecordError(f"the record lacks {error.args[0]}") from None
+
+
+def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[Table]:
+    """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
+
+    Raises
+    ------
+    RecordError
+        Two records give the same section, or are of different units.
+    """
+    serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
+    if len(serials) > 1:
+        raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
+    tables = [table for record in records for table in tables_of(record, fusion)]
+    kinds = [table.kind for table in tables]
+    twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
+    if twice:
+        raise RecordError(f"two records give a {twice[0]} table; a unit has one")
+    return tables
