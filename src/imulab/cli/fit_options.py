@@ -1,0 +1,53 @@
+"""A fit's options on the command line, made from the procedure's own definition of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from inspect import Parameter, signature
+from typing import Annotated, Any
+
+import typer
+
+from imulab.procedures.options import Option
+
+
+def with_options(options: Sequence[Option]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator that puts the options in the place of a command's parameter `options`.
+
+    The command gets the texts that were given by the names of the options, None where none was.
+    """
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        def run(**given: Any) -> Any:
+            texts = {option.name: _text(given.pop(option.name)) for option in options}
+            return command(options=texts, **given)
+
+        parameters: list[Parameter] = []
+        for parameter in signature(command, eval_str=True).parameters.values():
+            parameters += map(_parameter, options) if parameter.name == "options" else [parameter]
+        parameters = [parameter.replace(kind=Parameter.KEYWORD_ONLY) for parameter in parameters]
+        run.__name__, run.__doc__ = command.__name__, command.__doc__
+        run.__signature__ = signature(command).replace(parameters=parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return run
+
+    return decorate
+
+
+def _parameter(option: Option) -> Parameter:
+    """An option as a parameter of a command, which typer reads."""
+    if option.switch:
+        kind: Any = Annotated[bool, typer.Option(option.flag, help=option.help)]
+        return Parameter(option.name, Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+    offered = partial(_beginning_with, option.choices) if option.choices else None
+    info = typer.Option(option.flag, metavar=option.shows, help=option.help, autocompletion=offered)
+    return Parameter(option.name, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info])
+
+
+def _beginning_with(choices: Sequence[str], incomplete: str) -> list[str]:
+    return [choice for choice in choices if choice.startswith(incomplete)]
+
+
+def _text(value: Any) -> str | None:
+    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
