@@ -42,7 +42,9 @@ def _parameter(option: Option) -> Parameter:
         return Parameter(option.name, Parameter.KEYWORD_ONLY, default=False, annotation=kind)
     offered = partial(_beginning_with, option.choices) if option.choices else None
     info = typer.Option(option.flag, metavar=option.shows, help=option.help, autocompletion=offered)
-    return Parameter(option.name, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info])
+    return Parameter(
+        option.name, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info]
+    )
 
 
 def _beginning_with(choices: Sequence[str], incomplete: str) -> list[str]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from imulab.device.array_settings import Fusion
 from imulab.device.tables import KINDS, TEXT, Table, pack
 from imulab.device.unit import Unit
 from imulab.errors import RecordError

@@ -48,7 +48,9 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
     found: dict[tuple[str, str], Limits] = {}
     for procedure, entries in table.items():
         if procedure not in PROCEDURES:
-            raise ReadError(f"{path}: unknown procedure {procedure!r}; known procedures: {listed(PROCEDURES, procedure)}")
+            raise ReadError(
+                f"{path}: unknown procedure {procedure!r}; known procedures: {listed(PROCEDURES, procedure)}"
+            )
         if not isinstance(entries, dict):
             raise ReadError(f'{path}: {procedure}: expected lines such as bias_x = {{ upper = 20, unit = "mg" }}')
         known = [name for owner, name in units if owner == procedure]

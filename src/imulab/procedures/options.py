@@ -103,7 +103,9 @@ def file_option(name: str, help: str, shows: str) -> Option:  # noqa: A002
 
 
 READING = (
-    file_option("layout", "Columns of a foreign file: a TOML file, or the name of a layout that comes along.", "L.toml"),
+    file_option(
+        "layout", "Columns of a foreign file: a TOML file, or the name of a layout that comes along.", "L.toml"
+    ),
     text_option("topic", "Topic of a bag or log, where there are several.", shows="TOPIC"),
     text_option("instance", "Sensor of a flight log, from 0; the first if not given.", shows="N"),
     text_option("window", "Part to read, s; either side may be left out.", shows="FROM:TO"),
