@@ -1,4 +1,4 @@
-"""Records and blobs that version 0.1.0 wrote before its modules were moved still load, and correct to the same numbers."""
+"""Records and blobs of version 0.1.0, written before its modules were moved, load and correct to the same numbers."""
 
 from __future__ import annotations
 

@@ -250,11 +250,15 @@ REFUSALS = {
     "gyro counts": ("px4", lambda: record(gyro="count"), "gyroscopes with outputs in count"),
     "scale": ("ardupilot", lambda: record(scale=0.7), r"scale of axis x is 1\.4.*0\.8 to 1\.2"),
     "px4 scale": ("px4", lambda: record(scale=20.0), r"scale of axis x is 0\.0.*0\.1 to 3"),
-    "warmup": ("px4", lambda: other("warmup"), "cannot be exported.*time since power-on, only.*temperature.*--to c"),
+    "warmup": (
+        "px4",
+        lambda: other("warmup"),
+        "cannot be exported.*time since power-on, at most.*temperature.*--to c",
+    ),
     "warmup 3": (
         "kalibr",
         lambda: other("warmup"),
-        "kalibr has no parameter that follows the time since power-on; use",
+        "kalibr has no parameter that follows the time since power-on, at most",
     ),
     "warmup 2": ("ardupilot", lambda: other("warmup"), "warmup record cannot be exported.*time since power-on"),
     "array": ("kalibr", lambda: other("gyro_array"), "gyro_array record cannot be exported"),

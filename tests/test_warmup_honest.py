@@ -14,9 +14,8 @@ from imulab.cli import main
 from imulab.device.blob import load_any
 from imulab.exporters import export
 from imulab.procedures.reports import exhibits_of
-from imulab.procedures.warmup.apply import record_table
 from imulab.procedures.warmup.fit import fit_warmup
-from imulab.procedures.warmup.model import evaluate
+from imulab.procedures.warmup.model import evaluate, record_table
 from imulab.verdict import Bad
 
 AT = (-20.0, 0.0, 20.0)

@@ -146,9 +146,8 @@ def _unit(place: str, cells: Mapping[str, str]) -> Unit:
     serial, procedure = cells["serial"], cells["procedure"]
     _check_serial(serial, place)
     if procedure not in PROCEDURES:
-        raise OptionError(
-            f"{place}, column procedure: unknown procedure {procedure!r}; known procedures: {listed(PROCEDURES, procedure)}"
-        )
+        known = listed(PROCEDURES, procedure)
+        raise OptionError(f"{place}, column procedure: unknown procedure {procedure!r}; known procedures: {known}")
     task = PROCEDURES[procedure].task
     files = tuple(file.strip() for file in cells["file"].split(";"))
     fewest, most = task.count

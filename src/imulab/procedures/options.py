@@ -1,6 +1,6 @@
 """The options of a procedure's fit, defined once: the command line, manifests of fleets and checks are made from them.
 
-An option is a text as a person writes it, ``--settling-time "90 s"`` or a cell of a manifest, and becomes a value in SI.
+An option is a text as a person writes it (``--settling-time "90 s"``, a cell of a manifest) and becomes a value in SI.
 """
 
 from __future__ import annotations

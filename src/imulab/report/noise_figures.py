@@ -26,7 +26,7 @@ _MOST_NAMED = 6
 
 
 def noise_page(found: dict[str, Any], recording: Recording) -> str:
-    """Return the report of an analysis by `imulab.estimation.column_noise.analyse` and of the recording that it was made from."""
+    """Return the report of what `imulab.estimation.column_noise.analyse` found, and of the recording it was given."""
     verdict = verdict_of(found["warnings"])
     return render_page(
         "Noise at rest",

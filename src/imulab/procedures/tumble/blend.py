@@ -2,7 +2,8 @@
 
 An order chosen from the data states an uncertainty as if it were right. Here all orders that the attitudes show are
 fitted with the same weights, each step from one to the next is shrunk by the share of it that is likely to be noise
-(`imulab.estimation.order_blend`), and the chosen values are stated with ``V + (theta_chosen - theta)(theta_chosen - theta)'``.
+(`imulab.estimation.order_blend`), and the chosen values are stated with
+``V + (theta_chosen - theta)(theta_chosen - theta)'``.
 """
 
 from __future__ import annotations

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.device.unit import Unit
-from imulab.errors import DataError, RecordError, UnitError
-from imulab.procedures.warmup.model import Table, table_from
+from imulab.errors import DataError, UnitError
 from imulab.procedures.warmup.poweron import LATEST_START, check_clock, check_start, power_on_temperature
 from imulab.recording import Array, Recording, check_time
-from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor
 from imulab.verdict import Note
 
@@ -140,16 +138,3 @@ def remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
     if not there or not absent:
         return []
     return [Note(f"{recording.name}: no {' '.join(absent)} in it: {' '.join(there)} alone are corrected for warm-up")]
-
-
-def record_table(record: Calibration) -> Table:
-    """Return the table of a warm-up record.
-
-    Raises
-    ------
-    RecordError
-        The record has none, or one that cannot be evaluated.
-    """
-    if "table" not in record.sections:
-        raise RecordError("the warm-up record lacks its table")
-    return table_from(record.sections["table"])

@@ -10,7 +10,7 @@ import numpy as np
 from imulab.device.tables import Field, Table, field_of, whole
 from imulab.device.unit import Unit
 from imulab.errors import RecordError
-from imulab.procedures.warmup.model import EXITS, MODELS
+from imulab.procedures.warmup.model import EXITS, MODELS, record_table
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -20,7 +20,8 @@ _TICK = 0.01  # s
 
 
 def tables_of(record: Calibration) -> tuple[Table, ...]:
-    """Return the table of a warm-up record; errors as for `warmup_table`."""
+    """Return the table of a warm-up record; errors as for `record_table` and `warmup_table`."""
+    record_table(record)  # says in words what the core would refuse by a number
     return (warmup_table(record.sections["table"]),)
 
 

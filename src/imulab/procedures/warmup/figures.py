@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from imulab.procedures.warmup.apply import record_table
 from imulab.procedures.warmup.engineering import engineering_unit
 from imulab.procedures.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
 from imulab.procedures.warmup.model import Table as WarmupTable
-from imulab.procedures.warmup.model import evaluate
+from imulab.procedures.warmup.model import evaluate, record_table
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, plain_number

@@ -16,6 +16,7 @@ import numpy as np
 
 from imulab.errors import RecordError, UnitError
 from imulab.recording import Array
+from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit
 
 MODELS = ("interval-cubic", "knot-cubic", "knot-log-cubic", "exponential")
@@ -271,3 +272,16 @@ def exit_jump(table: Table) -> Array:
     last = basis(table.model, np.array(table.settling_time), table.settling_time, table.scales)
     found: Array = table.coefficients @ last
     return found
+
+
+def record_table(record: Calibration) -> Table:
+    """Return the table of a warm-up record.
+
+    Raises
+    ------
+    RecordError
+        The record has none, or one that cannot be evaluated.
+    """
+    if "table" not in record.sections:
+        raise RecordError("the warm-up record lacks its table")
+    return table_from(record.sections["table"])
