@@ -12,8 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import imulab as il
 from imulab.atomic_write import replacing, write_text
 from imulab.errors import OptionError, RecordError
+from imulab.procedures.apply import loaded
+from imulab.procedures.reports import exhibits_of
+from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Source
 from imulab.records.calibration import (
     Calibration,
@@ -282,6 +286,14 @@ def test_a_version_that_is_none_is_refused(version):
         loads(sealed({**json.loads(TEXT), "version": version}), "sn42.json")
 
 
+def test_a_record_of_an_unknown_procedure_is_refused_where_the_procedure_is_needed(tmp_path):
+    record = loads(sealed({**json.loads(TEXT), "procedure": "levelling"}), "sn42.json")
+    message = "unknown procedure 'levelling'; known procedures: tumble gyro_array warmup centrifuge"
+    for use in (exhibits_of, tables_of, loaded, lambda record: il.write_report(record, tmp_path / "r.html")):
+        with pytest.raises(RecordError, match=message):
+            use(record)
+
+
 @pytest.mark.parametrize(
     "key", ["procedure", "sensor", "created", "software", "sources", "model", "parameters", "covariance", "fit"]
 )
@@ -294,10 +306,6 @@ def test_a_record_that_lacks_a_part_is_refused(key):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"procedure": "levelling"},
-            "unknown procedure 'levelling'; known procedures: tumble gyro_array warmup centri",
-        ),
         ({"covariance": {"names": ["a", "b"], "matrix": [[1.0, 2.0]]}}, "covariance: expected a 2 x 2 matrix"),
         ({"covariance": {"names": ["a"], "matrix": [[1.0, 2.0]]}}, "covariance: expected a 1 x 1 matrix"),
         ({"covariance": {"names": [], "matrix": [[1.0]]}}, "covariance: expected a 0 x 0 matrix"),

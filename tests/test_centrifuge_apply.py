@@ -14,9 +14,8 @@ from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.procedures.centrifuge.manifest import make_manifest
 from imulab.procedures.centrifuge.plan import plan_centrifuge
 from imulab.procedures.centrifuge.simulate import Simulation, typical_truth
-from imulab.procedures.reports import exhibits_of
+from imulab.procedures.reports import exhibits_of, rendered
 from imulab.recording import Recording
-from imulab.report import render
 from imulab.report.elements import Figure
 
 G = 9.80665
@@ -251,7 +250,7 @@ def test_the_table_of_runs_says_what_differs_between_them():
     assert all(len(row) == len(table.columns) for row in table.rows)
     half = len(test.runs)
     assert [row[table.columns.index("spin axis")] for row in table.rows] == ["up"] * half + ["down"] * half
-    page = render(record, exhibits_of(record))
+    page = rendered(record)
     assert '<th scope="col" class="text">file</th>' in page
     assert '<th scope="col">g</th>' in page
 

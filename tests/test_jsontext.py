@@ -97,7 +97,7 @@ def test_without_integers_of_128_bits_the_numbers_are_the_same():
     numbers = np.random.default_rng(2).integers(0, 2**64, 2000, dtype=np.uint64).view(np.float64)
     numbers = [*numbers[np.isfinite(numbers)].tolist(), 0.0, -0.0, 1e16, 1e-5, 5e-324, 0.1, 100.0]
     code = (
-        "import struct, sys; from imulab import _digits; data = sys.stdin.buffer.read();"
+        "import struct, sys; from imulab.writers import _digits; data = sys.stdin.buffer.read();"
         "sys.stdout.buffer.write(_digits.json(struct.unpack(f'{len(data) // 8}d', data))[0])"
     )
     packed = struct.pack(f"{len(numbers)}d", *numbers)

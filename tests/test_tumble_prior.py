@@ -270,14 +270,14 @@ def bad_priors():
     indefinite[0, 1] = indefinite[1, 0] = 5 * np.sqrt(matrix[0, 0] * matrix[1, 1])
     yield good, with_covariance(certain), "scale_factor_y has the variance 0; a prior needs more than 0 for each"
     yield good, with_covariance(0 * matrix), "bias_x has the variance 0"
-    yield good, with_covariance(-matrix), "bias_x has the variance -"
-    yield good, with_covariance(indefinite), "covariance is not positive definite"
+    yield good, with_covariance(-matrix), "covariance.matrix: a correlation beyond 1, or a variance below 0"
+    yield good, with_covariance(indefinite), "covariance.matrix: a correlation beyond 1, or a variance below 0"
     yield good, with_covariance(matrix, 6), "no misalignment_yx, or no covariance of it"
     lacking = {name: p for name, p in good.parameters.items() if name != "bias_z"}
-    yield good, replace(good, parameters=lacking), "no bias_z, or no covariance of it"
+    yield good, replace(good, parameters=lacking), "covariance.names: expected each a parameter, once, found 'bias_z'"
     yield good, replace(good, model={**good.model, "order": 7}), "a record of order 7 cannot be a prior"
     yield good, replace(good, model={**good.model, "gauge": "upper"}), "a record in the gauge 'upper'"
-    yield good, replace(good, procedure="centrifuge"), "a centrifuge record cannot be a prior"
+    yield good, replace(good, procedure="centrifuge", fit={}), "a centrifuge record cannot be a prior"
 
 
 @pytest.mark.parametrize("number", range(9))

@@ -97,7 +97,7 @@ def changed(record, name, value=None, unit=None):
             ),
             "has no y_direction: it was made without table_angle",
         ),
-        (replace(madeup.warmup(), sections={}), "lacks table"),
+        (replace(madeup.warmup(), sections={}), "lacks its table"),
     ],
 )
 def test_records_that_cannot_be_are_refused(record, message):

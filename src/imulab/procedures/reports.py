@@ -6,6 +6,7 @@ from pathlib import Path
 
 from imulab import report
 from imulab.atomic_write import write_text
+from imulab.errors import RecordError
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change, Comparison, compared
@@ -28,7 +29,10 @@ def exhibits_of(record: Calibration) -> Exhibits:
     RecordError
         Its procedure is not known, or it lacks the data that they need.
     """
-    return procedure_of(record).exhibits(record)
+    try:
+        return procedure_of(record).exhibits(record)
+    except (KeyError, IndexError) as error:
+        raise RecordError(f"the record lacks data that its report needs ({error!r})") from None
 
 
 def compare_records(first: Calibration, second: Calibration) -> Comparison:

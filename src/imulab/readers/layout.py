@@ -210,7 +210,7 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
     """
     name = name or str(path)
     shipped = shipped_file(str(path))
-    if shipped is None and not os.path.exists(path):  # noqa: PTH110  (Path.exists raises for names too long)
+    if shipped is None and not os.path.lexists(path):  # a link in a circle says so when it is opened
         known = shipped_names()
         raise ReadError(f"{name}: no such layout file; those that come with imulab: {listed(known, name)}")
     table = load_toml(shipped or path, name, "layout")
