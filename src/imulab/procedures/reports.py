@@ -31,7 +31,7 @@ def exhibits_of(record: Calibration) -> Exhibits:
     """
     try:
         return procedure_of(record).exhibits(record)
-    except (KeyError, IndexError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise RecordError(f"the record lacks data that its report needs ({error!r})") from None
 
 
