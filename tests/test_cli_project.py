@@ -1,5 +1,6 @@
 """The project file: what it gives, where it is found, what wins over it, and what is refused."""
 
+import io
 import json
 from pathlib import Path
 
@@ -81,6 +82,47 @@ def test_a_layout_beside_it_is_for_files_that_need_one(work, capsys):
         assert "imulab.toml" not in capsys.readouterr().err
 
 
+def test_a_layout_that_comes_along_is_meant_by_its_name_and_a_file_by_its_path(work, capsys):
+    (work / "phyphox").write_text(LAYOUT)
+    (work / "imulab.toml").write_text('layout = "phyphox"\n')
+    assert project.load(work / "imulab.toml", "imulab.toml") == {"layout": "phyphox"}
+    (work / "imulab.toml").write_text('layout = "./phyphox"\n')
+    assert project.load(work / "imulab.toml", "../../imulab.toml") == {"layout": "../../phyphox"}
+    (Path.cwd() / "phyphox").write_text(LAYOUT)
+    (Path.cwd() / "imulab.toml").write_text('layout = "./phyphox"\n')
+    assert main(["show", "foreign.txt"]) == 0
+    assert "note: --layout ./phyphox from imulab.toml" in capsys.readouterr().err
+
+
+def test_a_layout_is_left_out_for_a_stream_and_for_each_file_that_does_without(work, capsys, monkeypatch):
+    (work / "imulab.toml").write_text('layout = "board.toml"\n')
+    (work / "board.toml").write_text(LAYOUT)
+    outputs = []
+    for name in ("native.csv", "foreign.txt"):
+        with Path(name).open("rb") as stream:
+            monkeypatch.setattr("sys.stdin", io.TextIOWrapper(stream))
+            assert main(["show", "-", "--json"]) == 0
+        said = json.loads(capsys.readouterr().out)
+        outputs.append((said["samples"], *((key, said["columns"][key]["unit"]) for key in ("time", "accel_z"))))
+    assert outputs[0] == outputs[1] == (6200, ("time", "s"), ("accel_z", "m/s^2"))
+    columns = "time [s],gyro_z [rad/s]\n"
+    Path("a.csv").write_text(columns + "0,1\n1,2\n2,3\n")
+    Path("b.txt").write_text("0;4;5;6\n1;7;8;9\n2;7;8;9\n")
+    assert main(["array", "merge", "a.csv", "b.txt", "--axis", "z", "-o", "m.csv"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("imulab: b.txt: ")  # a.csv was read without the layout
+
+
+def test_no_home_and_no_working_folder(work, capsys, monkeypatch):
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home directory")))
+    assert project.find(Path.cwd()) is None
+    file = str(Path("native.csv").resolve())
+    gone = work / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert main(["tumble", "fit", file, "--order", "1", "--gravity", "9.81362", "--json"]) == 0
+
+
 def test_it_is_found_up_to_the_root_of_the_repository_and_not_above(work, monkeypatch):
     assert project.find(Path.cwd()) is None
     (work.parent / "imulab.toml").write_text("gravity = 9.8\n")
@@ -123,7 +165,13 @@ def test_verbose_says_which_one_was_used(work, capsys):
             "gravity together with latitude or height: expected one or the other",
         ),
         ("height = 520\n", "height without latitude: expected both"),
-        ('gravity = "fast"\n', None),
+        ('layout = "/etc"\n', "layout = '/etc': expected the name of a file, found a folder"),
+        (
+            'gravity = "fast"\n',
+            "gravity 'fast': expected a number, or one with a unit of acceleration such as 1 m/s^2",
+        ),
+        ('limit = "1 kg"\n', "limit '1 kg': unknown unit 'kg'"),
+        ("limit = -1\n", "limit '-1': expected more than 0"),
     ],
 )
 def test_what_it_cannot_say_is_refused(work, capsys, content, message):
@@ -132,12 +180,8 @@ def test_what_it_cannot_say_is_refused(work, capsys, content, message):
     out, err = capsys.readouterr()
     assert out == ""
     assert not Path("r.json").exists()
-    lines = err.splitlines()
-    if message:
-        assert lines == [f"imulab: ../../imulab.toml: {message}"]
-    else:  # the value is judged as if it were typed; the note says where it is from
-        assert lines[0] == "imulab: note: --gravity fast from ../../imulab.toml"
-        assert lines[1].startswith("imulab: --gravity 'fast': expected a number")
+    assert err.startswith(f"imulab: ../../imulab.toml: {message}")
+    assert err.count("\n") == 1
     assert main(["tumble", "fit", "native.csv", "--no-project", "-q"]) == 0
 
 

@@ -8,6 +8,7 @@ import pytest
 import imulab as il
 from fleets import make_fleet, records, write_manifest
 from imulab.fleet.run import run_fleet
+from imulab.fleet.sources import sha256_of
 from imulab.fleet.store import Store
 from imulab.fleet.work import work
 
@@ -145,3 +146,17 @@ def test_a_half_written_file_of_a_killed_worker_does_not_outlive_the_run(tmp_pat
         assert part.exists()
     Store(tmp_path / "out").tidy()
     assert not part.exists()
+
+
+def test_a_file_called_like_a_layout_that_comes_along_is_the_file(imulab, tmp_path):
+    manifest = make_fleet(tmp_path / "in", 1)
+    (tmp_path / "in" / "u0.csv").rename(tmp_path / "in" / "phyphox")
+    edited(manifest, lambda rows: rows[0].update(file="phyphox"))
+    first = run(manifest, tmp_path / "out")
+    assert [row.summary.inputs for row in first.rows] == [(sha256_of(tmp_path / "in" / "phyphox", "phyphox"),)]
+    edited(manifest, lambda rows: rows[0].update(file="u0.csv", layout="phyphox"))
+    (tmp_path / "in" / "u0.csv").write_text(
+        "Time (s),Acceleration x (m/s^2),Acceleration y (m/s^2),Acceleration z (m/s^2)\n0,1,2,3\n"
+    )
+    done = imulab("fleet", "run", "in/manifest.csv", "-o", "named", "--workers", 1)
+    assert "u0.csv: 1 samples over 0 s are too few to find static attitudes" in done.stderr  # its columns were known

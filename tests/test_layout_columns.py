@@ -164,8 +164,16 @@ REFUSED = {
     "encoding number": ("encoding = 8\n" + FOG % "scale = 1", "encoding = 8; expected the name of an encoding such"),
     "encoding wide": (
         'encoding = "utf-16"\n' + FOG % "scale = 1",
-        "encoding = 'utf-16'; expected one that writes digits as ASCII does",
+        "encoding = 'utf-16'; expected one that writes letters and digits as ASCII does",
     ),
+    **{
+        f"encoding {name}": (
+            f'encoding = "{name}"\n' + FOG % "scale = 1",
+            f"encoding = '{name}'; expected one that writes letters and digits as ASCII does",
+        )
+        for name in ("idna", "utf-7", "punycode", "unicode_escape", "raw_unicode_escape", "utf-32", "cp037")
+    },
+    "encoding rot13": ('encoding = "rot13"\n' + FOG % "scale = 1", "encoding = 'rot13'; expected the name of an"),
     "unit of counted time": (
         'sample_rate = 100\n[columns]\ntime = { from = 0, unit = "s" }\n',
         "both a time column and sample_rate; expected one of them, or a time of unit count",

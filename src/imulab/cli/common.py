@@ -120,7 +120,10 @@ def _run(
 def _from_project(values: dict[str, Any], files: list[str]) -> dict[str, str]:
     if not speech().project or all(values.get(key, "") is not None for key in project.KEYS):
         return {}
-    here = Path.cwd()
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:  # the working folder was deleted
+        return {}
     path = project.find(here)
     if path is None:
         tell(f"no project file {project.NAME} here or above")

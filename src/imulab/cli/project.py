@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,16 +14,18 @@ OFF = "IMULAB_NO_PROJECT"
 _GRAVITY = ("gravity", "latitude", "height")
 _PATHS = ("layout", "limits")
 KEYS = (*_GRAVITY, *_PATHS, "limit")
-_TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
 
 
 def find(folder: Path) -> Path | None:
     """Return the project file of a folder: there or above, up to the root of its repository or the home folder."""
     if os.environ.get(OFF):
         return None
-    home = Path.home()
+    try:
+        home = Path.home()
+    except RuntimeError:  # no HOME, and nobody of this number is known
+        home = None
     for place in (folder, *folder.parents):
-        if (place / NAME).is_file():
+        if os.path.lexists(place / NAME):  # what is no file is refused when it is read
             return place / NAME
         if place == home or (place / ".git").exists():
             break
@@ -48,28 +49,58 @@ def load(path: Path, shown: str) -> dict[str, str]:
             raise OptionError(f"{shown}: {key} = {value!r}: expected a text or a number, as --{key} takes it")
         if key in _PATHS and not isinstance(value, str):
             raise OptionError(f"{shown}: {key} = {value!r}: expected the name of a file")
-        found[key] = os.path.normpath(f"{shown}/../{value}") if key in _PATHS else str(value)
-        if key in _PATHS and not Path(found[key]).is_file():
-            raise OptionError(f"{shown}: {key} = {value!r}: no such file beside it")
+        found[key] = _file(key, str(value), shown) if key in _PATHS else str(value)
     if "gravity" in found and len(found.keys() & set(_GRAVITY)) > 1:
         raise OptionError(f"{shown}: gravity together with latitude or height: expected one or the other")
     if "height" in found and "latitude" not in found:
         raise OptionError(f"{shown}: height without latitude: expected both")
+    _check_values(found, shown)
     return found
+
+
+def _file(key: str, value: str, shown: str) -> str:
+    """Return the name of a file beside the project file, or of a layout that comes with imulab."""
+    from imulab.readers.layout import shipped_file
+
+    if key == "layout" and shipped_file(value):
+        return value
+    path = Path(os.path.normpath(Path(shown).parent / value))
+    if path.is_dir():
+        raise OptionError(f"{shown}: {key} = {value!r}: expected the name of a file, found a folder")
+    if not path.is_file():
+        raise OptionError(f"{shown}: {key} = {value!r}: no such file beside it")
+    return f"./{path}" if key == "layout" and shipped_file(str(path)) else str(path)
+
+
+def _check_values(found: Mapping[str, str], shown: str) -> None:
+    """Check gravity and limit as if they were typed, whether or not this command takes them."""
+    from imulab.gravity import gravity_option
+    from imulab.quantities import quantity
+
+    try:
+        gravity_option(found.get("gravity"), found.get("latitude"), found.get("height"), "{}")
+        if "limit" in found and not quantity(found["limit"], "limit", "acceleration", "mg") > 0:
+            raise OptionError(f"limit {found['limit']!r}: expected more than 0")
+    except OptionError as error:
+        raise OptionError(f"{shown}: {error}") from None
 
 
 def additions(said: Mapping[str, str], typed: Mapping[str, object], files: Sequence[str]) -> dict[str, str]:
     """Return what a project file adds to the options of a command.
 
     `typed` are the options that the command has, None where not given; `files` what it reads. Options of gravity count
-    together: one that is typed leaves out those of the file. A layout is left out where the file that is read says
-    itself what its columns are.
+    together: one that is typed leaves out those of the file. A layout is left out where all files say themselves what
+    their columns are; else it is for those that do not.
     """
     found = {key: text for key, text in said.items() if key in typed and typed[key] is None}
     if any(typed.get(key) is not None for key in _GRAVITY):
         found = {key: text for key, text in found.items() if key not in _GRAVITY}
-    if "layout" in found and files and _describes_itself(files[-1]):
+    if "layout" in found and files and all(map(_describes_itself, files)):
         del found["layout"]
+    elif "layout" in found:
+        from imulab.readers.layout import IfNeeded
+
+        found["layout"] = IfNeeded(found["layout"])
     return found
 
 
@@ -79,6 +110,7 @@ def _describes_itself(file: str) -> bool:
     from imulab.device.blob import is_blob
     from imulab.readers import is_pipe
     from imulab.readers.formats import TEXT, recognised
+    from imulab.readers.text import is_native
 
     path = Path(file)
     if path.is_dir() or is_blob(file):
@@ -92,5 +124,4 @@ def _describes_itself(file: str) -> bool:
     if kind is not TEXT:
         return kind.layout == "none"
     lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
-    titles = next((line for line in lines if not line.startswith("#")), "")
-    return all(_TITLE.fullmatch(title.strip().strip('"')) for title in titles.split(","))
+    return is_native(next((line for line in lines if line.strip() and not line.startswith("#")), ""))

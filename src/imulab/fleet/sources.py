@@ -170,14 +170,8 @@ class UnitFiles:
         self._stack.close()
 
     def path(self, name: str) -> Path:
-        """Return a local path for a name: imulab's own layout, or relative to the manifest; URLs are fetched once."""
+        """Return a local path for a name that is relative to the manifest; URLs are fetched once."""
         if name not in self._local:
-            from imulab.readers.layout import shipped_file
-
-            shipped = shipped_file(name)
-            if shipped is not None:
-                self._local[name] = shipped
-                return shipped
             if is_url(name):
                 address = name
             elif is_url(self._base):
@@ -195,16 +189,20 @@ class UnitFiles:
         if name is None:
             return None
         from imulab.readers import load_layout
+        from imulab.readers.layout import shipped_file
 
-        self.inputs[name] = self.sha256(name)
-        return load_layout(self.path(name), name)
+        shipped = shipped_file(name)
+        path = shipped or self.path(name)
+        self.inputs.setdefault(name, sha256_of(path, name))
+        return load_layout(path, name)
 
     def blocks(self, name: str, layout: str | None, **part: Any) -> Iterator[Recording]:
         """Read a recording in blocks."""
         from imulab.readers import read_blocks
 
+        known = self._layout(layout)
         self.inputs[name] = self.sha256(name)
-        for number, block in enumerate(read_blocks(self.path(name), self._layout(layout), name=name, **part)):
+        for number, block in enumerate(read_blocks(self.path(name), known, name=name, **part)):
             if not number:
                 self.heard(block)
             yield block
@@ -253,6 +251,13 @@ class UnitFiles:
     def unchanged(self, inputs: Sequence[Any]) -> bool:
         """Return whether every file of a record's list is there with the hash that the record states."""
         try:
-            return bool(inputs) and all(self.sha256(item["file"]) == item["sha256"] for item in inputs)
+            return bool(inputs) and all(self._has(item["file"], item["sha256"]) for item in inputs)
         except (ImulabError, KeyError, TypeError):
             return False
+
+    def _has(self, name: str, sha256: str) -> bool:
+        """Return whether a file, or the layout of this name that comes with imulab, has this hash."""
+        from imulab.readers.layout import shipped_file
+
+        shipped = shipped_file(name)
+        return (shipped is not None and sha256_of(shipped, name) == sha256) or self.sha256(name) == sha256

@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import as_strided
 
 from imulab.errors import ImulabError, ReadError, UnitError
 from imulab.readers.formats import FORMATS, TEXT, recognised
-from imulab.readers.layout import Layout, load_layout
+from imulab.readers.layout import IfNeeded, Layout, load_layout
 from imulab.readers.selection import Selection, of_element, windowed
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Recording, Source
@@ -179,7 +179,7 @@ def _blocks(
     else:
         kind = TEXT
         # A pipe can be read once: it is text, or is refused as none.
-        if not is_pipe(file) and not (layout is not None and layout.text):
+        if not is_pipe(file) and not (layout is not None and layout.text and not layout.if_needed):
             with _open(file, name) as stream:
                 try:
                     kind = recognised(stream.read(1024))
@@ -188,6 +188,8 @@ def _blocks(
     chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
     said = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
     _LOG.info("%s: a %s file%s", name, kind.name, said)
+    if kind.layout == "none" and layout is not None and layout.if_needed:
+        layout = None
     if kind.layout == "none" and layout is not None:
         raise ReadError(f"{name}: a {kind.name} file says itself what its columns are; leave out {layout.name}")
     if kind is not TEXT:
@@ -276,6 +278,8 @@ def _name(file: str | Path) -> str:
 
 
 def _layout(layout: str | Path | Layout | None) -> Layout | None:
+    if isinstance(layout, IfNeeded):
+        return replace(load_layout(str(layout)), if_needed=True)
     return load_layout(layout) if isinstance(layout, str | Path) else layout
 
 

@@ -57,6 +57,8 @@ _KEYS = (
 )
 _COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
 _COUNTERS = [2.0**8, 2.0**16, 2.0**32]
+_ASCII = bytes(range(32, 92)) + bytes(range(93, 127)) + b"\\u0041\t\n"
+"""What an encoding of titles must leave as it is; the escape is one that unicode_escape would change."""
 _BY_COLUMN = {
     "scale_factor": '{ value = 0.02, unit = "V/(deg/s)" }',
     "zero": '{ value = 2.5, unit = "V" }',
@@ -93,7 +95,8 @@ class Layout:
 
     ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
     in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field of the lines that count, or
-    nothing; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter).
+    nothing; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter); ``if_needed``
+    that it is left out where a file says itself what its columns are.
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -108,6 +111,7 @@ class Layout:
     encoding: str = "utf-8"
     prefix: str = ""
     skip_incomplete: bool = False
+    if_needed: bool = False
 
     @property
     def units(self) -> dict[str, str]:
@@ -123,6 +127,10 @@ class Layout:
         return (
             f"{count} {what} skipped that lack a reading of {' '.join(self.columns)} (skip_incomplete in {self.name})"
         )
+
+
+class IfNeeded(str):
+    """The name of a layout that is left out where a file says itself what its columns are."""
 
 
 class Readings:
@@ -197,8 +205,9 @@ def shipped_file(name: str) -> Path | None:
 
 
 def load_layout(path: str | Path, name: str | None = None) -> Layout:
-    """Read a layout: a file, or one that comes with imulab by its name (a file of that name is ``./phyphox``).
+    """Read a layout: a file, or one that comes with imulab by its name.
 
+    A text such as ``"phyphox"`` is the name of one that comes with imulab; ``"./phyphox"`` and any `Path` are files.
     `name` is what messages call it, its path if not given.
 
     Raises
@@ -209,7 +218,7 @@ def load_layout(path: str | Path, name: str | None = None) -> Layout:
         A unit is unknown or does not belong to its column.
     """
     name = name or str(path)
-    shipped = shipped_file(str(path))
+    shipped = shipped_file(path) if isinstance(path, str) else None
     if shipped is None and not os.path.lexists(path):  # a link in a circle says so when it is opened
         known = shipped_names()
         raise ReadError(f"{name}: no such layout file; those that come with imulab: {listed(known, name)}")
@@ -339,14 +348,18 @@ def _prefix(prefix: Any, delimiter: str, path: str) -> str:
 
 def _encoding(name: Any, path: str) -> str:
     try:
-        digits = "0,\n".encode(name)
-    except (LookupError, TypeError, UnicodeError, ValueError):
+        bytes(range(128, 256)).decode(name, "replace")  # comments may hold any bytes
+        decoded = _ASCII.decode(name)
+    except UnicodeError:
+        decoded = ""
+    except (LookupError, TypeError, ValueError):
         raise ReadError(
             f"{path}: encoding = {name!r}; expected the name of an encoding such as gbk, shift_jis or latin-1"
         ) from None
-    if digits != b"0,\n":
+    if decoded != _ASCII.decode("ascii"):
         raise ReadError(
-            f"{path}: encoding = {name!r}; expected one that writes digits as ASCII does: save the file as UTF-8"
+            f"{path}: encoding = {name!r}; expected one that writes letters and digits as ASCII does: save the file as "
+            "UTF-8"
         )
     return str(name)
 

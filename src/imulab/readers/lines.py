@@ -168,6 +168,16 @@ class Lines:
             end = self._rest.find(b"\n", looked)
         return self._rest[self._at : end if end >= 0 else len(self._rest)]
 
+    def first(self) -> bytes:
+        """Return the first line that is neither blank nor a comment without taking it; empty where there is none."""
+        while True:
+            lines = self._rest[self._at :].split(b"\n")
+            whole = lines if self._ended or self.waiting > LONGEST_LINE else lines[:-1]
+            found = next((line for line in whole if line.strip() and not line.startswith(b"#")), b"")
+            if found or whole is lines:
+                return found
+            self._read_more()
+
     def line(self, encoding: str = "utf-8", errors: str = "strict", hint: str = "") -> str | None:
         """Take one line of the head, None at the end of the file; comments may be of any encoding.
 

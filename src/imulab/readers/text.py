@@ -24,6 +24,7 @@ from imulab.verdict import Note
 from imulab.writers.powers_of_ten import powers_of_five
 
 _text.prepare(powers_of_five())
+_TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
 _DATE = 1 << 30
 _NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE = 1, 2, 3
 _MOST_ABOVE = 100  # lines above the titles
@@ -59,13 +60,15 @@ class TextFile:
         self, stream: BinaryIO, name: str, layout: Layout | None, *, hashed: bool = True, whole: bool = False
     ) -> None:
         self._name = name
+        self._lines = Lines(stream, name, hashed=hashed, whole=whole)
+        if layout is not None and layout.if_needed and is_native(self._lines.first().decode("utf-8", "replace")):
+            layout = None
         self._layout = layout
         self._readings = Readings(layout, name) if layout else None
         self._room: np.ndarray | None = None
         self._used = 0
         self._corrected_by: list[str] = []
         self._metadata: dict[str, str] = dict(layout.metadata or {}) if layout else {}
-        self._lines = Lines(stream, name, hashed=hashed, whole=whole)
         self.sha256, self.drain = self._lines.sha256, self._lines.drain
         self._delimiter = layout.delimiter if layout else ","
         self._blanks = b" \r\n" if self._delimiter == "\t" else b" \t\r\n"
@@ -346,6 +349,11 @@ def _fields(line: str, delimiter: str) -> list[str]:
 def titles_of(line: str, delimiter: str) -> list[str]:
     """Split a line of titles, which may begin with # and hold them in quotes."""
     return [title.strip().strip('"') for title in _fields(line.lstrip("# "), delimiter)]
+
+
+def is_native(line: str) -> bool:
+    """Return whether a line is one of titles with units, such as ``time [s],accel_x [g]``."""
+    return all(_TITLE.fullmatch(title.strip().strip('"')) for title in line.lstrip("\ufeff").split(","))
 
 
 def _is_number(text: str) -> bool:

@@ -228,6 +228,10 @@ def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
     try:
         content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except (ValueError, RecursionError) as error:
+        if type(error) is ValueError and "int_max_str_digits" in str(error):
+            raise RecordError(
+                f"{name}: not a calibration record: it holds a whole number of thousands of digits"
+            ) from None
         reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
         if not data.lstrip().startswith(b"{"):
             raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
