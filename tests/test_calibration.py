@@ -16,6 +16,7 @@ import imulab as il
 from imulab.atomic_write import replacing, write_text
 from imulab.errors import OptionError, RecordError
 from imulab.procedures.apply import loaded
+from imulab.procedures.loading import load, loads, loads_sealed
 from imulab.procedures.reports import exhibits_of
 from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Source
@@ -25,9 +26,6 @@ from imulab.records.calibration import (
     Parameter,
     content_sha256,
     json_text,
-    load,
-    loads,
-    loads_sealed,
 )
 
 FIXED = settings(derandomize=True, database=None, deadline=None, max_examples=200)

@@ -8,8 +8,8 @@ import pytest
 
 import imulab as il
 from imulab.errors import RecordError
+from imulab.procedures.loading import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
-from imulab.records.calibration import loads
 from imulab.records.json_text import content_sha256
 from imulab.verdict import Bad, Note, Verdict, verdict_of
 

@@ -11,8 +11,8 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.device.blob import load_any
 from imulab.exporters import export
+from imulab.procedures.loading import load_any
 from imulab.procedures.reports import exhibits_of
 from imulab.procedures.warmup.fit import fit_warmup
 from imulab.procedures.warmup.model import evaluate, record_table

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
     from imulab.procedures.gyro_array.fuse import fuse as fuse
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
+    from imulab.procedures.loading import load as load
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
     from imulab.procedures.tumble.compare import check_tumble as check_tumble
@@ -60,7 +61,6 @@ if TYPE_CHECKING:
     from imulab.readers import read_blocks as read_blocks
     from imulab.recording import Recording as Recording
     from imulab.records.calibration import Calibration as Calibration
-    from imulab.records.calibration import load as load
     from imulab.writers import write as write
     from imulab.writers import write_csv as write_csv
 
@@ -88,7 +88,7 @@ _HOME = {
     "fit_centrifuge": "procedures.centrifuge.fit",
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
-    "load": "records.calibration",
+    "load": "procedures.loading",
     "load_manifest": "procedures.centrifuge.manifest",
     "normal_gravity": "gravity",
     "plan_warmup": "procedures.warmup.plan",

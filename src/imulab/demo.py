@@ -14,8 +14,8 @@ from pathlib import Path
 
 from imulab.atomic_write import write_text
 from imulab.errors import ImulabError, OptionError
+from imulab.procedures.loading import load
 from imulab.procedures.reports import exhibits_of
-from imulab.records.calibration import load
 from imulab.report import Card, render_index
 from imulab.report.elements import Figure
 from imulab.verdict import Verdict

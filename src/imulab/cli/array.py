@@ -259,7 +259,7 @@ def _load(name: str, option: str) -> Calibration:
     from pathlib import Path
 
     from imulab.procedures.gyro_array.model import check_calibration
-    from imulab.records.calibration import load
+    from imulab.procedures.loading import load
 
     if option == "--initial-bias" and not Path(name).exists():
         raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
@@ -269,8 +269,9 @@ def _load(name: str, option: str) -> Calibration:
 
 
 def _load_any(name: str) -> Calibration | Blob:
-    from imulab.device.blob import Blob, load_any
+    from imulab.device.blob import Blob
     from imulab.procedures.gyro_array.model import check_calibration
+    from imulab.procedures.loading import load_any
 
     record = load_any(name)
     if not isinstance(record, Blob):

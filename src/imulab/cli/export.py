@@ -40,8 +40,8 @@ def export(
     """Write calibration records in the form of firmware, an autopilot or a toolbox."""
     from imulab.exporters import EXPORTERS, ExportOptions
     from imulab.exporters import export as write
+    from imulab.procedures.loading import load
     from imulab.procedures.unit_tables import tables_of
-    from imulab.records.calibration import load
     from imulab.verdict import SENTENCES
 
     if to not in EXPORTERS:

@@ -83,7 +83,7 @@ class GivenFiles:
 
     def record(self, name: str) -> Calibration:
         """Read a calibration record."""
-        from imulab.records.calibration import load
+        from imulab.procedures.loading import load
 
         return load(name)
 

@@ -11,6 +11,7 @@ from imulab.atomic_write import replacing
 from imulab.cli.options import check_outputs, is_json, quantity, whole_number
 from imulab.cli.show import aligned
 from imulab.errors import ImulabError, OptionError, RecordError
+from imulab.procedures.loading import load
 from imulab.procedures.tumble.engineering import predicted_rows
 from imulab.procedures.tumble.findings import freedom_finding
 from imulab.procedures.tumble.fit import fit_tumble
@@ -21,7 +22,7 @@ from imulab.procedures.tumble.segment import find_attitudes
 from imulab.procedures.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.readers import read
 from imulab.recording import Array
-from imulab.records.calibration import Calibration, load
+from imulab.records.calibration import Calibration
 from imulab.records.json_text import json_text
 from imulab.report import render_plan
 from imulab.units import STANDARD_GRAVITY, from_si

@@ -65,8 +65,8 @@ def apply(
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
-    from imulab.device.blob import load_any
     from imulab.procedures.apply import apply_blocks, loaded
+    from imulab.procedures.loading import load_any
     from imulab.procedures.warmup.poweron import with_power_on_temperature
     from imulab.readers import read_blocks
 
@@ -166,8 +166,8 @@ def show(
     (file,) = files
     from imulab.cli.show import describe_blob, describe_record, describe_recording, recording_json
     from imulab.device.blob import is_blob, load_blob
+    from imulab.procedures.loading import load
     from imulab.readers import read_blocks
-    from imulab.records.calibration import load
 
     if layout is None and is_blob(file):
         blob = load_blob(file)
@@ -201,8 +201,8 @@ def _show_formats(names: list[str]) -> None:
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:
     from imulab.cli.show import describe_changes
+    from imulab.procedures.loading import load
     from imulab.procedures.reports import compare_records
-    from imulab.records.calibration import load
 
     records = [load(first), load(second)]
     comparison = compare_records(*records)
@@ -222,8 +222,8 @@ def report(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.html", help="Report to write.")],
 ) -> None:
     """Draw the report of a record."""
+    from imulab.procedures.loading import load
     from imulab.procedures.reports import write_report
-    from imulab.records.calibration import load
 
     check_outputs([output], [file])
     write_report(load(file), output)

@@ -277,10 +277,10 @@ def gyro(
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
     from imulab.cli.show import describe_gyro
+    from imulab.procedures.loading import load
     from imulab.procedures.tumble.gyro import fit_gyro
     from imulab.procedures.tumble.gyrorecord import with_gyro
     from imulab.procedures.tumble.segment import find_attitudes
-    from imulab.records.calibration import load
 
     inputs = [name for name in (file, accel, accel_file, layout, accel_layout) if name]
     check_outputs([output, report], inputs)
@@ -328,9 +328,9 @@ def check(
     from imulab.errors import RecordError
     from imulab.gravity import gravity_option
     from imulab.procedures.apply import warnings_of
+    from imulab.procedures.loading import load
     from imulab.procedures.tumble.compare import check_tumble
     from imulab.procedures.tumble.segment import find_attitudes
-    from imulab.records.calibration import load
 
     check_outputs([report], [name for name in (record, file, layout) if name])
     held = load(record)

@@ -245,8 +245,8 @@ def table(
     from imulab.atomic_write import write_text
     from imulab.cli.options import is_json
     from imulab.device.blob import is_blob
+    from imulab.procedures.loading import load
     from imulab.procedures.warmup.spreadsheet import read_table, record_of_table, write_table
-    from imulab.records.calibration import load
 
     check_outputs([output], [file])
     if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason

@@ -7,17 +7,67 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from imulab.device.tables import KINDS, TEXT, Table, pack
 from imulab.device.unit import Unit
 from imulab.errors import RecordError
 from imulab.printable import first_hidden
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
-from imulab.records.shape import check_blob_text
+from imulab.records.sections import Part, Positive, Size, check_sizes, read
 
 FORMAT = "imulab.blob"
 _HEAD = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Kind(Part):
+    kind: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Text(Part):
+    sensor: dict[str, str]
+    software: str
+    records: list[str]
+    sections: list[_Kind]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Triad(Part):
+    output_unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Centrifuge(Part):
+    axes: list[str]
+    highest: Size
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Warmup(Part):
+    axes: Annotated[list[str], "columns"]
+    units: Annotated[list[str], "columns"]
+    range: Annotated[list[float], 2]
+    end: Size
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Array(Part):
+    elements: int
+    axes: int
+    method: str
+    rate: Positive
+
+
+_COLUMNS: dict[str, type[Part]] = {
+    "tumble": _Triad,
+    "gyro": _Triad,
+    "centrifuge": _Centrifuge,
+    "warmup": _Warmup,
+    "array": _Array,
+}
+"""What the text says of a section of each kind."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +133,7 @@ def load_blob(path: str | Path) -> Blob:
         raise RecordError(f"{path}: the blob has no description of its units: it is for firmware only") from None
     names = {number: name for name, number in KINDS.items()}
     try:
-        check_blob_text(content, [names[kind] for kind, _ in _sections(data) if kind != TEXT])
+        _check_text(content, [names[kind] for kind, _ in _sections(data) if kind != TEXT])
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
     if place := first_hidden(content):
@@ -91,11 +141,22 @@ def load_blob(path: str | Path) -> Blob:
     return Blob(str(path), data, content)
 
 
-def load_any(path: str | Path) -> Calibration | Blob:
-    """Read a record or a blob; errors as for `imulab.load` and `load_blob`."""
-    from imulab.records.calibration import load
+def _check_text(text: Any, kinds: list[str]) -> None:
+    """Check that what a blob says of its sections, of these kinds, in this order, is what `make_blob` writes."""
+    _complete(_Text, text, "its text")
+    check_sizes(text)
+    said = [section["kind"] for section in text["sections"]]
+    if said != kinds:
+        raise RecordError(f"its text speaks of {' '.join(map(str, said))}, but it holds {' '.join(kinds)}")
+    for number, kind in enumerate(kinds):
+        _complete(_COLUMNS[kind], text["sections"][number], f"sections[{number}]")
 
-    return load_blob(path) if is_blob(path) else load(path)
+
+def _complete(kind: type[Part], text: Any, place: str) -> None:
+    found = read(kind, text, place)
+    missing = [key for key in kind.__dataclass_fields__ if key not in vars(found)]
+    if missing:
+        raise RecordError(f"{place} lacks {missing[0]}")
 
 
 def _sections(data: bytes) -> Iterator[tuple[int, bytes]]:

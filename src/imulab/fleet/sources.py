@@ -229,7 +229,7 @@ class UnitFiles:
 
     def record(self, name: str) -> Calibration:
         """Read a calibration record."""
-        from imulab.records.calibration import loads
+        from imulab.procedures.loading import loads
 
         try:
             data = self.path(name).read_bytes()

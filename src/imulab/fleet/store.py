@@ -23,7 +23,8 @@ from typing import Any
 from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
 from imulab.fleet.manifest import FleetManifest, Unit
-from imulab.records.calibration import Calibration, load_sealed
+from imulab.procedures.loading import load_sealed
+from imulab.records.calibration import Calibration
 
 MOST_ATTEMPTS = 3
 """A unit that was under work when its process ended this often is not tried again."""

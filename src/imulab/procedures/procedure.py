@@ -132,6 +132,8 @@ class Procedure:
         Of its part in the report of a fleet.
     task
         How it is run on the files of one unit.
+    check
+        Of a record read from its file: raises RecordError where its sections are not what the procedure writes.
     exhibits
         Record to headline, facts, figures and tables.
     tables
@@ -162,6 +164,7 @@ class Procedure:
     title: str
     line_title: str
     task: Task
+    check: Callable[[Calibration], None]
     exhibits: Callable[[Calibration], Exhibits]
     tables: Callable[..., tuple[Table, ...]]
     sections: tuple[Section, ...]

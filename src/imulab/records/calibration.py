@@ -26,7 +26,7 @@ from imulab.printable import first_hidden, has_hidden, printable
 from imulab.recording import Source
 from imulab.records.json_text import content_sha256, sealed_text
 from imulab.records.json_text import json_text as json_text
-from imulab.records.shape import check_shape
+from imulab.records.sections import check_sizes
 from imulab.verdict import UNJUDGED, Verdict, as_judged, verdict_of
 
 FORMAT = "imulab.calibration"
@@ -62,7 +62,16 @@ class Covariance:
         return np.array(self.matrix, dtype=np.float64).reshape(len(self.names), len(self.names))
 
     def block(self, names: Sequence[str]) -> NDArray[np.float64]:
-        """Return the matrix of some of the parameters, in this order, shape (q, q)."""
+        """Return the matrix of some of the parameters, in this order, shape (q, q).
+
+        Raises
+        ------
+        RecordError
+            The record lacks it.
+        """
+        for name in names:
+            if name not in self.names:
+                raise RecordError(f"the record lacks the covariance of {name}")
         index = [self.names.index(name) for name in names]
         return self.array()[np.ix_(index, index)]
 
@@ -114,8 +123,20 @@ class Calibration:
             object.__setattr__(self, "verdict", verdict_of(self.warnings))
 
     def value(self, name: str) -> float:
-        """Return the value of a parameter."""
-        return self.parameters[name].value
+        """Return the value of a parameter; errors as for `parameter`."""
+        return self.parameter(name).value
+
+    def parameter(self, name: str) -> Parameter:
+        """Return a parameter.
+
+        Raises
+        ------
+        RecordError
+            The record lacks it.
+        """
+        if name not in self.parameters:
+            raise RecordError(f"the record lacks {name}")
+        return self.parameters[name]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the record as plain JSON values, ``content_sha256`` included.
@@ -191,35 +212,16 @@ class Calibration:
         return "\n".join(lines)
 
 
-def load(path: str | Path) -> Calibration:
-    """Read a calibration record.
+def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
+    """Return a record from the bytes of its file, and its ``content_sha256``.
+
+    What its procedure says of its sections is still to be checked: `imulab.procedures.loading.load` does both.
 
     Raises
     ------
     RecordError
-        The file is missing, is no record, is of a newer version, was altered, or lacks something.
+        It is no record, is of a newer version, was altered, or lacks something.
     """
-    return load_sealed(path)[0]
-
-
-def load_sealed(path: str | Path) -> tuple[Calibration, str]:
-    """Read a calibration record and its ``content_sha256``; errors as for `load`."""
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise RecordError(f"{path}: no such file") from None
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
-    return loads_sealed(data, str(path))
-
-
-def loads(data: bytes, name: str) -> Calibration:
-    """Read a calibration record from the bytes of its file; errors as for `load`."""
-    return loads_sealed(data, name)[0]
-
-
-def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
-    """Return a record from the bytes of its file, and its ``content_sha256``; errors as for `load`."""
     if data.startswith(BLOB_MAGIC):
         raise RecordError(
             f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
@@ -300,7 +302,7 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
         raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
     try:
         _check_numbers(record)
-        check_shape(content, record.procedure)
+        check_sizes(content)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
     return replace(record, warnings=as_judged(record.warnings, record.verdict))

@@ -13,6 +13,7 @@ ENTRY = Procedure(
     title="Centrifuge test",
     line_title="Centrifuge",
     task=TASK,
+    check=deferred(f"{_HERE}.sections:check"),
     exhibits=deferred(f"{_HERE}.figures:exhibits"),
     tables=deferred(f"{_HERE}.device:tables_of"),
     sections=(

@@ -13,6 +13,7 @@ ENTRY = Procedure(
     title="Warm-up table",
     line_title="Warm-up",
     task=TASK,
+    check=deferred(f"{_HERE}.sections:check"),
     exhibits=deferred(f"{_HERE}.figures:exhibits"),
     tables=deferred(f"{_HERE}.device:tables_of"),
     sections=(

@@ -1,0 +1,184 @@
+"""What code reads of a centrifuge record, with types."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from imulab.errors import RecordError
+from imulab.records.calibration import Calibration
+from imulab.records.sections import Above0, Kind, Length, Part, Quantity, Size, part
+
+Sense = Annotated[int, Kind("1 or -1", lambda value: type(value) is int and value in (1, -1))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model(Part):
+    """``model``; the terms of the curve by axis."""
+
+    radius: Quantity
+    gravity: Quantity
+    reference: Quantity
+    curve: dict[str, str]
+    highest_specific_force: Length
+    temperature: Quantity | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried(Part):
+    """One model of the curve that was tried."""
+
+    model: str
+    coefficients: int
+    chi_square: float
+    chosen: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve(Part):
+    """The models tried on one axis."""
+
+    tried: list[Tried]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeatability(Part):
+    """``fit.repeatability``."""
+
+    relative_standard_deviation: Size
+    direction: Length
+    within_power_cycle: Size
+
+
+@dataclass(frozen=True, kw_only=True)
+class CycleRow(Part):
+    """K and zeta of one power cycle, by axis."""
+
+    power_cycle: float
+    x: dict[str, Quantity] = field(default_factory=dict)
+    y: dict[str, Quantity] = field(default_factory=dict)
+    x_down: dict[str, Quantity] = field(default_factory=dict)
+    y_down: dict[str, Quantity] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Error(Part):
+    """One row of the error budget."""
+
+    error: str
+    bounded: bool
+    value: float | None
+    standard_uncertainty: Size | None
+    unit: str
+    effect: float
+    removed: float | None
+    basis: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Part):
+    """``fit``; factors and degrees of freedom by parameter, curves by axis."""
+
+    method: str
+    noise: str
+    coverage_factor_95: dict[str, float]
+    degrees_of_freedom: dict[str, float]
+    curves: dict[str, Curve]
+    repeatability: Repeatability
+    power_cycles: list[CycleRow] = field(default_factory=list)
+    error_budget: list[Error]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line(Part):
+    """Amplitudes in and out of phase with their covariance; of a run also K, from its amplitude."""
+
+    A: float
+    B: float
+    covariance: Annotated[list[Annotated[list[float], 2]], 2]
+    unit: str
+    K: Quantity | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level(Part):
+    """One of ``levels``: its runs by their place in ``runs``, and the drift per specific force of each axis."""
+
+    level: int
+    specific_force: Above0
+    runs: list[int]
+    x: Line | None = None
+    y: Line | None = None
+    x_down: Line | None = None
+    y_down: Line | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(Part):
+    """One of ``runs``; what follows `specific_force` is of loaded runs."""
+
+    file: str
+    window: str | None = None
+    power_cycle: float
+    role: str
+    sense: Sense
+    spin_axis: str
+    specific_force: Length
+    table_rate_used: Quantity
+    table_rate_from: str
+    periods: float
+    x: Line | None = None
+    y: Line | None = None
+    fog: Line
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spectrum(Part):
+    """One of ``data.spectra``: heights of lines over the rate, rad/s, by column."""
+
+    level: int
+    spin_axis: str
+    rate: Annotated[list[float], "rates"]
+    height: dict[str, Annotated[list[float], "rates"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Data(Part):
+    """``data``."""
+
+    spectra: list[Spectrum]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Centrifuge(Part):
+    """A centrifuge record."""
+
+    model: Model
+    fit: Fit
+    levels: Annotated[list[Level], "levels"]
+    runs: Annotated[list[Run], "runs"]
+    data: Data
+
+
+def centrifuge_of(record: Calibration) -> Centrifuge:
+    """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
+    return part(record, Centrifuge)
+
+
+def check(record: Calibration) -> None:
+    """Check the sections of a record as it is read from its file; raises RecordError."""
+    centrifuge_of(record)
+
+
+def level_of(levels: list[Level], number: int) -> Level:
+    """Return the level of this number.
+
+    Raises
+    ------
+    RecordError
+        There is none.
+    """
+    for level in levels:
+        if level.level == number:
+            return level
+    raise RecordError(f"levels: level {number} is missing")

@@ -1,0 +1,219 @@
+"""What code reads of a gyro array's record, a calibration or a comparison of methods, with types."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, TypeVar
+
+import numpy as np
+
+from imulab.errors import RecordError
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.records.sections import Above0, Length, Part, Positive, Quantity, part
+
+T = TypeVar("T")
+PerAxis = Annotated[list[T], "axes"]
+PerElement = Annotated[list[T], "elements"]
+Square = Annotated[list[Annotated[list[float], "elements"]], "elements"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model(Part):
+    """``model``; `units`, `truth` and `calibrated` of a comparison, `aligned` and `gauge` of a calibration."""
+
+    kind: str
+    elements: int
+    axes: PerAxis[str]
+    aligned: bool
+    gauge: str | None
+    unit: str
+    units: PerAxis[str]
+    truth: str
+    calibrated: bool
+    temperature: Quantity | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Part):
+    """``fit``."""
+
+    sample_rate: Above0
+    duration: Above0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerGyro(Part):
+    """A number of an element: one where it has one axis, a list over x, y, z where it has three."""
+
+    value: PerAxis[float | None] | float | None
+    standard_uncertainty: PerAxis[float | None] | float | None
+    unit: str
+
+    @property
+    def values(self) -> Array:
+        """The values, shape (axes,), nan where there is none."""
+        return np.atleast_1d(np.array(self.value, dtype=np.float64))
+
+    @property
+    def uncertainties(self) -> Array:
+        """The standard uncertainties, likewise."""
+        return np.atleast_1d(np.array(self.standard_uncertainty, dtype=np.float64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matrix(Part):
+    """The alignment of an element of three axes."""
+
+    value: PerAxis[PerAxis[float]]
+    standard_uncertainty: PerAxis[PerAxis[float]]
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Element(Part):
+    """One of ``elements``."""
+
+    name: str
+    bias: PerGyro
+    scale_factor: Quantity | None = None
+    matrix: Matrix | None = None
+    residual: PerGyro | None = None
+    angle_random_walk: PerGyro
+    bias_instability: PerGyro
+    rate_random_walk: PerGyro
+    quantisation: PerGyro
+
+    @property
+    def alignment(self) -> Array:
+        """The matrix from readings to rates, shape (axes, axes); one axis has the inverse of its scale factor."""
+        if self.matrix is not None:
+            return np.array(self.matrix.value)
+        if self.scale_factor is None or not self.scale_factor.value:
+            raise RecordError(f"the record lacks the matrix or scale factor of element {self.name}")
+        return np.array([[1 / self.scale_factor.value]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correlation(Part):
+    """``correlation``: the noise that elements share on each axis, and the weights that it asks for."""
+
+    averaging_time: Above0
+    matrix: PerAxis[Square]
+    covariance: PerAxis[Square]
+    standard_uncertainty: PerAxis[Square]
+    weights: PerAxis[PerElement[float]]
+    limit: PerAxis[Length]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AllanCurve(Part):
+    """A curve of Allan deviation over averaging time, s."""
+
+    tau: list[Positive]
+    deviation: list[float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationData(Part):
+    """``data`` of a calibration."""
+
+    allan: PerAxis[PerElement[AllanCurve]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayRecord(Part):
+    """The record of a calibration."""
+
+    model: Model
+    fit: Fit
+    elements: PerElement[Element]
+    correlation: Correlation
+    data: CalibrationData
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodRow(Part):
+    """What a method reaches on one axis; None where it has no such number."""
+
+    rate_std: float
+    rate_max: float
+    angle_std: float
+    angle_max: float
+    reduction: float | None
+    over_limit: float
+    bandwidth: float
+    split_half: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Health(Part):
+    """Weights and flags of each gyro over time, s; nothing where the method robust failed."""
+
+    time: Annotated[list[float], "times"]
+    weight: Annotated[list[PerAxis[PerElement[float | None]]], "times"]
+    flags: Annotated[list[PerAxis[PerElement[int]]], "times"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonData(Part):
+    """``data`` of a comparison, by method; a method that failed has the reason as text."""
+
+    figures: dict[str, PerAxis[MethodRow] | str]
+    allan: dict[str, PerAxis[AllanCurve]]
+    angle: dict[str, PerAxis[Annotated[list[float], "trace"]]]
+    trace_time: Annotated[list[float], "trace"]
+    health: Health
+    single: PerAxis[float]
+    working: PerAxis[list[str]]
+    readings_names: PerAxis[PerElement[str]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonRecord(Part):
+    """The record of a comparison."""
+
+    model: Model
+    fit: Fit
+    data: ComparisonData
+
+
+def model_of(record: Calibration) -> Model:
+    """Return the section ``model``; a part that is wrong raises RecordError, one that is missing when it is read."""
+    return part(record, Model, "model")
+
+
+def comparison_of(record: Calibration) -> ComparisonRecord:
+    """Return the sections of a comparison; errors as for `model_of`."""
+    return part(record, ComparisonRecord)
+
+
+def array_of(record: Calibration) -> ArrayRecord:
+    """Return the sections of a calibration; errors as for `model_of`.
+
+    Raises
+    ------
+    RecordError
+        Its elements have another number of axes than it says, or noise without size.
+    """
+    found = part(record, ArrayRecord)
+    held = vars(found)
+    many = len(vars(held.get("model", found)).get("axes", ())) > 1
+    for number, element in enumerate(held.get("elements", ())):
+        for name, value in vars(element).items():
+            if isinstance(value, PerGyro) and isinstance(vars(value).get("value", [0] * many), list) is not many:
+                raise RecordError(
+                    f"elements[{number}].{name}.value: expected {'a list over the axes' if many else 'a number'}"
+                )
+    for axis, matrix in enumerate(vars(held.get("correlation", found)).get("covariance", ())):
+        if not all(row[i] > 0 for i, row in enumerate(matrix)):
+            raise RecordError(f"correlation.covariance[{axis}]: expected variances above 0")
+    return found
+
+
+def check(record: Calibration) -> None:
+    """Check the sections of a record as it is read from its file; raises RecordError."""
+    if record.model.get("kind") == "comparison":
+        comparison_of(record)
+    else:
+        array_of(record)

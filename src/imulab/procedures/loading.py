@@ -1,0 +1,54 @@
+"""Calibration records from their files, each checked by the procedure that it names; records and blobs alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from imulab.device.blob import Blob, is_blob, load_blob
+from imulab.errors import RecordError
+from imulab.procedures.registry import PROCEDURES
+from imulab.records.calibration import Calibration, parsed
+
+
+def load(path: str | Path) -> Calibration:
+    """Read a calibration record.
+
+    Raises
+    ------
+    RecordError
+        The file is missing, is no record, is of a newer version, was altered, or lacks something.
+    """
+    return load_sealed(path)[0]
+
+
+def load_sealed(path: str | Path) -> tuple[Calibration, str]:
+    """Read a calibration record and its ``content_sha256``; errors as for `load`."""
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise RecordError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+    return loads_sealed(data, str(path))
+
+
+def loads(data: bytes, name: str) -> Calibration:
+    """Read a calibration record from the bytes of its file; errors as for `load`."""
+    return loads_sealed(data, name)[0]
+
+
+def load_any(path: str | Path) -> Calibration | Blob:
+    """Read a record or a blob; errors as for `load` and `load_blob`."""
+    return load_blob(path) if is_blob(path) else load(path)
+
+
+def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
+    """Return a record from the bytes of its file, and its ``content_sha256``; errors as for `load`."""
+    record, seal = parsed(data, name)
+    try:
+        for entry in PROCEDURES.values():
+            if entry.name == record.procedure:
+                entry.check(record)
+    except RecordError as error:
+        raise RecordError(f"{name}: {error}") from None
+    return record, seal
