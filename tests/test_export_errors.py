@@ -8,6 +8,7 @@ import pytest
 
 import madeup
 from imulab.cli import main
+from imulab.exporters import c
 
 
 @pytest.fixture
@@ -76,3 +77,27 @@ def test_a_serial_cannot_end_a_comment(folder, capsys):
     if compiler:
         strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
         subprocess.run([compiler, *strict, folder / "out" / "unit.c", folder / "out" / "selftest.c"], check=True)
+
+
+@pytest.mark.parametrize("change", ["edited", "new"])
+def test_sources_that_were_changed_after_they_were_compiled_are_not_exported(folder, capsys, monkeypatch, change):
+    """After a pull without a build the sources would be of two versions, and none of them that of the desk."""
+    source = folder / "runtime"
+    shutil.copytree(c._CHECKOUT, source)
+    monkeypatch.setattr(c, "_CHECKOUT", source)
+    if change == "edited":
+        (source / "warmup.c").write_text((source / "warmup.c").read_text() + "/* newer */\n")
+    else:
+        (source / "later.c").write_text("")
+        monkeypatch.setattr(c, "_CORE", (*c._CORE, "later.c"))
+    name = "warmup.c" if change == "edited" else "later.c"
+    assert main(["export", "--to", "c", "accel.json", "-o", "out"]) == 2
+    err = capsys.readouterr().err
+    assert err == f"imulab: {name}: the compiled part is older than the source: build again (pip install -e .)\n"
+    assert not (folder / "out").exists()
+
+
+def test_a_record_that_does_not_follow_power_on_needs_no_power_on_temperature(folder, capsys):
+    (folder / "in.csv").write_text("time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2]\n0,1,2,3\n")
+    assert main(["apply", "accel.json", "in.csv", "--temperature-column", "-o", "out.csv"]) == 0
+    assert "power_on_temperature" not in (folder / "out.csv").read_text()

@@ -119,6 +119,22 @@ def test_bytes_that_are_no_utf_8_in_lines_that_are_skipped_do_not_matter(layout,
 FOG = '[columns]\nfog = { from = 0, unit = "V", %s }\n'
 REFUSED = {
     "scale 0": (FOG % "scale = 0", "column fog: scale = 0; expected a number other than 0"),
+    "scale tiny": (
+        FOG % "scale = 1e-320",
+        "column fog: scale: expected a size from 1e-30 to 1e+30, found",
+    ),
+    "factor tiny": (
+        FOG % 'scale_factor = { value = 1e-320, unit = "V/(deg/s)" }',
+        "column fog: scale_factor: expected a size from 1e-30 to 1e+30, found",
+    ),
+    "zero huge": (
+        FOG % 'zero = { value = 1e300, unit = "V" }',
+        "column fog: zero: expected a size from 1e-30 to 1e+30, found 1e+300",
+    ),
+    "rate tiny": (
+        "sample_rate = 1e-308\n" + FOG % "scale = 1",
+        "sample_rate: expected a number of Hz from 1e-06 to 1e+09, found 1e-308",
+    ),
     "scale inf": (FOG % "scale = inf", "column fog: scale: expected a number, found inf"),
     "scale text": (FOG % 'scale = "2"', "column fog: scale: expected a number, found '2'"),
     "factor number": (
@@ -217,3 +233,11 @@ def test_the_command_says_it_in_one_line(imulab, tmp_path, layout, file):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "imulab: foreign.toml: column fog: scale = 0; expected a number other than 0\n"
     assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_reading_too_large_for_a_number_warns_of_no_line_of_source(imulab, tmp_path, layout, file):
+    layout(FOG % "scale = 1e30")
+    file(b"1\n1e300\n")
+    done = imulab("convert", "log.txt", "--layout", "foreign.toml", "-o", "out.csv")
+    assert done.returncode == 0
+    assert "Warning" not in done.stderr

@@ -290,6 +290,15 @@ def test_a_bad_line_of_a_stream_does_not_lose_the_good_rows_before_it(pipe):
         next(rows)
 
 
+def test_a_date_of_a_stream_that_runs_backwards_does_not_lose_the_good_rows_before_it(pipe):
+    pipe(b"2026-11-22 15:04:05,1\n2026-11-22 15:04:06,2\n2026-11-22 15:04:02,3\n2026-11-22 15:04:09,4\n")
+    rows = read_blocks("-", columns("time", "accel_x", date=True))
+    block = next(rows)
+    assert (block.time.tolist(), block.column("accel_x").tolist()) == ([0, 1], [1, 2])
+    with pytest.raises(ReadError, match=r"row 3 \(line 3\), column time: time runs backwards"):
+        next(rows)
+
+
 @pytest.mark.parametrize("above", [b"", b"0,1\n1,2\n"])
 def test_a_line_of_fifty_megabytes_is_refused_at_once(pipe, above):
     pipe(HEAD + above + b"7" * 50_000_000)

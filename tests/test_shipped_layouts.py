@@ -1,8 +1,10 @@
 """Layouts that come with imulab: files in each format, made here from what is documented of it."""
 
+import json
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -256,6 +258,11 @@ def test_formats_lists_them_and_prints_one(imulab):
         assert re.search(rf"^{entry.name} +{re.escape(entry.about)} +time ", shown, re.M)
     printed = imulab("show", "--formats", "euroc").stdout
     assert printed == shipped_file("euroc").read_text()
+    said = json.loads(imulab("show", "--formats", "--json").stdout)
+    assert [entry["name"] for entry in said["layouts"]] == [entry.name for entry in shipped()]
+    assert {"name": "ROS 1 bag", "files": ".bag", "use": "read", "layout": ""}.items() <= said["formats"][5].items()
+    one = json.loads(imulab("show", "--formats", "euroc", "--json").stdout)["euroc"]
+    assert one == tomllib.loads(shipped_file("euroc").read_text())
     refused = imulab("show", "--formats", "nothing")
     assert refused.returncode == 2
     assert "nothing: expected the name of a layout: androsensor" in refused.stderr

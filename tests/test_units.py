@@ -38,9 +38,12 @@ ONE = {
     "count": 1.0,
     "V": 1.0,
     "mV": 1.0,
+    "A": 1.0,
+    "mA": 1.0,
     "pulse/s": 1.0,
     "count/(deg/s)": 57.295779513082320877,
     "V/(deg/s)": 57.295779513082320877,
+    "mA/(deg/s)": 57.295779513082320877,
     "m": 1.0,
     "Hz": 1.0,
     "1": 1.0,
@@ -86,7 +89,7 @@ def test_arrays_are_converted_as_their_elements():
     assert from_si(values, "mg").tolist() == [from_si(value, "mg") for value in values.tolist()]
 
 
-@pytest.mark.parametrize("symbol", ["count", "V", "mV", "pulse/s", "m/s^2", "rad/s", "degC", "s"])
+@pytest.mark.parametrize("symbol", ["count", "V", "mV", "A", "mA", "pulse/s", "m/s^2", "rad/s", "degC", "s"])
 def test_counts_volts_and_si_keep_every_bit(symbol):
     values = np.random.default_rng(1).standard_normal(100)
     assert to_si(values, symbol).tobytes() == values.tobytes()
@@ -113,6 +116,8 @@ def test_a_unit_converts_to_itself_by_exactly_one(symbol):
         ("V", "g"),
         ("count", "V"),
         ("mV", "count"),
+        ("mA", "mV"),
+        ("A", "V"),
         ("pulse/s", "count"),
         ("count/(deg/s)", "V/(deg/s)"),
         ("deg", "deg/s"),
@@ -176,11 +181,17 @@ def test_millivolts_and_volts_convert_to_each_other():
     assert conversion_factor("V", "mV") == 1000.0
 
 
+def test_milliamperes_and_amperes_convert_to_each_other():
+    assert conversion_factor("mA", "A") == 0.001
+    assert conversion_factor("A", "mA") == 1000.0
+
+
 @pytest.mark.parametrize(
     ("text", "output", "measured"),
     [
         ("V/(deg/s)", "V", "deg/s"),
         ("mV/g", "mV", "g"),
+        ("mA/g", "mA", "g"),
         ("LSB/dps", "count", "deg/s"),
         ("count/(m/s^2)", "count", "m/s^2"),
         ("pulse/s/(deg/h)", "pulse/s", "deg/h"),

@@ -194,7 +194,10 @@ def test_a_power_on_temperature_comes_from_the_column_when_that_is_asked_for(fol
     found, want = il.read(out), il.apply(il.load(folder / "zero.json"), recording)
     np.testing.assert_allclose(found.column("gyro_x"), want.column("gyro_x"), rtol=1e-12, atol=1e-9)
     assert found.metadata["power_on_temperature"] == "3.0"
-    assert "150000 rows of " in capsys.readouterr().err
+    assert found.metadata["power_on_temperature_from"] == "the first reading of the column temperature"
+    err = capsys.readouterr().err
+    assert "150000 rows of " in err
+    assert err.count("the power-on temperature was taken from the first reading of the column temperature") == 1
     assert "no reading in a column temperature" in refused(
         capsys, folder, replace(cycle(3.0, 1), metadata={}), "--temperature-column"
     )

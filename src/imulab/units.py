@@ -2,7 +2,7 @@
 
 Inside imulab every number is in SI (s, m/s^2, rad, rad/s; temperature in degC). This module is the one place
 that knows other units. What a sensor puts out before calibration (counts, volts) has no SI value of its own:
-such units are kept as they are, with the quantity ``"output"``; only `conversion_factor` turns mV into V.
+such units are kept as they are, with the quantity ``"output"``; only `conversion_factor` turns mV into V and mA into A.
 
 Source: SI brochure, 9th edition; standard gravity: 3rd CGPM (1901), 9.80665 m/s^2 exactly.
 """
@@ -64,10 +64,14 @@ _UNITS = {
         Unit("count", "output"),
         Unit("V", "output"),
         Unit("mV", "output"),
+        Unit("A", "output"),
+        Unit("mA", "output"),
         Unit("pulse/s", "output"),
         Unit("count/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("V/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("mV/(deg/s)", "output per rate", 1.0 / _DEGREE),
+        Unit("A/(deg/s)", "output per rate", 1.0 / _DEGREE),
+        Unit("mA/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("pulse/s/(deg/s)", "output per rate", 1.0 / _DEGREE),
         Unit("m", "length"),
         Unit("Hz", "frequency"),
@@ -103,7 +107,7 @@ _SPELLINGS = {
     "lsb": "count",
     "pulses/s": "pulse/s",
 }
-_IN_VOLTS = {"V": 1.0, "mV": 1e-3}
+_ELECTRIC = {"V": ("V", 1.0), "mV": ("V", 1e-3), "A": ("A", 1.0), "mA": ("A", 1e-3)}
 
 
 def parse_unit(text: str) -> Unit:
@@ -132,7 +136,7 @@ def parse_scale_factor(text: str) -> tuple[Unit, Unit]:
     Raises
     ------
     UnitError
-        It is no output (count, V, mV, pulse/s) per unit of something else.
+        It is no output (count, V, mV, A, mA, pulse/s) per unit of something else.
     """
     for place in (i for i, sign in enumerate(text) if sign == "/"):
         output, measured = text[:place], text[place + 1 :].strip()
@@ -189,11 +193,12 @@ def conversion_factor(source: str, target: str) -> float:
     Raises
     ------
     UnitError
-        The two do not measure the same quantity; of the outputs only V and mV convert to each other.
+        The two do not measure the same quantity; of the outputs only V and mV, and A and mA, convert to each other.
     """
     a, b = parse_unit(source), parse_unit(target)
-    if a.symbol in _IN_VOLTS and b.symbol in _IN_VOLTS:
-        return _IN_VOLTS[a.symbol] / _IN_VOLTS[b.symbol]
+    (base, factor), (other, divisor) = (_ELECTRIC.get(unit.symbol, (unit.symbol, 1.0)) for unit in (a, b))
+    if base == other and a.symbol != b.symbol:
+        return factor / divisor
     if a.quantity != b.quantity or (a.quantity.startswith("output") and a.symbol != b.symbol):
         raise UnitError(f"cannot convert {a.symbol} ({a.quantity}) to {b.symbol} ({b.quantity})")
     return a.factor / b.factor if a.symbol != b.symbol else 1.0

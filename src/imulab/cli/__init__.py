@@ -6,6 +6,7 @@ import atexit
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 
 from imulab.printable import printable
@@ -81,6 +82,8 @@ def _main(arguments: Sequence[str] | None) -> int:
 def run() -> None:
     """Entry point of the installed command; a termination unwinds it, so that no part of a file stays behind."""
     signal.signal(signal.SIGTERM, _terminate)
+    if not sys.warnoptions and not os.environ.get("IMULAB_DEBUG"):
+        warnings.simplefilter("ignore")  # they name lines of sources, not what a person can mend
     closed = _open_closed()
     status = main()
     if "stdout" in closed:  # what could not be written is not tried again at the end, with a traceback

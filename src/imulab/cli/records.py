@@ -95,7 +95,7 @@ def apply(
                 )
             )
     blocks = heard(read_blocks(file, layout, **part), notes=False)
-    if temperature_column:
+    if temperature_column and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
     write_out(rows.counted(apply_blocks(chain, _warned(records, blocks))), output)
@@ -120,6 +120,8 @@ class _Rows:
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
     from imulab.procedures.apply import beyond_message, beyond_test_of, warnings_of
+    from imulab.procedures.warmup.poweron import TAKEN_FROM
+    from imulab.verdict import Note
 
     counts, largest, name = [0] * len(records), [0.0] * len(records), ""
     for number, block in enumerate(blocks):
@@ -132,6 +134,8 @@ def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> I
         yield block
         if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
             messages = [message for record in records for message in warnings_of(record, block)]
+            if power_on := block.metadata.get(TAKEN_FROM):
+                messages.append(Note(f"{block.name}: the power-on temperature was taken from {power_on}"))
             messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]
             for message in dict.fromkeys(messages):
                 warn(message)
@@ -154,7 +158,7 @@ def show(
 ) -> None:
     """Say what is in a record or a recording, or what changed between two records of one unit."""
     if formats:
-        _show_formats(files or [])
+        _show_formats(files or [], json=json)
         return
     if not files:
         raise OptionError("show: expected a FILE, two records, or --formats")
@@ -181,18 +185,29 @@ def show(
     print(recording_json(blocks) if json else describe_recording(blocks))
 
 
-def _show_formats(names: list[str]) -> None:
+def _show_formats(names: list[str], *, json: bool) -> None:
     """Print what can be read, or the layouts of these names."""
     from imulab.cli.show import aligned
     from imulab.readers import formats, shipped
     from imulab.readers.layout import EXAMPLE, shipped_file, shipped_names
+    from imulab.toml import load_toml
 
+    tables = {}
     for name in names:
         path = shipped_file(name)
         if path is None:
             raise OptionError(f"show --formats {name}: expected the name of a layout: {' '.join(shipped_names())}")
-        print(path.read_text(encoding="utf-8").rstrip("\n"))
+        tables[name] = load_toml(path, name, "layout")
+        if not json:
+            print(path.read_text(encoding="utf-8").rstrip("\n"))
+    if names and json:
+        print(dumps(tables, indent=1, ensure_ascii=False))
     if names:
+        return
+    if json:
+        kinds = [dict(zip(("name", "files", "use", "layout", "needs"), row, strict=True)) for row in formats.table()[1]]
+        known = [dict(zip(("name", "files", "columns"), row, strict=True)) for row in shipped.table()[1]]
+        print(dumps({"formats": kinds, "layouts": known}, indent=1, ensure_ascii=False))
         return
     lines = [*aligned(*formats.table()), "", "Layouts that come with imulab (--layout NAME):", ""]
     lines += [*aligned(*shipped.table()), "", "imulab show --formats NAME prints one, to copy and change."]

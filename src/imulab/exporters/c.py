@@ -35,6 +35,7 @@ _CORE = (
     "robust_motion.c",
     "table.c",
 )
+_CHECKOUT = Path(__file__).resolve().parents[3] / "runtime"
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
 _OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust)\.h"\n', re.MULTILINE)
 
@@ -74,11 +75,20 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
 
 
 def _source(name: str) -> str:
-    """A file of the core: installed beside the package, or in the checkout."""
+    """Return a file of the core, as it was compiled; in a checkout it must be what the checkout has.
+
+    Raises
+    ------
+    OptionError
+        The checkout was changed after it was built: what is exported would not compute what the desk does.
+    """
     installed = files("imulab") / "core" / name
-    if installed.is_file():
-        return installed.read_text(encoding="utf-8")
-    return (Path(__file__).resolve().parents[3] / "runtime" / name).read_text(encoding="utf-8")
+    compiled = installed.read_text(encoding="utf-8") if installed.is_file() else None
+    checkout = _CHECKOUT / name
+    source = checkout.read_text(encoding="utf-8") if checkout.is_file() else None
+    if compiled is None or (_CHECKOUT.is_dir() and source != compiled):
+        raise OptionError(f"{name}: the compiled part is older than the source: build again (pip install -e .)")
+    return compiled
 
 
 def _firmware(name: str) -> str:

@@ -56,9 +56,10 @@ _KEYS = (
     "zero",
 )
 _COLUMN_KEYS = ("from", "unit", "scale", "zero", "scale_factor")
-_COUNTERS = [2.0**8, 2.0**16, 2.0**32]
 _ASCII = bytes(range(32, 92)) + bytes(range(93, 127)) + b"\\u0041\t\n"
 """What an encoding of titles must leave as it is; the escape is one that unicode_escape would change."""
+_LARGEST = 1e30
+_RATES = (1e-6, 1e9)
 _BY_COLUMN = {
     "scale_factor": '{ value = 0.02, unit = "V/(deg/s)" }',
     "zero": '{ value = 2.5, unit = "V" }',
@@ -80,13 +81,14 @@ class LayoutColumn:
     date: bool = False
 
     def convert(self, values: Array) -> None:
-        """Turn what was read into readings, in place."""
-        if self.scale != 1.0:
-            values *= self.scale
-        if self.zero != 0.0:
-            values -= self.zero
-        if self.scale_factor != 1.0:
-            values /= self.scale_factor
+        """Turn what was read into readings, in place; a number that no reading can be becomes infinite."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.scale != 1.0:
+                values *= self.scale
+            if self.zero != 0.0:
+                values -= self.zero
+            if self.scale_factor != 1.0:
+                values /= self.scale_factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,67 +133,6 @@ class Layout:
 
 class IfNeeded(str):
     """The name of a layout that is left out where a file says itself what its columns are."""
-
-
-class Readings:
-    """The columns of a file as its layout describes them, block by block: converted, and with their time."""
-
-    def __init__(self, layout: Layout, name: str) -> None:
-        self._layout, self._name = layout, name
-        self._last = np.nan
-        self._carried = 0.0
-        self._dates: dict[str, tuple[int, int]] = {}
-
-    def of(self, columns: Mapping[str, Array], first_row: int, lines_before: int | None = None) -> dict[str, Array]:
-        """Return the readings of a block that begins at row `first_row`; the arrays are changed in place.
-
-        Raises
-        ------
-        ReadError
-            A date is before the one above it.
-        """
-        for name, values in columns.items():
-            column = self._layout.columns[name]
-            if column.date and len(values):
-                self._count_from_first(name, values, first_row, lines_before)
-            else:
-                column.convert(values)
-        rate = self._layout.sample_rate
-        if rate is None:
-            return dict(columns)
-        if "time" in columns:
-            return {**columns, "time": self._unwrapped(columns["time"]) / rate}
-        count = len(next(iter(columns.values())))
-        return {"time": np.arange(first_row - 1, first_row - 1 + count) / rate, **columns}
-
-    def _count_from_first(self, name: str, values: Array, first_row: int, lines_before: int | None) -> None:
-        """Turn dates, nanoseconds since 1970 in the bits of `values`, into seconds since the first of the file."""
-        stamps = values.view(np.int64)
-        first, last = self._dates.get(name, (int(stamps[0]), int(stamps[0])))
-        back = np.diff(stamps, prepend=last) < 0
-        if back.any():
-            index = int(np.argmax(back))
-            row = first_row + index
-            place = f"row {row}" if lines_before is None else f"row {row} (line {row + lines_before})"
-            above = stamps[index - 1] if index else last
-            dates = (np.datetime_as_string(np.datetime64(int(stamp), "ns")) for stamp in (above, stamps[index]))
-            raise ReadError(
-                "{}: {}, column {}: time runs backwards: expected {} UTC or later, found {}".format(
-                    self._name, place, name, *dates
-                )
-            )
-        self._dates[name] = first, int(stamps[-1])
-        values[:] = (stamps - first) / 1e9
-
-    def _unwrapped(self, numbers: Array) -> Array:
-        """Carry a counter on where it begins again, having come near to 2^8, 2^16 or 2^32."""
-        before = np.concatenate([[self._last], numbers[:-1]])
-        fall = before - numbers
-        size = np.select([before < limit for limit in _COUNTERS], _COUNTERS, np.inf)
-        carried = self._carried + np.cumsum(np.where(fall > size / 2, size, 0.0))
-        if len(numbers):
-            self._last, self._carried = float(numbers[-1]), float(carried[-1])
-        return numbers + carried
 
 
 def shipped_names() -> list[str]:
@@ -298,6 +239,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
     scale = number_of(entry.get("scale", 1.0), f"{place}: scale")
     if scale == 0:
         raise ReadError(f"{place}: scale = {entry['scale']!r}; expected a number other than 0")
+    _check_size(scale, f"{place}: scale")
     if entry["unit"] == "iso":
         check_unit(name, "s", path)
         converts = sorted(set(entry) & {"scale", "zero", "scale_factor"})
@@ -323,6 +265,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
             f"{place}: unit = {entry['unit']!r}; expected {known.output.symbol}, the output in the scale factor's unit "
             f"{entry['scale_factor']['unit']}"
         ) from None
+    _check_size(factor, f"{place}: scale_factor")
     check_unit(name, known.measured.symbol, path)
     return LayoutColumn(origin, known.measured.symbol, scale, zero, factor)
 
@@ -337,7 +280,16 @@ def _zero(entry: Any, unit: Unit, place: str) -> float:
         factor = conversion_factor(str(entry["unit"]), unit.symbol)
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
-    return number_of(entry["value"], place) * factor
+    zero = number_of(entry["value"], place) * factor
+    if zero:
+        _check_size(zero, place)
+    return zero
+
+
+def _check_size(value: float, place: str) -> None:
+    """Refuse a number by which ordinary readings would become infinite or nothing."""
+    if not 1 / _LARGEST <= abs(value) <= _LARGEST:
+        raise ReadError(f"{place}: expected a size from {1 / _LARGEST:g} to {_LARGEST:g}, found {value:g}")
 
 
 def _prefix(prefix: Any, delimiter: str, path: str) -> str:
@@ -372,6 +324,7 @@ def _sample_rate(entry: Any, path: str) -> float | None:
     if not isinstance(entry, dict) or set(entry) != {"value", "unit"} or entry["unit"] != "Hz":
         raise ReadError(f'{path}: sample_rate: expected {{ value = 100, unit = "Hz" }}, found {entry!r}')
     value = entry["value"]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
-        raise ReadError(f"{path}: sample_rate: expected a positive number of Hz, found {value!r}")
+    low, high = _RATES
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ReadError(f"{path}: sample_rate: expected a number of Hz from {low:g} to {high:g}, found {value!r}")
     return to_si(float(value), "Hz")

@@ -9,7 +9,8 @@ from typing import Any
 from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
-from imulab.readers.layout import Layout, Readings
+from imulab.readers.layout import Layout
+from imulab.readers.readings import Readings
 from imulab.recording import CORRECTED_BY, Array, Recording, parse_column_title
 
 _NOT_OURS = ("ARROW:", "org.apache.")

@@ -17,8 +17,9 @@ import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers import _text
-from imulab.readers.layout import Layout, Readings
+from imulab.readers.layout import Layout
 from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Crew, Lines
+from imulab.readers.readings import BackwardsError, Readings
 from imulab.recording import CORRECTED_BY, Recording, parse_column_title
 from imulab.verdict import Note
 from imulab.writers.powers_of_ten import powers_of_five
@@ -110,7 +111,12 @@ class TextFile:
                 while waiting and (lines is None or live or len(waiting) > crew.size):
                     job = waiting.popleft()
                     rows, problem, field = job.answer()
-                    recording = self._finish(job.out[:, :rows], row)
+                    try:
+                        recording = self._finish(job.out[:, :rows], row)
+                    except BackwardsError as error:
+                        if live and error.index:
+                            yield self._finish(job.out[:, : error.index], row)
+                        raise
                     if self._lines.unended and not waiting:
                         recording = replace(recording, notes=(*recording.notes, _UNENDED))
                     # The good rows of a stream are not lost with the bad one behind them.

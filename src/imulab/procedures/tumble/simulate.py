@@ -21,6 +21,8 @@ _RING_DECAY = 0.08  # s
 _KNOCK = 30.0  # m/s^2
 _HAND_SWAY = 0.6  # m/s^2
 _MEMS_NONLINEARITY = {2: 5e-3, 3: 2e-3, 4: 1e-3, 5: 5e-4}  # in inverse powers of g
+_PER_G = {"V": 1.0, "mV": 1000.0, "A": 0.001, "mA": 1.0}
+"""Scale factor of outputs, per g; counts otherwise."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def _nominal_scale(unit: str, scale: float | None) -> float:
         return conversion_factor("m/s^2", known.symbol)
     if known.quantity != "output":
         raise OptionError(f"unit {unit}: expected m/s^2 g mg count V")
-    return scale if scale is not None else {"V": 1.0, "mV": 1000.0}.get(known.symbol, 4096.0) / STANDARD_GRAVITY
+    return scale if scale is not None else _PER_G.get(known.symbol, 4096.0) / STANDARD_GRAVITY
 
 
 def _random_sensor(rng: np.random.Generator, order: int, nominal: float) -> dict[str, float]:

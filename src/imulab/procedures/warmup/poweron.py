@@ -12,6 +12,8 @@ from imulab.errors import DataError, UnitError
 from imulab.recording import Array, Recording
 from imulab.units import parse_unit, to_si
 
+TAKEN_FROM = "power_on_temperature_from"
+"""Key of the head beside a power-on temperature that was not measured at power-on, but taken from elsewhere."""
 LATEST_START = 5.0
 """A first sample later than this after power-on is refused, s."""
 _SLOWEST, _FASTEST = 4.0, 2e-5
@@ -97,7 +99,8 @@ def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording
                 f"{block.name}: no power_on_temperature in the head of the file, and no reading in a column "
                 "temperature to take its place"
             )
-        yield replace(block, metadata={**block.metadata, "power_on_temperature": f"{found!r}"})
+        said = {"power_on_temperature": f"{found!r}", TAKEN_FROM: "the first reading of the column temperature"}
+        yield replace(block, metadata={**block.metadata, **said})
 
 
 def head_temperature(recording: Recording, key: str) -> float | None:
