@@ -98,6 +98,6 @@ def test_sources_that_were_changed_after_they_were_compiled_are_not_exported(fol
 
 
 def test_a_record_that_does_not_follow_power_on_needs_no_power_on_temperature(folder, capsys):
-    (folder / "in.csv").write_text("time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2]\n0,1,2,3\n")
+    (folder / "in.csv").write_text("time [s],accel_x [count],accel_y [count],accel_z [count]\n0,1,2,3\n")
     assert main(["apply", "accel.json", "in.csv", "--temperature-column", "-o", "out.csv"]) == 0
     assert "power_on_temperature" not in (folder / "out.csv").read_text()
