@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imulab.cli.fit_options import with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -27,6 +28,7 @@ from imulab.cli.options import (
     whole_number,
 )
 from imulab.errors import OptionError
+from imulab.procedures.gyro_array.task import OPTIONS
 
 if TYPE_CHECKING:
     from imulab.device.blob import Blob
@@ -158,39 +160,23 @@ def merge(
     print(f"{output}: {len(merged.recording)} samples, {len(files)} gyros")
 
 
+@with_options(OPTIONS)
 def calibrate(
     still: Annotated[str, typer.Argument(metavar="STILL", help="Recording at rest.")],
+    options: dict[str, str | None],
     moving: Annotated[
         str | None, typer.Option("--moving", metavar="FILE", help="Recording in motion, for alignment and scale.")
-    ] = None,
-    interval: Annotated[
-        str | None, typer.Option("--interval", metavar="FROM:TO", help="Use STILL between these times only, s.")
-    ] = None,
-    averaging: Annotated[str, typer.Option(help="Averaging time of the covariance matrix.")] = "1 s",
-    method: Annotated[
-        str | None, typer.Option(help="Method that fuse and export take from the record; robust if not given.")
-    ] = None,
-    memory: Annotated[
-        str | None, typer.Option(help="Its memory: growing, growing:COUNT, or a gain between 0 and 1.")
-    ] = None,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Annotated[
-        str | None, typer.Option("--window", metavar="FROM:TO", help="Part of STILL to read, s; as --interval.")
     ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
 ) -> None:
     """Calibrate an array's elements: bias, noise and correlation at rest; sign and scale or alignment in motion."""
-    from imulab.cli.tumble import finish
+    from imulab.cli.result import finish
     from imulab.procedures.run import run_task
 
-    check_outputs([output, report], [name for name in (still, moving, layout) if name])
+    check_outputs([output, report], [name for name in (still, moving, options["layout"]) if name])
     files = [still] if moving is None else [still, moving]
-    options = {"interval": interval, "averaging": averaging, "method": method, "memory": memory, "layout": layout}
-    options |= {"topic": topic, "instance": instance, "window": window}
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
 
@@ -321,6 +307,7 @@ def compare(
 ) -> None:
     """Run every method over one recording, or over the source's experiments, and say what fusing buys."""
     from imulab.cli import arraytext
+    from imulab.cli.result import write_both
 
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
@@ -351,7 +338,7 @@ def compare(
     comparison = compare_methods(
         read(str(file), layout, **reading), calibration=record, memory=kept, count_from=by.start
     )
-    arraytext.write(comparison.record, output, report)
+    write_both(comparison.record, output, report)
     if not json:
         print(verdict_line(comparison.record.verdict))
     print(comparison.record.to_json().rstrip("\n") if json else arraytext.comparison(comparison))

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import asdict
 from json import dumps
 
-from imulab.atomic_write import replacing
 from imulab.cli.show import aligned
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.experiments import ExperimentRow
 from imulab.procedures.gyro_array.model import unit_of_angle
-from imulab.records.calibration import Calibration
 from imulab.report.elements import plain_number
 
 _TITLE = {
@@ -86,16 +83,3 @@ def _those(names: Sequence[str], working: Sequence[str]) -> str:
         return "all"
     failed = " ".join(name for name in names if name not in working)
     return f"the {len(working)} that work (not {failed})" if working else "none"
-
-
-def write(record: Calibration, output: str | None, report: str | None) -> None:
-    """Write record and report, both or none."""
-    from imulab.procedures.reports import rendered
-
-    with ExitStack() as stack:
-        to_record = stack.enter_context(replacing(output)) if output else None
-        to_report = stack.enter_context(replacing(report)) if report else None
-        if to_record:
-            to_record.write(record.to_json().encode("utf-8"))
-        if to_report:
-            to_report.write(rendered(record).encode("utf-8"))

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imulab.cli.fit_options import with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
-    LayoutFile,
     OutputFile,
     ReportFile,
     check_outputs,
@@ -20,6 +20,7 @@ from imulab.cli.options import (
     whole_number,
 )
 from imulab.errors import OptionError
+from imulab.procedures.centrifuge.task import OPTIONS
 
 if TYPE_CHECKING:
     from imulab.procedures.centrifuge.manifest import Manifest
@@ -160,13 +161,10 @@ def simulate(
     _write_simulation(simulation, test, truth, output)
 
 
+@with_options(OPTIONS)
 def reduce(
     manifest: ManifestFile,
-    layout: LayoutFile = None,
-    method: Annotated[
-        str, typer.Option(help="least-squares, or fourier (the source's whole-period sums).")
-    ] = "least-squares",
-    curve: Annotated[str, typer.Option(help="Terms of K(a): auto, constant, c1, c2 or c1+c2.")] = "auto",
+    options: dict[str, str | None],
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -177,14 +175,13 @@ def reduce(
     """
     from pathlib import Path
 
-    from imulab.cli.tumble import finish
+    from imulab.cli.result import finish
     from imulab.procedures.centrifuge.manifest import load_manifest
     from imulab.procedures.run import run_task
 
     test = load_manifest(manifest)
     files = [str(Path(manifest).parent / run.file) for run in test.runs]
-    check_outputs([output, report], [manifest, *([layout] if layout else []), *files])
-    options = {"method": method, "curve": curve, "layout": layout}
+    check_outputs([output, report], [manifest, *([options["layout"]] if options["layout"] else []), *files])
     with progress_bar("runs", len(test.runs)) as progress:
         record = run_task("centrifuge", [manifest], options, GivenFiles(), progress=progress)
     finish(record, output, report, json=json)

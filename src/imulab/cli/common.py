@@ -19,30 +19,19 @@ from imulab.errors import OptionError, listed, meant
 _CHOICES: dict[str, tuple[str, ...]] = {
     "tumble plan --criterion": ("imulab.procedures.tumble.optimal:CRITERIA",),
     "tumble plan --from": ("sphere", "fixture:15", "head:15"),
-    "tumble fit --order": ("auto", "0", "1", "2", "3", "4", "5", "blend"),
-    "tumble fit --method": ("imulab.procedures.tumble.options:METHODS",),
-    "tumble plan --method": ("imulab.procedures.tumble.options:METHODS",),
-    "tumble fit --loss": ("imulab.procedures.tumble.options:LOSSES",),
+    "tumble plan --method": ("imulab.procedures.tumble.choices:METHODS",),
     "tumble gyro --g-sensitivity": ("auto", "yes", "no"),
     "tumble gyro --clock-of": ("gyro", "accel"),
     "array simulate --experiment": ("imulab.procedures.gyro_array.simulate:EXPERIMENTS",),
     "array simulate --mounting": ("same", "alternate"),
     "array simulate --fault": ("imulab.procedures.gyro_array.simulate:FAULTS",),
     "array simulate --unit": ("rad/s", "deg/s", "deg/h"),
-    "array calibrate --method": ("imulab.device.array_settings:METHODS",),
-    "array calibrate --memory": ("growing",),
-    "array fuse --method": ("imulab.device.array_settings:METHODS",),
+    "array fuse --method": ("imulab.device.methods:METHODS",),
     "array fuse --memory": ("growing",),
     "array fuse --initial-bias": ("first", "zero"),
     "array compare --experiment": ("static", "dynamic"),
     "allan --taus": ("octave", "dense"),
     "warmup simulate --law": ("imulab.procedures.warmup.simulate:LAWS",),
-    "warmup fit --model": ("auto", "imulab.procedures.warmup.model:MODELS"),
-    "warmup fit --exit": ("imulab.procedures.warmup.model:EXITS",),
-    "warmup fit --pool": ("imulab.procedures.warmup.fit:POOLS",),
-    "warmup fit --beyond": ("imulab.procedures.warmup.model:BEYOND",),
-    "centrifuge reduce --method": ("imulab.procedures.centrifuge.fit:METHODS",),
-    "centrifuge reduce --curve": ("auto", "imulab.procedures.centrifuge.curve:MODELS"),
     "export --to": ("imulab.exporters:EXPORTERS",),
     "fleet run --engine": ("imulab.fleet.engine:ENGINES",),
 }
@@ -62,9 +51,23 @@ def offer(root: Any) -> None:
         files = [parameter.name for parameter in command.params if parameter.param_type_name == "argument"]
         command.callback = partial(_run, command.callback, path, files)
         for parameter in command.params:
-            for option in parameter.opts:
-                if values := _CHOICES.get(f"{path} {option}"):
-                    parameter._custom_shell_complete = partial(_complete, values)
+            values = next((v for option in parameter.opts if (v := _CHOICES.get(f"{path} {option}"))), ())
+            if values:
+                parameter._custom_shell_complete = partial(_complete, values)
+            if parameter.param_type_name == "argument":
+                parameter.display_type_rich = lambda ctx: ""  # the name says what it is
+            elif parameter.metavar is None and not parameter.is_flag:
+                parameter.metavar = _stand_in(values, parameter.default)
+
+
+def _stand_in(values: tuple[str, ...], default: Any) -> str:
+    """What the help shows in the place of an option's value."""
+    words = "|".join(values)
+    if values and ":" not in words and len(words) <= 30:
+        return words
+    if not isinstance(default, str) or not default[:1].isdigit():
+        return "VALUE"
+    return "NUMBER" if default.replace(".", "", 1).isdigit() else "QUANTITY"
 
 
 def _commands(group: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
@@ -40,15 +39,18 @@ def _parameter(option: Option) -> Parameter:
     if option.switch:
         kind: Any = Annotated[bool, typer.Option(option.flag, help=option.help)]
         return Parameter(option.name, Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-    offered = partial(_beginning_with, option.choices) if option.choices else None
+    offered = _beginning(option.choices) if option.choices else None
     info = typer.Option(option.flag, metavar=option.shows, help=option.help, autocompletion=offered)
     return Parameter(
         option.name, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info]
     )
 
 
-def _beginning_with(choices: Sequence[str], incomplete: str) -> list[str]:
-    return [choice for choice in choices if choice.startswith(incomplete)]
+def _beginning(choices: Sequence[str]) -> Callable[[str], list[str]]:
+    def words(incomplete: str) -> list[str]:
+        return [choice for choice in choices if choice.startswith(incomplete)]
+
+    return words
 
 
 def _text(value: Any) -> str | None:

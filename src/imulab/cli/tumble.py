@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imulab.cli.fit_options import with_options
 from imulab.cli.options import (
     AsJson,
     Element,
@@ -21,16 +20,17 @@ from imulab.cli.options import (
     Window,
     check_outputs,
     chosen,
-    note,
     progress_bar,
     quantity,
     read_recording,
     warn,
     whole_number,
 )
+from imulab.cli.result import finish
+from imulab.procedures.tumble.task import OPTIONS
 
 if TYPE_CHECKING:
-    from imulab.records.calibration import Calibration
+    pass
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -130,55 +130,10 @@ def simulate(
     print(f"{output}: {len(recording)} samples, {attitudes} attitudes, serial {recording.metadata['serial']}")
 
 
+@with_options(OPTIONS)
 def fit(
     file: RecordingFile,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
-    order: Annotated[
-        str,
-        typer.Option(
-            help="auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them."
-        ),
-    ] = "auto",
-    method: Annotated[str, typer.Option(help="norm or linearised.")] = "norm",
-    loss: Annotated[
-        str, typer.Option(help="auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.")
-    ] = "auto",
-    nonlinearity: Annotated[
-        str | None,
-        typer.Option(metavar="20ug,20ug", help="Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known."),
-    ] = None,
-    gravity: Annotated[
-        str | None,
-        typer.Option(help="Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head."),
-    ] = None,
-    latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
-    height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
-    prior: Annotated[
-        str | None, typer.Option("--prior", metavar="RECORD", help="Earlier record of this unit, as prior knowledge.")
-    ] = None,
-    ageing: Annotated[
-        str | None,
-        typer.Option(metavar="100ug,100ppm[,50urad]", help="What the unit may have changed since the prior, if known."),
-    ] = None,
-    monte_carlo: Annotated[
-        str | None,
-        typer.Option("--monte-carlo", metavar="N", help="Trials of a propagation of distributions, 1000 or more."),
-    ] = None,
-    cross: Annotated[
-        bool, typer.Option("--cross", help="Fit cross terms k_xy, k_yz, k_zx: products of two axes.")
-    ] = False,
-    threshold: Annotated[
-        str | None,
-        typer.Option(
-            metavar="5ppm,2ug,3arcsec",
-            help="Changes of scale factors, biases and misalignments at which --method linearised rests; "
-            'the source\'s "5 ppm, 2 ug, 3 arcsec" if not given.',
-        ),
-    ] = None,
+    options: dict[str, str | None],
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -189,63 +144,11 @@ def fit(
     """
     from imulab.procedures.run import run_task
 
-    check_outputs([output, report], [name for name in (file, layout, prior) if name])
-    options = {
-        "order": order,
-        "method": method,
-        "loss": loss,
-        "nonlinearity": nonlinearity,
-        "gravity": gravity,
-        "latitude": latitude,
-        "height": height,
-        "prior": prior,
-        "ageing": ageing,
-        "cross": "yes" if cross else "no",
-        "threshold": threshold,
-        "monte_carlo": monte_carlo,
-        "layout": layout,
-        "topic": topic,
-        "instance": instance,
-        "window": window,
-        "element": element,
-    }
-    trials = None if monte_carlo is None else whole_number(monte_carlo, "--monte-carlo")
+    check_outputs([output, report], [name for name in (file, options["layout"], options["prior"]) if name])
+    trials = None if options["monte_carlo"] is None else whole_number(options["monte_carlo"], "--monte-carlo")
     with progress_bar("Monte Carlo", trials) as progress:
         record = run_task("tumble", [file], options, GivenFiles(), progress=progress)
     finish(record, output, report, json=json)
-
-
-def finish(
-    record: Calibration,
-    output: str | None,
-    report: str | None,
-    *,
-    json: bool,
-    describe: Callable[[Calibration], str] | None = None,
-) -> None:
-    """Write a record and its report, both or none, and say what was found, in full or as `describe` has it."""
-    from imulab.atomic_write import replacing
-    from imulab.procedures.reports import rendered
-
-    with ExitStack() as stack:
-        # Both files are opened before either is finished, so that neither is left alone behind an error.
-        to_record = stack.enter_context(replacing(output)) if output else None
-        to_report = stack.enter_context(replacing(report)) if report else None
-        if to_record:
-            to_record.write(record.to_json().encode("utf-8"))
-        if to_report:
-            to_report.write(rendered(record).encode("utf-8"))
-    if json:
-        print(record.to_json(), end="")
-    else:
-        from imulab.cli.show import describe_record
-
-        print(describe(record) if describe else describe_record(record, provenance=False))
-        for name, what in ((output, "record"), (report, "report")):
-            if name:
-                print(f"{what}: {name}")
-    for message in record.warnings:
-        (warn if message in record.verdict.reasons else note)(message)
 
 
 def gyro(

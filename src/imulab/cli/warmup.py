@@ -7,16 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imulab.cli.fit_options import with_options
 from imulab.cli.options import (
     AsJson,
-    Element,
     GivenFiles,
-    Instance,
-    LayoutFile,
     OutputFile,
     ReportFile,
-    Topic,
-    Window,
     check_outputs,
     naming,
     quantity,
@@ -24,7 +20,8 @@ from imulab.cli.options import (
     whole_number,
 )
 from imulab.errors import OptionError
-from imulab.procedures.warmup.task import TEMPERATURES, temperature_list
+from imulab.procedures.warmup.choices import TEMPERATURES
+from imulab.procedures.warmup.task import OPTIONS, temperature_list
 from imulab.quantities import number as _number
 
 if TYPE_CHECKING:
@@ -168,38 +165,10 @@ def simulate(
     print(f"{output}: {many * len(at) * number} recordings of {options['duration']:g} s, law {law}")
 
 
+@with_options(OPTIONS)
 def fit(
     files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings, one power cycle each.")],
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
-    model: Annotated[
-        str, typer.Option(help="auto, interval-cubic, knot-cubic, knot-log-cubic or exponential.")
-    ] = "auto",
-    temperatures: Temperatures = TEMPERATURES,
-    tolerance: Annotated[str, typer.Option(metavar="K", help="A power-on temperature within this fits, K.")] = "1",
-    settling_time: Annotated[
-        str | None, typer.Option("--settling-time", help="T_M, s; chosen from the data if not given.")
-    ] = None,
-    settling_limit: Annotated[
-        str, typer.Option("--settling-limit", help="Settled below this: percent of the peak, or deg/h, mg ...")
-    ] = "5 %",
-    exit_rule: Annotated[str, typer.Option("--exit", help="From T_M on: zero, hold or taper.")] = "zero",
-    taper_time: Annotated[str, typer.Option("--taper-time", help="How long a taper takes.")] = "60 s",
-    pool: Annotated[str, typer.Option(help="unit, or type: several units share one table.")] = "unit",
-    beyond: Annotated[
-        str, typer.Option(help="Beyond the outer temperatures: zero (no correction) or hold (as there).")
-    ] = "zero",
-    axes: Annotated[str | None, typer.Option(metavar="A,A,...", help="Columns to fit; all if not given.")] = None,
-    latest_start: Annotated[
-        str, typer.Option("--latest-start", help="A first sample later after power-on is refused.")
-    ] = "5 s",
-    temperature_column: Annotated[
-        bool,
-        typer.Option("--temperature-column", help="Take a missing power-on temperature from the first row's column."),
-    ] = False,
+    options: dict[str, str | None],
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -208,29 +177,10 @@ def fit(
 
     Prints the comparison of the models; -o writes the calibration record, --report its figures.
     """
-    from imulab.cli.tumble import finish
+    from imulab.cli.result import finish
     from imulab.procedures.run import run_task
 
-    check_outputs([output, report], [*files, *([layout] if layout else [])])
-    options = {
-        "model": model,
-        "temperatures": temperatures,
-        "tolerance": tolerance,
-        "settling_time": settling_time,
-        "settling_limit": settling_limit,
-        "exit": exit_rule,
-        "taper_time": taper_time,
-        "pool": pool,
-        "axes": axes,
-        "beyond": beyond,
-        "latest_start": latest_start,
-        "temperature_column": "yes" if temperature_column else "no",
-        "layout": layout,
-        "topic": topic,
-        "instance": instance,
-        "window": window,
-        "element": element,
-    }
+    check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
     finish(run_task("warmup", files, options, GivenFiles()), output, report, json=json)
 
 

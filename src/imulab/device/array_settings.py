@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from imulab.device.methods import METHODS
 from imulab.device.tables import Field, Table
 from imulab.errors import OptionError, RecordError, listed
 from imulab.recording import Array
 
-METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")
 MOST_ELEMENTS = 64
 MOST_COUNT = 1_000_000_000
 """Largest starting count of the growing memory."""

@@ -134,7 +134,7 @@ def _check_columns(titles: Sequence[str], name: str) -> None:
         if title not in titles:
             found = " ".join(titles)
             raise OptionError(f"{name}: no column {title}; found {found if len(found) < 300 else found[:300] + ' ...'}")
-    known = [*COLUMNS, *dict.fromkeys(option for entry in PROCEDURES.values() for option in entry.task.options)]
+    known = [*COLUMNS, *dict.fromkeys(option for entry in PROCEDURES.values() for option in entry.task.names)]
     for index, title in enumerate(titles):
         if title.replace("-", "_") not in known:
             raise OptionError(f"{name}: unknown column {title!r}; known columns: {listed(known, title)}")
@@ -157,9 +157,9 @@ def _unit(place: str, cells: Mapping[str, str]) -> Unit:
         raise OptionError(f"{place}, column file: expected names of files, found '-'")
     options = {title.replace("-", "_"): text for title, text in cells.items() if title not in COLUMNS and text}
     for name in options:
-        if name not in task.options:
+        if name not in task.names:
             raise OptionError(
-                f"{place}, column {name}: not an option of {procedure}; its options: {listed(task.options, name)}"
+                f"{place}, column {name}: not an option of {procedure}; its options: {listed(task.names, name)}"
             )
     try:
         task.values(options, "column {}")

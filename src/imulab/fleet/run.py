@@ -154,7 +154,8 @@ def read_by(fleet: FleetManifest) -> dict[str, str]:
         return {}
     found = {_full(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
     for unit in fleet.units:
-        paths = [unit.options[key] for key in PROCEDURES[unit.procedure].task.paths if key in unit.options]
+        options = PROCEDURES[unit.procedure].task.options
+        paths = [unit.options[o.name] for o in options if o.names_file and o.name in unit.options]
         for name in (*unit.files, *paths):
             if not is_url(name):
                 found[_full(os.path.join(fleet.base, name))] = name  # noqa: PTH118

@@ -102,20 +102,20 @@ def file_option(name: str, help: str, shows: str) -> Option:  # noqa: A002
     return Option(name, help, lambda text, _: text, None, shows, names_file=True)
 
 
+LAYOUT = file_option("layout", "Columns of a foreign file: L.toml, or a name from show --formats.", "LAYOUT")
 READING = (
-    file_option(
-        "layout", "Columns of a foreign file: a TOML file, or the name of a layout that comes along.", "L.toml"
-    ),
+    LAYOUT,
     text_option("topic", "Topic of a bag or log, where there are several.", shows="TOPIC"),
     text_option("instance", "Sensor of a flight log, from 0; the first if not given.", shows="N"),
     text_option("window", "Part to read, s; either side may be left out.", shows="FROM:TO"),
 )
 """How a recording is read, whatever the procedure."""
+ELEMENT = text_option("element", "One IMU of a file of several, from 1.", shows="N")
 
 
 def part_of(values: Mapping[str, Any], label: str) -> dict[str, Any]:
     """Return the options of `imulab.read` that choose a part of a file; errors as for `chosen`."""
-    return chosen(values["topic"], values["instance"], values["window"], label)
+    return chosen(values["topic"], values["instance"], values["window"], values.get("element"), label=label)
 
 
 def read_options(options: Sequence[Option], texts: Mapping[str, str], label: str) -> dict[str, Any]:

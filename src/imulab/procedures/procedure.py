@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from imulab.procedures.options import Option
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -64,9 +66,7 @@ class Task:
     count
         Fewest and most files; None for any number.
     options
-        Names of the options of its fit.
-    paths
-        Those of them that name a file.
+        The options of its fit.
     modules
         What its fit loads: whoever has several processes fit loads them once, before.
     values
@@ -77,11 +77,15 @@ class Task:
 
     files: str
     count: tuple[int, int | None]
-    options: tuple[str, ...]
-    paths: tuple[str, ...]
+    options: tuple[Option, ...]
     modules: tuple[str, ...]
     values: Callable[[Mapping[str, str], str], dict[str, Any]]
     fit: Callable[[Sequence[str], Mapping[str, Any], Files, Callable[[int], None]], Calibration]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the options."""
+        return tuple(option.name for option in self.options)
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from imulab.errors import OptionError, listed
 from imulab.estimation.estimate import chi_square_limit, chi_square_probability
 from imulab.estimation.order_blend import blend
+from imulab.procedures.centrifuge.choices import CURVES
 from imulab.recording import Array
 
-MODELS: dict[str, tuple[int, ...]] = {"constant": (), "c1": (1,), "c2": (2,), "c1+c2": (1, 2)}
 _NESTED = ("constant", "c1", "c1+c2")
 _GAIN = 0.05
 _ROUNDING = 1e-9
@@ -24,7 +24,7 @@ class CurveFit:
     Attributes
     ----------
     model
-        Key of `MODELS`.
+        Key of `CURVES`.
     coefficients
         Of 1, a, a^2: ``K(a) = p0 + p1 a + p2 a^2``; zero where the model has no such term.
     from_levels
@@ -73,33 +73,33 @@ def fit_curve(force: Array, K: Array, covariance: Array, model: str = "auto") ->
     OptionError
         The model is unknown, or has more coefficients than there are levels.
     """
-    if model != "auto" and model not in MODELS:
-        raise OptionError(f"curve {model!r}: expected one of {listed(('auto', *MODELS), model)}")
-    if model != "auto" and len(MODELS[model]) + 1 > len(K):
-        raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(MODELS[model]) + 1}")
-    names = [name for name, terms in MODELS.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]
+    if model != "auto" and model not in CURVES:
+        raise OptionError(f"curve {model!r}: expected one of {listed(('auto', *CURVES), model)}")
+    if model != "auto" and len(CURVES[model]) + 1 > len(K):
+        raise OptionError(f"curve {model!r}: {len(K)} levels; expected at least {len(CURVES[model]) + 1}")
+    names = [name for name, terms in CURVES.items() if len(terms) + 1 <= max(len(K) - 1, 1) or name == model]
     whitened = np.asarray(np.linalg.cholesky(_regular(covariance, K)), dtype=np.float64)
-    found = {name: _solve(force, K, whitened, MODELS[name]) for name in names}
+    found = {name: _solve(force, K, whitened, CURVES[name]) for name in names}
     chosen = model
     if model == "auto":
-        largest = max(names, key=lambda name: len(MODELS[name]))
-        freedom = len(K) - 1 - len(MODELS[largest])
+        largest = max(names, key=lambda name: len(CURVES[name]))
+        freedom = len(K) - 1 - len(CURVES[largest])
         scale = max(1.0, min(value[2] for value in found.values()) / freedom) if freedom > 0 else 1.0
-        chosen = min(names, key=lambda name: found[name][2] / scale + chi_square_limit(1, _GAIN) * len(MODELS[name]))
+        chosen = min(names, key=lambda name: found[name][2] / scale + chi_square_limit(1, _GAIN) * len(CURVES[name]))
     coefficients, matrix, chi_square = found[chosen]
     given = matrix @ covariance @ matrix.T
     return CurveFit(
         chosen, coefficients, matrix,
         _blended(force, K, whitened, covariance, coefficients, given) if model == "auto" else given,
-        chi_square, len(K) - 1 - len(MODELS[chosen]),
-        tuple((name, 1 + len(MODELS[name]), found[name][2], name == chosen) for name in names),
+        chi_square, len(K) - 1 - len(CURVES[chosen]),
+        tuple((name, 1 + len(CURVES[name]), found[name][2], name == chosen) for name in names),
     )  # fmt: skip
 
 
 def _blended(force: Array, K: Array, root: Array, covariance: Array, chosen: Array, given: Array) -> Array:
     """Covariance of the chosen coefficients whichever model is right: nowhere less than that given the model."""
-    nested = [name for name in _NESTED if len(MODELS[name]) < len(K)]
-    steps = [_solve(force, K, root, MODELS[name]) for name in nested]
+    nested = [name for name in _NESTED if len(CURVES[name]) < len(K)]
+    steps = [_solve(force, K, root, CURVES[name]) for name in nested]
     squares = np.array([chi_square for *_, chi_square in steps])
     found = blend(
         np.array([coefficients for coefficients, *_ in steps]),

@@ -9,8 +9,8 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.procedures.centrifuge.budget import error_budget
+from imulab.procedures.centrifuge.choices import CURVES, METHODS
 from imulab.procedures.centrifuge.corrections import corrected, find_corrections
-from imulab.procedures.centrifuge.curve import MODELS
 from imulab.procedures.centrifuge.levels import Levels, level_numbers, pool_levels
 from imulab.procedures.centrifuge.manifest import Manifest, Run
 from imulab.procedures.centrifuge.parameters import Estimates, estimate
@@ -19,8 +19,6 @@ from imulab.procedures.centrifuge.run import LoadedRun, reduce_run
 from imulab.procedures.centrifuge.static import StaticRun, reduce_static
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
-
-METHODS = ("least-squares", "fourier")
 
 
 @dataclass(frozen=True)
@@ -126,8 +124,8 @@ def check_options(method: str, curve: str) -> None:
     """
     if method not in METHODS:
         raise OptionError(f"method {method!r}: expected one of {listed(METHODS, method)}")
-    if curve != "auto" and curve not in MODELS:
-        raise OptionError(f"curve {curve!r}: expected one of {listed(('auto', *MODELS), curve)}")
+    if curve != "auto" and curve not in CURVES:
+        raise OptionError(f"curve {curve!r}: expected one of {listed(('auto', *CURVES), curve)}")
 
 
 @dataclass

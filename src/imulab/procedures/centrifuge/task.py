@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import ReadError
+from imulab.procedures.centrifuge.choices import CURVES, METHODS
+from imulab.procedures.options import LAYOUT, choice, read_options
 from imulab.procedures.procedure import Files, Task, source_of
 
 if TYPE_CHECKING:
@@ -13,15 +15,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-def _centrifuge_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    from imulab.procedures.centrifuge.fit import check_options
-
-    method, curve = texts.get("method", "least-squares"), texts.get("curve", "auto")
-    check_options(method, curve)
-    return {"method": method, "curve": curve, "layout": texts.get("layout")}
-
-
-def _centrifuge_fit(
+def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
     from imulab.procedures.centrifuge.fit import fit_centrifuge
@@ -48,17 +42,27 @@ def _centrifuge_fit(
     ).calibration
 
 
+OPTIONS = (
+    LAYOUT,
+    choice("method", "least-squares, or fourier (the source's whole-period sums).", METHODS, "least-squares"),
+    choice("curve", "Terms of K(a).", ("auto", *CURVES), "auto"),
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    return read_options(OPTIONS, texts, label)
+
+
 TASK = Task(
     files="the manifest of one test",
     count=(1, 1),
-    options=("method", "curve", "layout"),
-    paths=("layout",),
+    options=OPTIONS,
     modules=(
         "imulab.readers",
         "imulab.procedures.centrifuge.manifest",
         "imulab.procedures.centrifuge.fit",
         "scipy.special",
     ),
-    values=_centrifuge_values,
-    fit=_centrifuge_fit,
+    values=_values,
+    fit=_fit,
 )

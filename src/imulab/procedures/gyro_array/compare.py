@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.device.methods import METHODS
 from imulab.errors import DataError, ImulabError
 from imulab.estimation.allan import allan_deviation
 from imulab.estimation.sampling import sampling_rate
@@ -16,14 +17,7 @@ from imulab.procedures.gyro_array.checks import Checks
 from imulab.procedures.gyro_array.clocks import on_one_clock
 from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
 from imulab.procedures.gyro_array.memory import memory_text
-from imulab.procedures.gyro_array.model import (
-    FEWEST_ROBUST,
-    METHODS,
-    Elements,
-    array_calibration,
-    feedback_notes,
-    find_elements,
-)
+from imulab.procedures.gyro_array.model import FEWEST_ROBUST, Elements, array_calibration, feedback_notes, find_elements
 from imulab.procedures.gyro_array.single import Singles, single_gyros
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.device.methods import METHODS
 from imulab.errors import OptionError, listed
 from imulab.procedures.gyro_array.compare import rate_figures
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
-from imulab.procedures.gyro_array.model import METHODS, find_elements
+from imulab.procedures.gyro_array.model import find_elements
 from imulab.procedures.gyro_array.simulate import EXPERIMENTS, NoiseModel, simulate_array
 
 CALIBRATION_TIME = 60.0

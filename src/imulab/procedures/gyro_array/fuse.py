@@ -10,6 +10,7 @@ import numpy as np
 
 from imulab.device.array_settings import MOST_COUNT
 from imulab.device.blob import Blob
+from imulab.device.methods import METHODS
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation.rows import HISTORY, zero_rows
 from imulab.procedures.gyro_array.blobs import blob_stream, fusion_of_blob
@@ -20,7 +21,6 @@ from imulab.procedures.gyro_array.kalman import RATE_WALK, default_bias_walk, no
 from imulab.procedures.gyro_array.memory import memory_text
 from imulab.procedures.gyro_array.model import (
     FEWEST_ROBUST,
-    METHODS,
     ArrayCalibration,
     Elements,
     array_calibration,

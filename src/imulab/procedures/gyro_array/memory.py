@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.device.array_settings import METHODS, MOST_COUNT, Fusion, fusion_of
+from imulab.device.array_settings import MOST_COUNT, Fusion, fusion_of
 from imulab.device.blob import Blob
+from imulab.device.methods import METHODS
 from imulab.errors import OptionError, listed
 from imulab.procedures.gyro_array.blobs import fusion_of_blob
 from imulab.records.calibration import Calibration

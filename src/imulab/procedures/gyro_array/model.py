@@ -19,7 +19,6 @@ from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
 from imulab.verdict import Note
 
-METHODS = ("mean", "support", "least-squares", "feedback", "robust", "covariance", "kalman")
 FEWEST_ROBUST = 3
 SOURCE_RATES = (50.0, 200.0)
 """Sampling rates for which the source states its recursion, Hz."""

@@ -6,39 +6,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from imulab.device.methods import METHODS
 from imulab.errors import OptionError
+from imulab.procedures.options import READING, Option, measure, part_of, read_options, text_option
 from imulab.procedures.procedure import Files, Task
-from imulab.quantities import chosen, interval, quantity
+from imulab.quantities import interval
 
 if TYPE_CHECKING:
-    from imulab.device.array_settings import Fusion
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
 
-def _array_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    name, between = label.format("interval"), texts.get("interval")
-    if between is not None and texts.get("window"):
-        raise OptionError(f"{name} together with {label.format('window')}: expected one of them, they say the same")
-    return {
-        "interval": None if between is None else interval(between, name),
-        "averaging": quantity(texts.get("averaging", "1 s"), label.format("averaging"), "time", "s"),
-        "layout": texts.get("layout"),
-        "part": chosen(texts.get("topic"), texts.get("instance"), texts.get("window"), label=label),
-        "fusion": _fusion(texts, label),
-    }
-
-
-def _fusion(texts: Mapping[str, str], label: str) -> Fusion | None:
-    """Method and memory that the record is to carry; None where neither is given."""
-    from imulab.procedures.gyro_array.memory import fusion_text
-
-    if texts.get("method") is None and texts.get("memory") is None:
-        return None
-    return fusion_text(texts.get("method"), texts.get("memory"), label)
-
-
-def _array_fit(
+def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
     from imulab.procedures.gyro_array.fit import calibrate_array
@@ -65,12 +44,42 @@ def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
     return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
 
 
+OPTIONS = (
+    *READING,
+    Option("interval", "Use STILL from START to STOP, s.", interval, shows="FROM:TO"),
+    measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
+    text_option(
+        "method",
+        "Method that fuse and export take from the record; robust if not given.",
+        shows="METHOD",
+        choices=METHODS,
+    ),
+    text_option(
+        "memory",
+        "Its memory: growing, growing:COUNT, or a gain between 0 and 1.",
+        shows="growing|growing:N|GAIN",
+        choices=("growing",),
+    ),
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.procedures.gyro_array.memory import fusion_text
+
+    values = read_options(OPTIONS, texts, label)
+    if values["interval"] is not None and values["window"]:
+        names = label.format("interval"), label.format("window")
+        raise OptionError(f"{names[0]} together with {names[1]}: expected one of them, they say the same")
+    by = (values["method"], values["memory"])
+    fusion = None if by == (None, None) else fusion_text(*by, label)
+    return {**values, "fusion": fusion, "part": part_of(values, label)}
+
+
 TASK = Task(
     files="STILL, or STILL;MOVING",
     count=(1, 2),
-    options=("interval", "averaging", "method", "memory", "layout", "topic", "instance", "window"),
-    paths=("layout",),
+    options=OPTIONS,
     modules=("imulab.readers", "imulab.procedures.gyro_array.fit", "scipy.special"),
-    values=_array_values,
-    fit=_array_fit,
+    values=_values,
+    fit=_fit,
 )

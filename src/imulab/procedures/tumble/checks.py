@@ -7,7 +7,8 @@ import numpy as np
 from imulab.errors import DataError, RecordError
 from imulab.estimation.estimate import median
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
-from imulab.procedures.tumble.model import GAUGE, HIGHEST_ORDER, parameter_names
+from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.model import GAUGE, parameter_names
 from imulab.procedures.tumble.solve import Solution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration

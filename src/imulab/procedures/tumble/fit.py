@@ -21,11 +21,12 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.axes import check_axes
 from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spread
 from imulab.procedures.tumble.checks import check_attitudes, check_residuals
+from imulab.procedures.tumble.choices import FROM_DATA
 from imulab.procedures.tumble.findings import Found, Stated
 from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold, solve_linearised
 from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.montecarlo import propagate
-from imulab.procedures.tumble.options import FROM_DATA, check_options
+from imulab.procedures.tumble.options import check_options
 from imulab.procedures.tumble.order_zero import with_assumed_alignment
 from imulab.procedures.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order, solve_orders
 from imulab.procedures.tumble.outliers import NONE_ASIDE, Aside, set_aside

@@ -25,7 +25,6 @@ from imulab.recording import Array
 
 AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
-HIGHEST_ORDER = 5
 _UNUSUAL = 3.0
 CROSS_TERMS = ("k_xy", "k_yz", "k_zx")
 _NEXT = [1, 2, 0]

@@ -7,13 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from imulab.errors import OptionError, listed
-from imulab.procedures.tumble.model import HIGHEST_ORDER
+from imulab.procedures.tumble.choices import FROM_DATA, HIGHEST_ORDER, LOSSES, METHODS
 from imulab.procedures.tumble.montecarlo import check_trials
 from imulab.procedures.tumble.prior import GROUPS
-
-METHODS = ("norm", "linearised")
-LOSSES = ("square", "huber", "auto")
-FROM_DATA = ("auto", "blend")
 
 
 def check_method(method: str, order: int | str) -> None:

@@ -15,7 +15,8 @@ import numpy as np
 
 from imulab.estimation.estimate import Observability, bayesian_information, covariance, f_test, leverage, observability
 from imulab.procedures.tumble.advice import sphere_points
-from imulab.procedures.tumble.model import HIGHEST_ORDER, norm_and_jacobian, parameter_count
+from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.model import norm_and_jacobian, parameter_count
 from imulab.procedures.tumble.solve import Problem, Solution, leave_one_out, solve_norm, start_parameters
 from imulab.recording import Array
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from imulab.estimation.estimate import f_test
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.model import AXES, CROSS_TERMS, HIGHEST_ORDER, MISALIGNMENTS
+from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.model import AXES, CROSS_TERMS, MISALIGNMENTS
 from imulab.procedures.tumble.solve import Problem, Solution, forces
 from imulab.recording import Array
 

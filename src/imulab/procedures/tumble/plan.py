@@ -14,7 +14,8 @@ import numpy as np
 from imulab.errors import ObservabilityError, OptionError, listed
 from imulab.estimation.estimate import observability
 from imulab.procedures.tumble.advice import sphere_points
-from imulab.procedures.tumble.model import HIGHEST_ORDER, parameter_count, parameter_names
+from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.optimal import CLOSEST, CRITERIA, Search, information_rows, inverse, optimal_set
 from imulab.recording import Array
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import OptionError
+from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
-_HIGHEST_ORDER = 5
 _MOST_SAMPLES = 1e7
 _RING_FREQUENCY = 12.0  # Hz
 _RING_DECAY = 0.08  # s
@@ -132,8 +132,8 @@ def simulate_tumble(
 
 
 def _check(order: int, sample_rate: float, hold: float, move: float, noise: float, gravity: float) -> None:
-    if not 1 <= order <= _HIGHEST_ORDER:
-        raise OptionError(f"order {order}: expected 1 to {_HIGHEST_ORDER}")
+    if not 1 <= order <= HIGHEST_ORDER:
+        raise OptionError(f"order {order}: expected 1 to {HIGHEST_ORDER}")
     for name, value, low, high in (
         ("sample rate", sample_rate, 10.0, 1e5),
         ("hold", hold, 0.5, 3600.0),
@@ -189,7 +189,7 @@ def _forward(force: Array, sensor: Mapping[str, float]) -> Array:
     }
     output = np.empty_like(force)
     for column, (axis, s) in enumerate(sensed.items()):
-        reading = s + sum(sensor.get(f"k{power}_{axis}", 0.0) * s**power for power in range(2, _HIGHEST_ORDER + 1))
+        reading = s + sum(sensor.get(f"k{power}_{axis}", 0.0) * s**power for power in range(2, HIGHEST_ORDER + 1))
         output[:, column] = sensor[f"scale_factor_{axis}"] * (reading + sensor[f"bias_{axis}"])
     return output
 

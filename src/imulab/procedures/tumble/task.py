@@ -6,9 +6,22 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import DataError, OptionError, RecordError
+from imulab.errors import DataError, OptionError, RecordError, listed
+from imulab.procedures.options import (
+    ELEMENT,
+    READING,
+    Option,
+    choice,
+    file_option,
+    part_of,
+    read_options,
+    switch,
+    text_option,
+    whole,
+)
 from imulab.procedures.procedure import Files, Task
-from imulab.quantities import chosen, quantity, whole_number
+from imulab.procedures.tumble.choices import LOSSES, METHODS, ORDERS
+from imulab.quantities import quantity
 from imulab.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -19,41 +32,7 @@ if TYPE_CHECKING:
 _CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
 
 
-def _tumble_values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    from imulab.gravity import gravity_option
-    from imulab.procedures.tumble.options import check_options
-
-    order = texts.get("order", "auto")
-    trials = texts.get("monte_carlo")
-    values: dict[str, Any] = {
-        "order": int(order) if order.isascii() and order.isdecimal() and len(order) < 3 else order,
-        "method": texts.get("method", "norm"),
-        "loss": texts.get("loss", "auto"),
-        "nonlinearity": _spread(texts.get("nonlinearity"), label.format("nonlinearity")),
-        "gravity": gravity_option(texts.get("gravity"), texts.get("latitude"), texts.get("height"), label),
-        "monte_carlo": None if trials is None else whole_number(trials, label.format("monte-carlo")),
-        "prior": texts.get("prior"),
-        "ageing": _ageing(texts.get("ageing"), label.format("ageing")),
-        "cross": _yes(texts.get("cross", "no"), label.format("cross")),
-        "threshold": _threshold(texts.get("threshold"), label.format("threshold")),
-        "layout": texts.get("layout"),
-        "part": chosen(*(texts.get(key) for key in ("topic", "instance", "window", "element")), label=label),
-    }
-    check_options(
-        values["order"], values["method"], values["loss"],
-        monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
-        nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
-    )  # fmt: skip
-    return values
-
-
-def _yes(text: str, name: str) -> bool:
-    if text not in ("yes", "no"):
-        raise OptionError(f"{name} {text!r}: expected yes or no")
-    return text == "yes"
-
-
-def _tumble_fit(
+def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
     from imulab.procedures.tumble.fit import fit_tumble
@@ -78,10 +57,8 @@ def _tumble_fit(
     ).calibration
 
 
-def _ageing(text: str | None, name: str) -> tuple[float, ...]:
+def _ageing(text: str, name: str) -> tuple[float, ...]:
     """Standard deviations of what biases, scale factors and misalignments changed, in SI, as many as are given."""
-    if text is None:
-        return ()
     kinds = (("acceleration", "ug"), ("number", "ppm"), ("angle", "urad"))
     parts = text.split(",")
     if len(parts) > len(kinds):
@@ -89,10 +66,8 @@ def _ageing(text: str | None, name: str) -> tuple[float, ...]:
     return tuple(quantity(part, name, *kind) for part, kind in zip(parts, kinds, strict=False))
 
 
-def _threshold(text: str | None, name: str) -> tuple[float, ...] | None:
+def _threshold(text: str, name: str) -> tuple[float, ...]:
     """Changes of scale factors, biases and misalignments at which method linearised rests, in SI."""
-    if text is None:
-        return None
     parts = text.split(",")
     if len(parts) != len(_CHANGES):
         raise OptionError(
@@ -105,10 +80,8 @@ def _threshold(text: str | None, name: str) -> tuple[float, ...] | None:
     return found
 
 
-def _spread(text: str | None, option: str) -> tuple[float, float] | None:
+def _spread(text: str, option: str) -> tuple[float, float]:
     """Return the standard deviations of k2 and k3 in units of 1/g and 1/g^2: ``20ug,20ug`` is 20 ug/g^2, 20 ug/g^3."""
-    if text is None:
-        return None
     parts = text.split(",")
     if len(parts) != 2:
         raise OptionError(f"{option} {text!r}: expected two standard deviations, of k2 and k3, such as 20ug,20ug")
@@ -133,30 +106,67 @@ def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     return record
 
 
+def _order(text: str, called: str) -> int | str:
+    if text not in ORDERS:
+        raise OptionError(f"{called} {text!r}: expected one of {listed(ORDERS, text)}")
+    return int(text) if text.isdecimal() else text
+
+
+OPTIONS = (
+    *READING,
+    ELEMENT,
+    Option(
+        "order",
+        "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
+        _order,
+        "auto",
+        "auto|0..5|blend",
+        ORDERS,
+    ),
+    choice("method", "norm: by the length of f; linearised: the source's iteration.", METHODS, "norm"),
+    choice(
+        "loss", "auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.", LOSSES, "auto"
+    ),
+    Option("nonlinearity", "Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known.", _spread, shows="20ug,20ug"),
+    text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
+    text_option("latitude", "Latitude, deg, for normal gravity.", shows="DEG"),
+    text_option("height", "Height above the ellipsoid, m.", shows="M"),
+    file_option("prior", "Earlier record of this unit, as prior knowledge.", "RECORD"),
+    Option(
+        "ageing", "What the unit may have changed since the prior, if known.", _ageing, shows="100ug,100ppm[,50urad]"
+    ),
+    whole("monte_carlo", "Trials of a propagation of distributions, 1000 or more."),
+    switch("cross", "Fit cross terms k_xy, k_yz, k_zx: products of two axes."),
+    Option(
+        "threshold",
+        "Changes of scale factors, biases and misalignments at which --method linearised rests; "
+        'the source\'s "5 ppm, 2 ug, 3 arcsec" if not given.',
+        _threshold,
+        shows="5ppm,2ug,3arcsec",
+    ),
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.gravity import gravity_option
+    from imulab.procedures.tumble.options import check_options
+
+    values = read_options(OPTIONS, texts, label)
+    values["ageing"] = values["ageing"] or ()
+    check_options(
+        values["order"], values["method"], values["loss"],
+        monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
+        nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
+    )  # fmt: skip
+    values["gravity"] = gravity_option(values["gravity"], values["latitude"], values["height"], label)
+    return {**values, "part": part_of(values, label)}
+
+
 TASK = Task(
     files="one recording or table of attitudes",
     count=(1, 1),
-    options=(
-        "order",
-        "method",
-        "gravity",
-        "latitude",
-        "height",
-        "loss",
-        "nonlinearity",
-        "monte_carlo",
-        "prior",
-        "ageing",
-        "cross",
-        "threshold",
-        "layout",
-        "topic",
-        "instance",
-        "window",
-        "element",
-    ),
-    paths=("prior", "layout"),
+    options=OPTIONS,
     modules=("imulab.readers", "imulab.procedures.tumble.segment", "imulab.procedures.tumble.fit", "scipy.special"),
-    values=_tumble_values,
-    fit=_tumble_fit,
+    values=_values,
+    fit=_fit,
 )

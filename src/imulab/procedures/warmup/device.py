@@ -10,7 +10,8 @@ import numpy as np
 from imulab.device.tables import Field, Table, field_of, whole
 from imulab.device.unit import Unit
 from imulab.errors import RecordError
-from imulab.procedures.warmup.model import EXITS, MODELS, record_table
+from imulab.procedures.warmup.choices import EXITS, MODELS
+from imulab.procedures.warmup.model import record_table
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
+from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS
 from imulab.procedures.warmup.curves import Curves, make_curves
 from imulab.procedures.warmup.cycles import Cycle, common_axes, find_power_cycle, with_axes
 from imulab.procedures.warmup.judge import (
@@ -21,13 +22,12 @@ from imulab.procedures.warmup.judge import (
     repeatability,
     worst_between,
 )
-from imulab.procedures.warmup.model import BEYOND, EXITS, MODELS, SOURCE_TEMPERATURES, Table
+from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, Table
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 
-POOLS = ("unit", "type")
 TOLERANCE = 1.0
 """How far a power-on temperature may lie from its calibration temperature, K."""
 SETTLING_SHARE = 0.05

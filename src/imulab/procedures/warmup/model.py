@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import RecordError, UnitError
+from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit
 
-MODELS = ("interval-cubic", "knot-cubic", "knot-log-cubic", "exponential")
-EXITS = ("zero", "hold", "taper")
-BEYOND = ("zero", "hold")
 MOST_CONSTANTS = 3
 """Time constants of an exponential that the unit has room for."""
 SOURCE_TEMPERATURES = (-40.0, -30.0, -20.0, -10.0, 0.0, 40.0, 50.0, 60.0)

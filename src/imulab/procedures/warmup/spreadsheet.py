@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
-from imulab.procedures.warmup.model import MODELS, Table, check_table, record_table
+from imulab.procedures.warmup.choices import MODELS
+from imulab.procedures.warmup.model import Table, check_table, record_table
 from imulab.procedures.warmup.solve import amplitude_slopes
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import conversion_factor, parse_unit

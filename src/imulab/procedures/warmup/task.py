@@ -6,63 +6,24 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
+from imulab.procedures.options import (
+    ELEMENT,
+    READING,
+    Option,
+    choice,
+    finite,
+    measure,
+    part_of,
+    read_options,
+    switch,
+)
 from imulab.procedures.procedure import Files, Task, source_of
-from imulab.quantities import chosen, number, quantity
+from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, TEMPERATURES
+from imulab.quantities import number, quantity
 
 if TYPE_CHECKING:
     from imulab.procedures.warmup.cycles import Cycle
     from imulab.records.calibration import Calibration
-
-TEMPERATURES = "-40,-30,-20,-10,0,40,50,60"
-"""Calibration temperatures of the source, degC."""
-_SWITCH = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
-
-
-def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    from imulab.procedures.warmup.fit import check_options
-
-    def name(option: str) -> str:
-        return label.format(option)
-
-    settling = texts.get("settling_time")
-    axes = texts.get("axes")
-    column = texts.get("temperature_column", "no").lower()
-    if column not in _SWITCH:
-        raise OptionError(f"{name('temperature-column')} {column!r}: expected yes or no")
-    fit: dict[str, Any] = {
-        "model": texts.get("model", "auto"),
-        "temperatures": temperature_list(texts.get("temperatures", TEMPERATURES), name("temperatures")),
-        "tolerance": number(texts.get("tolerance", "1"), name("tolerance")),
-        "settling_time": None if settling is None else quantity(settling, name("settling-time"), "time", "s"),
-        "settling_limit": _limit(texts.get("settling_limit", "5 %"), name("settling-limit")),
-        "exit_rule": texts.get("exit", "zero"),
-        "taper_time": quantity(texts.get("taper_time", "60 s"), name("taper-time"), "time", "s"),
-        "pool": texts.get("pool", "unit"),
-        "axes": None if axes is None else _names(axes, name("axes")),
-        "beyond": texts.get("beyond", "zero"),
-    }
-    check_options(
-        *(
-            fit[key]
-            for key in (
-                "model",
-                "temperatures",
-                "tolerance",
-                "settling_time",
-                "exit_rule",
-                "taper_time",
-                "pool",
-                "beyond",
-            )
-        )
-    )
-    return {
-        "fit": fit,
-        "latest_start": quantity(texts.get("latest_start", "5 s"), name("latest-start"), "time", "s"),
-        "temperature_column": _SWITCH[column],
-        "layout": texts.get("layout"),
-        "part": chosen(*(texts.get(key) for key in ("topic", "instance", "window", "element")), label=label),
-    }
 
 
 def _fit(
@@ -120,29 +81,39 @@ def _limit(text: str, option: str) -> dict[str, float]:
     raise OptionError(f"{option} {text!r}: expected a percentage such as '5 %', a rate or an acceleration")
 
 
+OPTIONS = (
+    *READING,
+    ELEMENT,
+    choice("model", "How the bias goes with time; auto compares them.", ("auto", *MODELS), "auto"),
+    Option("temperatures", "Calibration temperatures, degC, ascending.", temperature_list, TEMPERATURES, "T,T,..."),
+    finite("tolerance", "A power-on temperature within this fits, K.", "1", "K"),
+    measure("settling_time", "T_M, s; chosen from the data if not given.", "time", "s", shows="TIME"),
+    Option("settling_limit", "Settled below this: percent of the peak, or deg/h, mg ...", _limit, "5 %", "LIMIT"),
+    choice("exit", "What the table gives from T_M on.", EXITS, "zero"),
+    measure("taper_time", "How long a taper takes, s.", "time", "s", "60 s", shows="TIME"),
+    choice("pool", "unit, or type: several units share one table.", POOLS, "unit"),
+    choice("beyond", "Beyond the outer temperatures: zero (no correction) or hold (as there).", BEYOND, "zero"),
+    Option("axes", "Columns to fit; all if not given.", _names, shows="A,A,..."),
+    measure("latest_start", "A first sample later after power-on, s, is refused.", "time", "s", "5 s", shows="TIME"),
+    switch("temperature_column", "Take a missing power-on temperature from the first row's column."),
+)
+_OF_THE_FIT = ("model", "temperatures", "tolerance", "settling_time", "taper_time", "pool", "axes", "beyond")
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.procedures.warmup.fit import check_options
+
+    values = read_options(OPTIONS, texts, label)
+    fit = {name: values[name] for name in _OF_THE_FIT}
+    fit |= {"settling_limit": values["settling_limit"], "exit_rule": values["exit"]}
+    check_options(**{name: value for name, value in fit.items() if name not in ("axes", "settling_limit")})
+    return {**values, "fit": fit, "part": part_of(values, label)}
+
+
 TASK = Task(
     files="the recordings of its power cycles",
     count=(1, None),
-    options=(
-        "model",
-        "temperatures",
-        "tolerance",
-        "settling_time",
-        "settling_limit",
-        "exit",
-        "taper_time",
-        "pool",
-        "axes",
-        "beyond",
-        "latest_start",
-        "temperature_column",
-        "layout",
-        "topic",
-        "instance",
-        "window",
-        "element",
-    ),
-    paths=("layout",),
+    options=OPTIONS,
     modules=("imulab.readers", "imulab.procedures.warmup.cycles", "imulab.procedures.warmup.fit", "scipy.special"),
     values=_values,
     fit=_fit,
