@@ -19,7 +19,7 @@ import madeup
 from imulab.device.unit import Unit
 from imulab.exporters import export
 from imulab.procedures.unit_tables import tables_of
-from imulab.procedures.warmup.model import MODELS
+from imulab.procedures.warmup.choices import MODELS
 
 CORE = Path(__file__).resolve().parents[1] / "runtime"
 SAMPLES = 1_000_000

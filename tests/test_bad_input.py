@@ -179,7 +179,7 @@ def test_clipped_rows_of_a_table(imulab, tmp_path):
         (["tumble", "frobnicate"], ["known commands: plan simulate fit gyro check"]),
         (["tumble", "fit"], ["Missing argument 'FILE'"]),
         (["tumble", "fit", "good.csv", "--frob"], ["--frob"]),
-        (["tumble", "fit", "good.csv", "--order", "7"], ["order 7: expected one of auto 0 1 2 3 4 5 blend"]),
+        (["tumble", "fit", "good.csv", "--order", "7"], ["--order '7': expected one of auto 0 1 2 3 4 5 blend"]),
         (["tumble", "fit", "good.csv", "--method", "magic"], ["expected one of norm linearised"]),
         (["tumble", "fit", "good.csv", "--loss", "cauchy"], ["expected one of square huber auto"]),
         (["tumble", "fit", "good.csv", "--gravity", "ten"], ["--gravity", "'ten'"]),

@@ -296,7 +296,10 @@ BAD_MANIFESTS = {
         "serial,procedure,file,order\nA,tumble,a.csv,1\nB,array,b.csv,1\n",
         ["row 2 (line 3), column order: not an option of array; its options: interval"],
     ),
-    "bad option": ("serial,procedure,file,order\nA,tumble,a.csv,9\n", ["row 1 (line 2): order 9", "auto 0 1 2"]),
+    "bad option": (
+        "serial,procedure,file,order\nA,tumble,a.csv,9\n",
+        ["row 1 (line 2): column order '9'", "auto 0 1 2"],
+    ),
     "bad gravity": (
         "serial,procedure,file,gravity\nA,tumble,a.csv,much\n",
         ["column gravity 'much': expected a number"],
@@ -310,7 +313,10 @@ BAD_MANIFESTS = {
     "open quote": ('serial,procedure,file\n"A,tumble,a.csv\n', ["m.csv: line 2: unexpected end of data"]),
     "binary": ("serial\0,procedure,file\n", ["expected text or Parquet, found binary data"]),
     "cut parquet": ("PAR1 and then nothing", ["not a whole Parquet file"]),
-    "bad centrifuge option": ("serial,procedure,file,curve\nA,centrifuge,a.toml,c9\n", ["row 1 (line 2): curve 'c9'"]),
+    "bad centrifuge option": (
+        "serial,procedure,file,curve\nA,centrifuge,a.toml,c9\n",
+        ["row 1 (line 2): column curve 'c9'"],
+    ),
 }
 
 

@@ -10,11 +10,11 @@ import pytest
 
 import imulab as il
 from imulab.device.array_settings import Fusion
+from imulab.device.methods import METHODS
 from imulab.procedures.gyro_array.compare import compare_methods
 from imulab.procedures.gyro_array.experiments import run_experiment
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse
-from imulab.procedures.gyro_array.model import METHODS
 from imulab.procedures.gyro_array.simulate import Fault, simulate_array
 from imulab.procedures.reports import exhibits_of
 from imulab.verdict import Note

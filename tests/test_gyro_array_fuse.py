@@ -10,11 +10,12 @@ import pytest
 import imulab as il
 from imulab.device.array_settings import ArraySettings
 from imulab.device.blob import Blob, make_blob
+from imulab.device.methods import METHODS
 from imulab.device.unit import Stream
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream
 from imulab.procedures.gyro_array.memory import parse_memory
-from imulab.procedures.gyro_array.model import METHODS, find_elements
+from imulab.procedures.gyro_array.model import find_elements
 from imulab.procedures.gyro_array.simulate import Fault, NoiseModel, simulate_array
 from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Recording

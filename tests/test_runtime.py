@@ -10,12 +10,12 @@ import pytest
 
 import madeup
 from imulab.device import _runtime
-from imulab.device.array_settings import METHODS
+from imulab.device.methods import METHODS
 from imulab.device.tables import pack
 from imulab.device.unit import ALONE, NOT_FINITE, ArraySettings, Stream, Unit, array_stream, array_table, fuse_table
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.procedures.unit_tables import tables_of
-from imulab.procedures.warmup.model import MODELS
+from imulab.procedures.warmup.choices import MODELS
 
 
 def readings(samples=600, elements=6, axes=1, seed=1):

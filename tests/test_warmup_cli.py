@@ -10,9 +10,8 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.warmup.apply import record_table
 from imulab.procedures.warmup.figures import exhibits
-from imulab.procedures.warmup.model import evaluate
+from imulab.procedures.warmup.model import evaluate, record_table
 from reference import flightlogs
 from reference import warmup as reference
 

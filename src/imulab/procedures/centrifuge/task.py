@@ -43,9 +43,9 @@ def _fit(
 
 
 OPTIONS = (
-    LAYOUT,
     choice("method", "least-squares, or fourier (the source's whole-period sums).", METHODS, "least-squares"),
     choice("curve", "Terms of K(a).", ("auto", *CURVES), "auto"),
+    LAYOUT,
 )
 
 

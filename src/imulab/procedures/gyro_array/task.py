@@ -45,7 +45,6 @@ def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
 
 
 OPTIONS = (
-    *READING,
     Option("interval", "Use STILL from START to STOP, s.", interval, shows="FROM:TO"),
     measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
     text_option(
@@ -60,6 +59,7 @@ OPTIONS = (
         shows="growing|growing:N|GAIN",
         choices=("growing",),
     ),
+    *READING,
 )
 
 

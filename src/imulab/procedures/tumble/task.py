@@ -113,8 +113,6 @@ def _order(text: str, called: str) -> int | str:
 
 
 OPTIONS = (
-    *READING,
-    ELEMENT,
     Option(
         "order",
         "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
@@ -144,6 +142,8 @@ OPTIONS = (
         _threshold,
         shows="5ppm,2ug,3arcsec",
     ),
+    *READING,
+    ELEMENT,
 )
 
 

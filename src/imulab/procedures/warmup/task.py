@@ -82,8 +82,6 @@ def _limit(text: str, option: str) -> dict[str, float]:
 
 
 OPTIONS = (
-    *READING,
-    ELEMENT,
     choice("model", "How the bias goes with time; auto compares them.", ("auto", *MODELS), "auto"),
     Option("temperatures", "Calibration temperatures, degC, ascending.", temperature_list, TEMPERATURES, "T,T,..."),
     finite("tolerance", "A power-on temperature within this fits, K.", "1", "K"),
@@ -96,6 +94,8 @@ OPTIONS = (
     Option("axes", "Columns to fit; all if not given.", _names, shows="A,A,..."),
     measure("latest_start", "A first sample later after power-on, s, is refused.", "time", "s", "5 s", shows="TIME"),
     switch("temperature_column", "Take a missing power-on temperature from the first row's column."),
+    *READING,
+    ELEMENT,
 )
 _OF_THE_FIT = ("model", "temperatures", "tolerance", "settling_time", "taper_time", "pool", "axes", "beyond")
 
