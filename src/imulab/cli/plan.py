@@ -18,6 +18,7 @@ from imulab.procedures.tumble.fit import fit_tumble
 from imulab.procedures.tumble.model import parameter_units
 from imulab.procedures.tumble.options import check_method
 from imulab.procedures.tumble.plan import Plan, fixture_candidates, head_candidates, plan_tumble, roll_pitch, turning
+from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.procedures.tumble.segment import find_attitudes
 from imulab.procedures.tumble.sheet import attitude_picture, directions_of, plan_recording
 from imulab.readers import read
@@ -155,10 +156,10 @@ def _noise(text: str | None) -> tuple[float, str]:
 
 def _noise_of(record: Calibration) -> float:
     """Noise of |f| in the usual attitude of a record, with what they scatter beyond their own, g."""
-    stated, g = record.data["attitudes"]["standard_uncertainty"], float(record.model["gravity"]["value"])
+    stated, fit, g = attitudes_of(record).standard_uncertainty, fit_of(record), model_of(record).gravity.value
     if stated:
-        return float(np.hypot(np.median(stated), record.fit["excess"]["value"])) / g
-    reduced = record.fit["reduced_chi_square"]
+        return float(np.hypot(np.median(stated), fit.excess.value)) / g
+    reduced = fit.reduced_chi_square
     if not reduced:
         raise RecordError("--noise: the record's attitudes do not say what noise they have; expected a value, as 20ug")
     return float(np.sqrt(reduced)) / g
@@ -187,8 +188,8 @@ def _already(file: str) -> Array:
         record = load(file)
         if record.procedure != "tumble":
             raise RecordError(f"{file}: a {record.procedure} record holds no attitudes; expected a tumble record")
-        listed_ones = record.data["attitudes"]
-        force = np.array(listed_ones["force"])[np.array(listed_ones["down_weight"]) > 0]
+        held = attitudes_of(record)
+        force = np.array(held.force)[np.array(held.down_weight) > 0]
     else:
         recording = read(file)
         listed = directions_of(recording)
@@ -197,7 +198,7 @@ def _already(file: str) -> Array:
         found = find_attitudes(recording)
         # The directions need no better than a percent, and too few attitudes for a fit are no reason to refuse.
         try:
-            force = np.array(fit_tumble(found, order=1).calibration.data["attitudes"]["force"])
+            force = np.array(attitudes_of(fit_tumble(found, order=1).calibration).force)
         except ImulabError:
             force = found.mean
     directions: Array = force / np.linalg.norm(force, axis=1, keepdims=True)

@@ -96,13 +96,11 @@ def values_of(record: Calibration, names: Sequence[str], unit: str) -> Array:
     Raises
     ------
     RecordError
-        One is in another unit.
-    KeyError
-        The record lacks one.
+        The record lacks one, or has it in another unit.
     """
     values = []
     for name in names:
-        parameter = record.parameters[name]
+        parameter = record.parameter(name)
         if parameter.unit != unit:
             raise RecordError(f"the record has {name} in {parameter.unit!r}, expected {unit!r}")
         values.append(parameter.value)

@@ -19,6 +19,7 @@ from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions
 from imulab.printable import printable
 from imulab.procedures.registry import procedure_of
+from imulab.procedures.tumble.sections import data_of, fit_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import plain_number
@@ -115,19 +116,17 @@ def one_unit(records: Sequence[Calibration], target: str) -> Unit:
     (record,) = records
     try:
         return Unit(record, _accelerometers(record), _gyroscopes(record))
-    except KeyError as error:
-        raise RecordError(f"{target}: the record lacks {error.args[0]}") from None
-    except (TypeError, ValueError) as error:
-        raise RecordError(f"{target}: the record has a value that cannot be: {error}") from None
+    except RecordError as error:
+        raise RecordError(f"{target}: {error}") from None
 
 
 def _accelerometers(record: Calibration) -> Accelerometers:
-    unit = str(record.model["output_unit"])
-    factor, kept = _to_si(unit, "m/s^2")
+    model = model_of(record)
+    factor, kept = _to_si(model.output_unit, "m/s^2")
     matrix = np.eye(3)
     for i, j in ((1, 0), (2, 0), (2, 1)):
         matrix[i, j] = record.value(f"misalignment_{AXES[i]}{AXES[j]}")
-    order = int(record.model["order"])
+    order = model.order
     terms = [[record.value(f"k{power}_{axis}") for axis in AXES] for power in range(2, order + 1)]
     return Accelerometers(
         scale=np.array([record.value(f"scale_factor_{axis}") for axis in AXES]) * factor,
@@ -142,7 +141,7 @@ def _accelerometers(record: Calibration) -> Accelerometers:
 def _gyroscopes(record: Calibration) -> Gyroscopes | None:
     if "gyro_output_unit" not in record.model:
         return None
-    factor, kept = _to_si(str(record.model["gyro_output_unit"]), "rad/s")
+    factor, kept = _to_si(model_of(record).gyro_output_unit, "rad/s")
     matrix, sensitivity = np.eye(3), np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -225,10 +224,10 @@ def held_accelerometers(
     refit = procedure_of(unit.record).refit
     record = None if refit is None else refit(unit.record, misalignment=misalignment)
     if record is None:
-        held = unit.record.data.get("attitudes")
+        there = data_of(unit.record).attitudes
         why = (
-            f"the record's {len(held['mean'])} attitudes are too few, or not the ones, to fit them to anew"
-            if held
+            f"the record's {len(there.mean)} attitudes are too few, or not the ones, to fit them to anew"
+            if there is not None
             else "the record holds no attitudes to fit them to anew"
         )
         return accel, error, [f"{what} are those of the whole model: {why}"]
@@ -240,8 +239,8 @@ def held_accelerometers(
         held,
         accel_loss(accel, correction(held)),
         [
-            f"{what} were fitted anew to the record's {record.fit['attitudes']} attitudes, without what is left out: "
-            f"|f| - g there is {_in_g(record.fit['rms']['value'])} rms, {_in_g(unit.record.fit['rms']['value'])} by "
+            f"{what} were fitted anew to the record's {fit_of(record).attitudes} attitudes, without what is left out: "
+            f"|f| - g there is {_in_g(fit_of(record).rms.value)} rms, {_in_g(fit_of(unit.record).rms.value)} by "
             f"the whole model; standard uncertainties up to {_in_g(bias)} and {plain_number(1e6 * scale, 3)} ppm"
         ],
     )

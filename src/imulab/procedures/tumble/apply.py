@@ -11,6 +11,7 @@ from imulab.device.unit import Unit
 from imulab.errors import DataError, UnitError
 from imulab.procedures.tumble.device import tables_of
 from imulab.procedures.tumble.model import AXES
+from imulab.procedures.tumble.sections import model_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
@@ -107,11 +108,12 @@ def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
 
     Counted only where the record has nonlinearity, which gravity has shown within 1 g and nowhere else.
     """
-    if record.model["order"] <= 1 and not record.model.get("cross"):
+    model = model_of(record)
+    if model.order <= 1 and not model.cross:
         return 0, 0.0
     scale = np.array([record.value(f"scale_factor_{axis}") for axis in AXES])
     bias = np.array([record.value(f"bias_{axis}") for axis in AXES])
-    factor = conversion_factor(recording.triad_unit("accel"), str(record.model["output_unit"]))
+    factor = conversion_factor(recording.triad_unit("accel"), model.output_unit)
     reading = np.abs(recording.triad("accel") * factor / scale - bias)
     largest = np.where(np.isfinite(reading), reading, 0.0).max(axis=1, initial=0.0)
     return int(np.count_nonzero(largest > _FAR * STANDARD_GRAVITY)), float(largest.max(initial=0.0))

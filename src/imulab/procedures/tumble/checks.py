@@ -9,6 +9,7 @@ from imulab.estimation.estimate import median
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import GAUGE, parameter_names
+from imulab.procedures.tumble.sections import data_of, model_of
 from imulab.procedures.tumble.solve import Solution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
@@ -156,10 +157,10 @@ def made_from(record: Calibration, recording: Recording) -> bool:
     source, time = recording.source, recording.time
     if source is None or source.sha256 not in [made.sha256 for made in record.sources]:
         return False
-    held = record.data.get("attitudes", {})
-    if time is None or not len(time) or not held:
+    held = data_of(record).attitudes
+    if time is None or not len(time) or held is None:
         return True
-    return any(b >= time[0] and a <= time[-1] for a, b in zip(held["start"], held["stop"], strict=True))
+    return any(b >= time[0] and a <= time[-1] for a, b in held.stretches)
 
 
 def check_prior(record: Calibration) -> None:
@@ -174,13 +175,14 @@ def check_prior(record: Calibration) -> None:
         raise RecordError(f"a {record.procedure} record cannot be a prior; expected a tumble record")
     if not record.covariance.names:
         raise RecordError("a record that states no uncertainties cannot be a prior")
-    order = record.model["order"]
-    if order not in range(HIGHEST_ORDER + 1):
+    model = model_of(record)
+    order = model.order
+    if order > HIGHEST_ORDER:
         raise RecordError(f"a record of order {order} cannot be a prior; expected 0 to {HIGHEST_ORDER}")
-    if record.model.get("cross"):
+    if model.cross:
         raise RecordError("a record with cross terms cannot be a prior")
-    if record.model["gauge"] != GAUGE:
-        raise RecordError(f"a record in the gauge {record.model['gauge']!r} cannot be a prior; expected {GAUGE!r}")
+    if model.gauge != GAUGE:
+        raise RecordError(f"a record in the gauge {model.gauge!r} cannot be a prior; expected {GAUGE!r}")
     for name in parameter_names(order):
         if name not in record.parameters or name not in record.covariance.names:
             raise RecordError(f"the record has no {name}, or no covariance of it, and cannot be a prior")

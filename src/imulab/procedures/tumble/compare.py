@@ -15,6 +15,7 @@ from imulab.procedures.tumble.checks import check_fresh, made_from
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of, scatter
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
+from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.verdict import Note
@@ -99,7 +100,7 @@ def check_tumble(
     """
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")
-    if record.model.get("cross"):
+    if model_of(record).cross:
         raise RecordError("a record with cross terms cannot be checked; expected one without, of the same attitudes")
     if limit is not None and not limit > 0:
         raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
@@ -107,7 +108,7 @@ def check_tumble(
         raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
     local = _gravity(record, gravity, attitudes)
     attitudes = _in_unit_of(record, attitudes)
-    g, order = local.value, int(record.model["order"])
+    g, order = local.value, model_of(record).order
     scale = g * np.array([record.value(f"scale_factor_{axis}") for axis in "xyz"])
     scaling = Scaling(np.zeros(3), np.abs(scale))
     theta = scaled_parameters(np.array([record.value(name) for name in parameter_names(order)]), scaling, g)
@@ -146,15 +147,15 @@ def check_tumble(
 def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:
     """What was given, else the head's, else that of the record."""
     if given is None and "gravity" not in attitudes.recording.metadata:
-        stated = record.model["gravity"]
-        value, uncertainty = float(stated["value"]), float(stated.get("standard_uncertainty", 0.0))
+        stated = model_of(record).gravity
+        value, uncertainty = float(stated.value), float(stated.standard_uncertainty or 0.0)
         said = f"gravity {value:.6g} m/s^2 was taken from the record, as if measured at the same place"
-        return Gravity(value, str(stated["from"]), uncertainty, Note(said))
+        return Gravity(value, stated.from_, uncertainty, Note(said))
     return local_gravity(given, attitudes.recording)
 
 
 def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
-    unit = str(record.model["output_unit"])
+    unit = model_of(record).output_unit
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, unit)
     return replace(
         attitudes,
@@ -169,9 +170,8 @@ def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple
     """Covariance of the attitudes, g^2, shape (n, 3, 3), and what is to be said of it."""
     if attitudes.covariance is not None:
         return attitudes.covariance / (scaling.scale[:, None] * scaling.scale), []
-    g, fit = float(record.model["gravity"]["value"]), record.fit
-    stated = record.data["attitudes"]["standard_uncertainty"]
-    chi_square = fit.get("reduced_chi_square")
+    g, chi_square = model_of(record).gravity.value, fit_of(record).reduced_chi_square
+    stated = attitudes_of(record).standard_uncertainty
     sigma = median(np.array(stated)) if stated else float(np.sqrt(chi_square)) if chi_square else 0.0
     said = Note(
         f"nothing is known of the noise of these attitudes: the {1e6 * sigma / g:.3g} µg of those that the record was "
@@ -182,15 +182,16 @@ def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple
 
 def _excess(record: Calibration, g: float) -> float:
     """Variance of the record's own attitudes beyond their noise, if that was seen: fresh ones will have it too."""
-    fit = record.fit
-    freedom, reduced = fit.get("degrees_of_freedom"), fit.get("reduced_chi_square")
-    if fit.get("noise") != "known" or not freedom or not reduced or freedom < 1:
+    fit = fit_of(record)
+    freedom, reduced = fit.degrees_of_freedom, fit.reduced_chi_square
+    if fit.noise != "known" or not reduced or freedom < 1:
         return 0.0
     if chi_square_probability(reduced * freedom, freedom) > SCATTERED:
         return 0.0
-    return (float(fit["excess"]["value"]) / g) ** 2
+    return (fit.excess.value / g) ** 2
 
 
 def _freedom(record: Calibration) -> float | None:
     """Degrees of freedom where the record's uncertainties rest on a scatter of few residuals; None: noise was known."""
-    return None if record.fit.get("noise") == "known" else float(record.fit["degrees_of_freedom"])
+    fit = fit_of(record)
+    return None if fit.noise == "known" else float(fit.degrees_of_freedom)

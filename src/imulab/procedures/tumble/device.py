@@ -9,6 +9,8 @@ import numpy as np
 from imulab.device.tables import Field, Table, field_of, nonzero, values_of, whole
 from imulab.device.unit import Unit
 from imulab.errors import RecordError
+from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.sections import model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY
@@ -25,12 +27,11 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
     Raises
     ------
     RecordError
-        A parameter is in another unit, or has a value that cannot be.
-    KeyError
-        The record lacks a parameter.
+        The record lacks a parameter, or has one in another unit or with a value that cannot be.
     """
-    order, output = record.model["order"], str(record.model["output_unit"])
-    if type(order) is not int or not 0 <= order <= 5:
+    model = model_of(record)
+    order, output = model.order, model.output_unit
+    if order > HIGHEST_ORDER:
         raise RecordError(f"the record has order {order!r}, expected a whole number from 0 to 5")
     scale = values_of(record, [f"scale_factor_{axis}" for axis in _AXES], f"{output}/(m/s^2)")
     nonlinearity = np.array(
@@ -74,14 +75,17 @@ def _gyro(record: Calibration) -> tuple[Table, ...]:
     if sensitive:
         g = [[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES]
         fields.append(Field("sensitivity", np.array(g)))
-    return (Table("gyro", tuple(fields), {"output_unit": str(record.model["gyro_output_unit"])}),)
+    return (Table("gyro", tuple(fields), {"output_unit": model_of(record).gyro_output_unit}),)
 
 
 def monotone_range(nonlinearity: Array) -> tuple[float, float]:
     """Return the readings between the turning points of ``s + k2 s^2 + ...`` next to zero, infinite without any."""
     powers = np.concatenate([[0.0, 1.0], nonlinearity])
     slope = np.polynomial.polynomial.polyder(powers)
-    turns = np.polynomial.polynomial.polyroots(slope)
+    try:
+        turns = np.polynomial.polynomial.polyroots(slope)
+    except np.linalg.LinAlgError:
+        raise RecordError("the record has a nonlinearity that cannot be: it has no turning points") from None
     real = turns[np.abs(turns.imag) < 1e-12 * np.maximum(np.abs(turns), 1.0)].real
     low, high = real[real < 0].max(initial=-np.inf), real[real > 0].min(initial=np.inf)
     ends = [float(np.polynomial.polynomial.polyval(s, powers)) if np.isfinite(s) else s for s in (low, high)]

@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.procedures.tumble.apply import specific_force
 from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.sections import fit_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -38,7 +39,7 @@ def direction_covariance(record: Calibration, attitudes: Attitudes, output: Arra
         columns = [_slope(record, output, size * np.eye(3)[axis]) / size for axis in range(3)]
         slope = np.stack(columns, axis=2)
         own = slope @ (attitudes.covariance * unit**2) @ np.swapaxes(slope, 1, 2)
-        joint[range(n), :, range(n), :] = own + float(record.fit["excess"]["value"]) ** 2 * np.eye(3)
+        joint[range(n), :, range(n), :] = own + fit_of(record).excess.value ** 2 * np.eye(3)
     names = [name for name in record.covariance.names if not name.startswith("gyro_")]
     if names:
         matrix = record.covariance.block(names)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from imulab.procedures.tumble.record import zero_outputs
+from imulab.procedures.tumble.sections import Trials, fit_of, model_of
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
 from imulab.report.elements import format_uncertain, plain_number
@@ -34,27 +36,28 @@ class EngineeringRow:
 
 def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     """Return the factor and the unit in which the change of a parameter is read."""
-    output = str(record.model["output_unit"])
+    output = model_of(record).output_unit
     factor, _, unit = _converted(change.name, change.unit, output, parse_unit(output).quantity == "acceleration")
     return factor, "ppm" if unit == _OFF_NOMINAL else unit
 
 
-def propagated_rows(record: Calibration) -> list[list[str]]:
+def propagated_rows(record: Calibration, trials: Trials) -> list[list[str]]:
     """Return the Monte Carlo intervals beside the linear ones: name, both, ratio of their widths, unit."""
-    output = str(record.model["output_unit"])
+    fit, output = fit_of(record), model_of(record).output_unit
     physical = parse_unit(output).quantity == "acceleration"
-    coverage = record.fit.get("coverage_factor_95_given_order") or record.fit["coverage_factor_95"]
+    coverage = fit.coverage_factor_95_given_order or fit.coverage_factor_95 or 0.0
     rows = []
-    for name, found in record.fit["monte_carlo"]["parameters"].items():
-        parameter = record.parameters[name]
+    for name, found in trials.parameters.items():
+        parameter = record.parameter(name)
         factor, offset, unit = _converted(name, parameter.unit, output, physical)
         u = parameter.standard_uncertainty_given_order or parameter.standard_uncertainty or 0.0
         linear = [parameter.value - coverage * u, parameter.value + coverage * u]
         texts = [
             " to ".join(format_uncertain(end * factor + offset, u * abs(factor))[0] for end in ends)
-            for ends in (linear, found["interval_95"])
+            for ends in (linear, found.interval_95)
         ]
-        ratio = (found["interval_95"][1] - found["interval_95"][0]) / (linear[1] - linear[0])
+        width = linear[1] - linear[0]
+        ratio = (found.interval_95[1] - found.interval_95[0]) / width if width else math.nan
         rows.append([name, *texts, f"{ratio:.3f}", unit])
     return rows
 
@@ -74,7 +77,7 @@ def predicted_rows(uncertainties: dict[str, float]) -> list[tuple[str, str, str]
 def engineering_rows(record: Calibration) -> list[EngineeringRow]:
     """Return the parameters in engineering units, the outputs at zero specific force included for counts and volts."""
     rows = []
-    output = str(record.model["output_unit"])
+    output = model_of(record).output_unit
     physical = parse_unit(output).quantity == "acceleration"
     zeros = {} if physical else zero_outputs(record)
     for name, parameter in record.parameters.items():

@@ -8,6 +8,17 @@ import numpy as np
 
 from imulab.procedures.tumble.engineering import micro_g, small_g
 from imulab.procedures.tumble.model import AXES
+from imulab.procedures.tumble.sections import (
+    HeldAttitudes,
+    Trace,
+    TurnAside,
+    Turns,
+    attitudes_of,
+    data_of,
+    fit_of,
+    gyro_of,
+    model_of,
+)
 from imulab.procedures.tumble.sphere import sphere_figure
 from imulab.procedures.tumble.tables import orders_table, parameters_table, propagated_table, shares_table
 from imulab.records.calibration import Calibration
@@ -18,40 +29,40 @@ from imulab.units import from_si
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
-    fit, model, data = record.fit, record.model, record.data["attitudes"]
-    good = [weight >= ALARM for weight in data["down_weight"]]
-    used = [value for value, ok in zip(data["residual"], good, strict=True) if ok] or data["residual"]
+    fit, held, data = fit_of(record), data_of(record), attitudes_of(record)
+    good = [weight >= ALARM for weight in data.down_weight]
+    used = [value for value, ok in zip(data.residual, good, strict=True) if ok] or data.residual
     bad = len(good) - sum(good)
-    left_out = fit.get("leave_one_out")
+    left_out = fit.leave_one_out
     worst = _worst_scale_uncertainty(record)
     facts = [
         ("attitudes", str(len(good))),
-        ("order", str(model["order"])),
+        ("order", str(model_of(record).order)),
         (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", small_g(_rms(used))),
-        ("leave-one-out", small_g(left_out["value"]) if left_out else "not computed"),
+        ("leave-one-out", small_g(left_out.value) if left_out else "not computed"),
         ("worst u(scale factor)", f"{plain_number(worst, 2)} ppm" if worst is not None else "not stated"),
-        ("condition number", plain_number(fit["condition_number"], 3)),
+        ("condition number", plain_number(fit.condition_number, 3)),
     ]
     items: list[Figure | Table] = [_residuals(record), parameters_table(record)]
-    if "monte_carlo" in fit:
-        items.append(propagated_table(record))
-    if "prior" in fit:
-        items.append(shares_table(record))
-    if fit["orders"]:
+    if fit.monte_carlo is not None:
+        items.append(propagated_table(record, fit.monte_carlo))
+    if fit.prior is not None:
+        items.append(shares_table(fit.prior))
+    if fit.orders:
         items.append(orders_table(record))
     items.append(sphere_figure(record))
-    if "trace" in record.data:
-        items.append(_trace(record))
-    if "gyro" in record.data:
-        items.append(_turns(record))
+    if held.trace is not None:
+        items.append(_trace(held.trace, data))
+    if held.gyro is not None:
+        items.append(_turns(held.gyro, gyro_of(record).set_aside))
     if record.covariance.names:
         items.append(_correlation(record))
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_held_back(record)}" if bad else ""
-    if "gyro" in fit:
+    if fit.gyro is not None:
         aside += f"; {gyro_headline(record)}"
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
-        f"{small_g(_rms(used))} rms (before: {small_g(_rms(data['residual_before']))}){aside}.",
+        f"{small_g(_rms(used))} rms (before: {small_g(_rms(data.residual_before))}){aside}.",
         facts=facts,
         items=items,
     )
@@ -59,13 +70,13 @@ def exhibits(record: Calibration) -> Exhibits:
 
 def gyro_headline(record: Calibration) -> str:
     """Return the result for the gyroscope triad, without a point."""
-    fit = record.fit["gyro"]
-    missed = from_si(fit["rms"]["value"], "deg")
-    return f"{fit['turns']} turns of the gyroscopes carry gravity's direction within {missed:.2g} deg rms"
+    fit = gyro_of(record)
+    missed = from_si(fit.rms.value, "deg")
+    return f"{fit.turns} turns of the gyroscopes carry gravity's direction within {missed:.2g} deg rms"
 
 
 def _held_back(record: Calibration) -> str:
-    return "set aside" if record.fit.get("set_aside") else "down-weighted"
+    return "set aside" if fit_of(record).set_aside else "down-weighted"
 
 
 def _rms(values: list[float]) -> float:
@@ -73,8 +84,8 @@ def _rms(values: list[float]) -> float:
 
 
 def _worst_scale_uncertainty(record: Calibration) -> float | None:
-    found = [record.parameters[f"scale_factor_{axis}"] for axis in AXES]
-    relative = [1e6 * p.standard_uncertainty / abs(p.value) for p in found if p.standard_uncertainty is not None]
+    found = [record.parameter(f"scale_factor_{axis}") for axis in AXES]
+    relative = [1e6 * p.standard_uncertainty / abs(p.value) for p in found if p.standard_uncertainty and p.value]
     return max(relative) if relative else None
 
 
@@ -83,14 +94,14 @@ def _axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def _residuals(record: Calibration) -> Figure:
-    data = record.data["attitudes"]
-    number = list(range(1, len(data["residual"]) + 1))
-    after = [micro_g(value) for value in data["residual"]]
-    sigma = data["standard_uncertainty"]
-    excess = record.fit["excess"]["value"]
+    data = attitudes_of(record)
+    number = list(range(1, len(data.residual) + 1))
+    after = [micro_g(value) for value in data.residual]
+    sigma = data.standard_uncertainty
+    excess = fit_of(record).excess.value
     bars = None if sigma is None else [micro_g(float(np.hypot(value, excess))) for value in sigma]
-    colours = [BAD if weight < ALARM else GOOD for weight in data["down_weight"]]
-    shapes = ["diamond" if weight < ALARM else "circle" for weight in data["down_weight"]]
+    colours = [BAD if weight < ALARM else GOOD for weight in data.down_weight]
+    shapes = ["diamond" if weight < ALARM else "circle" for weight in data.down_weight]
     marker = {"color": colours, "size": 8, "symbol": shapes}
     trace: dict[str, Any] = {
         "type": "scatter",
@@ -100,25 +111,23 @@ def _residuals(record: Calibration) -> Figure:
         "marker": marker,
         "xaxis": "x",
         "yaxis": "y",
-        "text": data["label"],
+        "text": data.label,
         "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
         "name": "after",
     }
     if bars is not None:
         trace["error_y"] = {"type": "data", "array": bars, "thickness": 1, "width": 2, "color": QUIET}
-    before = [micro_g(value) / 1e3 for value in data["residual_before"]]
-    usual = np.array(data["down_weight"]) >= ALARM
+    before = [micro_g(value) / 1e3 for value in data.residual_before]
+    usual = np.array(data.down_weight) >= ALARM
     bad = len(number) - int(usual.sum())
     beyond = bulk(np.array(after), usual if usual.any() else None, float(np.median(bars)) if bars else 0.0)
-    marks = (
-        [] if beyond is None else edge_marks(beyond, np.array(after), number, [small_g(v) for v in data["residual"]])
-    )
+    marks = [] if beyond is None else edge_marks(beyond, np.array(after), number, [small_g(v) for v in data.residual])
     worst = int(np.argmax(np.where(usual, np.abs(after), -1.0)))
     scale = {} if beyond is None else {"range": [beyond.low, beyond.high]}
     return Figure(
         title="Residual |f| − g of each attitude",
-        message=f"Before: {small_g(_rms(data['residual_before']))} rms. After: the largest of the attitudes that count "
-        f"is {small_g(data['residual'][worst])}, attitude {worst + 1}.",
+        message=f"Before: {small_g(_rms(data.residual_before))} rms. After: the largest of the attitudes that count "
+        f"is {small_g(data.residual[worst])}, attitude {worst + 1}.",
         caption="Above, grey bars: with the nominal sensor (for counts and volts: the span of each axis). Below, "
         "points: calibrated"
         + ("; bars are one standard uncertainty of |f|" if bars else "")
@@ -151,21 +160,21 @@ def _residuals(record: Calibration) -> Figure:
     )
 
 
-def _trace(record: Calibration) -> Figure:
-    trace, data = record.data["trace"], record.data["attitudes"]
-    deviation = [max(float(from_si(value, "mg")), 1e-6) for value in trace["deviation"]]
-    rest = sum(stop - start for start, stop in zip(data["start"], data["stop"], strict=True))
-    whole = trace["time"][-1] - trace["time"][0]
+def _trace(trace: Trace, data: HeldAttitudes) -> Figure:
+    deviation = [max(float(from_si(value, "mg")), 1e-6) for value in trace.deviation]
+    stretches = data.stretches
+    rest = sum(stop - start for start, stop in stretches)
+    whole = trace.time[-1] - trace.time[0]
     return Figure(
         title="Where the unit was at rest",
-        message=f"{len(data['start'])} stretches were used, {rest:.0f} s of {whole:.0f} s.",
+        message=f"{len(stretches)} stretches were used, {rest:.0f} s of {whole:.0f} s.",
         caption="Standard deviation within a sliding window (three axes together), the threshold below which the unit "
         "counts as at rest, and the stretches that were used (shaded), without their settling edges.",
         traces=[
             {
                 "type": "scatter",
                 "mode": "lines",
-                "x": trace["time"],
+                "x": trace.time,
                 "y": deviation,
                 "line": {"color": GOOD, "width": 1},
                 "name": "windowed standard deviation",
@@ -174,8 +183,8 @@ def _trace(record: Calibration) -> Figure:
             {
                 "type": "scatter",
                 "mode": "lines",
-                "x": [trace["time"][0], trace["time"][-1]],
-                "y": [float(from_si(trace["threshold"], "mg"))] * 2,
+                "x": [trace.time[0], trace.time[-1]],
+                "y": [float(from_si(trace.threshold, "mg"))] * 2,
                 "line": {"color": BAD, "dash": "dash"},
                 "name": "threshold",
                 "hoverinfo": "skip",
@@ -198,22 +207,20 @@ def _trace(record: Calibration) -> Figure:
                     "opacity": 0.13,
                     "line": {"width": 0},
                 }
-                for a, b, weight in zip(data["start"], data["stop"], data["down_weight"], strict=True)
+                for (a, b), weight in zip(stretches, data.down_weight, strict=True)
             ],
         },
     )
 
 
-def _turns(record: Calibration) -> Figure:
-    data = record.data["gyro"]
-    aside = record.fit["gyro"].get("set_aside", [])
-    turns = [(a, b, miss, GOOD) for a, b, miss in zip(data["start"], data["stop"], data["residual"], strict=True)]
-    turns += [(turn["start"], turn["stop"], turn["miss"]["value"], BAD) for turn in aside]
+def _turns(data: Turns, aside: list[TurnAside]) -> Figure:
+    turns = [(a, b, miss, GOOD) for a, b, miss in zip(data.start, data.stop, data.residual, strict=True)]
+    turns += [(turn.start, turn.stop, turn.miss.value, BAD) for turn in aside]
     turns.sort(key=lambda turn: turn[0])
     angle = [float(from_si(turn[2], "deg")) for turn in turns]
     number = list(range(1, len(angle) + 1))
     text = [f"{a:.1f} to {b:.1f} s" for a, b, *_ in turns]
-    rms = float(from_si(_rms(data["residual"]), "deg"))
+    rms = float(from_si(_rms(data.residual), "deg"))
     beyond = bulk(np.array(angle))
     marks = [] if beyond is None else edge_marks(beyond, np.array(angle), number, [f"{v:.3g} deg" for v in angle])
     return Figure(

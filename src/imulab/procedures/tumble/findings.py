@@ -15,6 +15,7 @@ from imulab.procedures.tumble.blend import Blended
 from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, parameter_count
 from imulab.procedures.tumble.optimal import CLOSEST, near_vertical
 from imulab.procedures.tumble.outliers import FREEDOM, HIGHEST_TESTED, Aside
+from imulab.procedures.tumble.sections import data_of, fit_of
 from imulab.procedures.tumble.solve import Problem, Solution, forces
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -68,8 +69,9 @@ def uncertainty_entries(stated: Stated | None) -> dict[str, Any]:
 def aside_of(record: Calibration, attitudes: Attitudes) -> NDArray[np.bool_]:
     """Return which of the attitudes a record set aside, if it was made from these, shape (n,)."""
     found = np.zeros(len(attitudes), dtype=np.bool_)
-    if np.array_equal(record.data.get("attitudes", {}).get("mean", ()), attitudes.mean):
-        found[[number - 1 for number in record.fit.get("set_aside", ())]] = True
+    held = data_of(record).attitudes
+    if held is not None and np.array_equal(held.mean, attitudes.mean):
+        found[[number - 1 for number in fit_of(record).set_aside]] = True
     return found
 
 

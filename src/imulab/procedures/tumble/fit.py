@@ -32,6 +32,7 @@ from imulab.procedures.tumble.orders import OrderChoice, OrderRow, absolute_weig
 from imulab.procedures.tumble.outliers import NONE_ASIDE, Aside, set_aside
 from imulab.procedures.tumble.prior import GROUPS, Aged, Known, entries, findings, known_of, put_together
 from imulab.procedures.tumble.record import Scaling, make_record
+from imulab.procedures.tumble.sections import model_of
 from imulab.procedures.tumble.solve import Problem, Solution, evaluate, forces, informed_rows, solve_norm
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -261,7 +262,7 @@ def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> 
             f"{attitudes.recording.name}: a prior needs the noise of the attitudes, to be weighed against: a "
             "recording, or std_* columns"
         )
-    own = int(prior.model["order"])
+    own = model_of(prior).order
     if order not in ("auto", own):
         raise OptionError(f"order {order} with a prior of order {own}: expected order {own} or auto")
     return own

@@ -29,6 +29,7 @@ from imulab.procedures.tumble.gyrolinear import Nonlinearity, test_linearity
 from imulab.procedures.tumble.gyrorest import SENSITIVITIES, clock_notes, find_holds
 from imulab.procedures.tumble.gyrosolve import Case, Solved, solve_turns
 from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
+from imulab.procedures.tumble.sections import fit_of, model_of
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY, from_si
@@ -158,7 +159,7 @@ def fit_gyro(
     check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
     left_out = leave_out(recording, [f"gyro_{axis}" for axis in "xyz"])
     time, output = check_time(recording), left_out.recording.triad("gyro")
-    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, str(record.model["output_unit"]))
+    factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, model_of(record).output_unit)
     means = attitudes.mean * factor
     own = attitudes.recording.si("time")
     moving = leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording
@@ -233,7 +234,7 @@ def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> li
     mine, its = record.sensor.get("serial"), attitudes.recording.metadata.get("serial")
     found = [f"gyro: the record is of {mine}, the recording of {its}"] if mine and its and mine != its else []
     length = np.linalg.norm(force, axis=1)
-    scatter, usual = float(length.std()), float(record.fit["rms"]["value"])
+    scatter, usual = float(length.std()), fit_of(record).rms.value
     if scatter > _FOREIGN * usual + _TOUCHED:
         found.append(
             f"gyro: under the record |f| scatters by {from_si(scatter, 'mg'):.3g} mg from attitude to attitude, by "

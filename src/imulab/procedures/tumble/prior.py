@@ -21,6 +21,7 @@ from imulab.gravity import Gravity
 from imulab.procedures.tumble.checks import check_prior
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.record import Scaling, scaled_parameters, si_derivative
+from imulab.procedures.tumble.sections import fit_of, model_of
 from imulab.procedures.tumble.solve import Prior, Problem, Solution
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
@@ -95,11 +96,12 @@ def known_of(record: Calibration, scaling: Scaling, gravity: Gravity, unit: str)
         The record cannot be a prior, or its outputs have another unit.
     """
     check_prior(record)
-    if record.model["output_unit"] != unit:
-        raise RecordError(f"the prior has outputs in {record.model['output_unit']}, the recording in {unit}")
-    names = parameter_names(int(record.model["order"]))
+    model = model_of(record)
+    if model.output_unit != unit:
+        raise RecordError(f"the prior has outputs in {model.output_unit}, the recording in {unit}")
+    names = parameter_names(model.order)
     covariance = record.covariance.block(names)
-    common = record.fit.get("shared", {}).get(gravity.name)
+    common = fit_of(record).shared.get(gravity.name)
     if common is not None:
         slope = np.array([common[name] for name in names])
         covariance = covariance - np.outer(slope, slope)
@@ -281,7 +283,7 @@ def entries(record: Calibration, known: Known, aged: Aged, scaling: Scaling, gra
         )
     )
     names = parameter_names(aged.problem.order)
-    common = record.fit.get("shared", {}).get(gravity.name, {}) if known.shared else {}
+    common = fit_of(record).shared.get(gravity.name, {}) if known.shared else {}
     shared = np.array([common.get(name, 0.0) ** 2 for name in names])
     shares = np.minimum((np.diag(now) + shared) / (np.diag(before) + shared), 1.0)
     units = ((g, "m/s^2"), (1.0, "1"), (1.0, "rad"))

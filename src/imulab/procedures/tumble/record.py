@@ -35,6 +35,7 @@ from imulab.procedures.tumble.model import (
 from imulab.procedures.tumble.montecarlo import MonteCarlo
 from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.patterns import direction_findings, time_findings
+from imulab.procedures.tumble.sections import model_of
 from imulab.procedures.tumble.solve import Problem, Solution, data_freedom, forces
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -168,13 +169,13 @@ def zero_outputs(record: Calibration) -> dict[str, Parameter]:
     """Return what each axis puts out at zero specific force, S b, with its uncertainty, in the output's unit."""
     found = {}
     for axis in AXES:
-        b, s = record.parameters[f"bias_{axis}"], record.parameters[f"scale_factor_{axis}"]
+        b, s = record.parameter(f"bias_{axis}"), record.parameter(f"scale_factor_{axis}")
         uncertainty = None
         if record.covariance.names:
             block = record.covariance.block([f"bias_{axis}", f"scale_factor_{axis}"])
             gradient = np.array([s.value, b.value])
             uncertainty = float(np.sqrt(max(gradient @ block @ gradient, 0.0)))
-        found[axis] = Parameter(s.value * b.value, uncertainty, str(record.model["output_unit"]))
+        found[axis] = Parameter(s.value * b.value, uncertainty, model_of(record).output_unit)
     return found
 
 

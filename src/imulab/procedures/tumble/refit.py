@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.estimation.estimate import covariance, least_squares, leverage, observability, plausible_excess
 from imulab.procedures.tumble.model import gravity_slope, norm_and_jacobian, parameter_names
+from imulab.procedures.tumble.sections import data_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -38,19 +39,20 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     Calibration or None
         The record with other parameters, covariance and rms; None where it holds no attitudes, or too few to see them.
     """
-    held = record.data.get("attitudes")
+    held = data_of(record).attitudes
     free = np.arange(9 if misalignment else 6)
-    if not held:
+    if held is None:
         return None
-    kept = np.array(held["down_weight"]) >= _KEPT
-    n, g = int(kept.sum()), float(record.model["gravity"]["value"])
+    gravity = model_of(record).gravity
+    kept = np.array(held.down_weight) >= _KEPT
+    n, g = int(kept.sum()), float(gravity.value)
     if n <= len(free):
         return None
     names = parameter_names(_LINEAR)
     nominal = np.array([record.value(name) for name in names[3:6]])
-    reading = (np.array(held["mean"])[kept] / (nominal * g))[None]
-    lengthening = np.array(held.get("lengthening") or np.zeros(len(kept)))[kept] / g
-    stated = held["standard_uncertainty"]
+    reading = (np.array(held.mean)[kept] / (nominal * g))[None]
+    lengthening = np.array(held.lengthening or np.zeros(len(kept)))[kept] / g
+    stated = held.standard_uncertainty
     own: Array = np.ones((1, n)) if stated is None else (np.array(stated)[kept] / g)[None] ** 2
 
     def model(parameters: Array) -> tuple[Array, Array]:
@@ -79,7 +81,7 @@ def refit_linear(record: Calibration, *, misalignment: bool) -> Calibration | No
     values = np.concatenate([g * zero / relative, nominal * relative, theta[6:]])
     slope = np.diag(np.concatenate([g / relative, nominal, np.ones(3)]))
     slope[range(3), range(3, 6)] = -g * zero / relative**2
-    shared = float(record.model["gravity"].get("standard_uncertainty") or 0.0) / g * gravity_slope(values, _LINEAR)
+    shared = float(gravity.standard_uncertainty or 0.0) / g * gravity_slope(values, _LINEAR)
     whole = slope[:, free] @ (covariance(fit.jacobian, 1 / variance)[0] * factor) @ slope[:, free].T
     whole += np.outer(shared, shared)
     fitted = {

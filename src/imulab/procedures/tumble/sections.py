@@ -157,6 +157,11 @@ class HeldAttitudes(Part):
     lengthening: PerAttitude[float] | None = None
     down_weight: PerAttitude[float]
 
+    @property
+    def stretches(self) -> list[tuple[float, float]]:
+        """Start and stop of each, s; none for a table of attitudes."""
+        return [(a, b) for a, b in zip(self.start, self.stop, strict=True) if a is not None and b is not None]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trace(Part):
@@ -220,6 +225,11 @@ def attitudes_of(record: Calibration) -> HeldAttitudes:
         It holds none, or something else.
     """
     return part(record, HeldAttitudes, "data.attitudes")
+
+
+def gyro_of(record: Calibration) -> GyroFit:
+    """Return what was found of the gyroscopes; errors as for `attitudes_of`."""
+    return part(record, GyroFit, "fit.gyro")
 
 
 def data_of(record: Calibration) -> Data:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.procedures.tumble.sections import attitudes_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import ALARM, BAD, GOOD, INK, QUIET, Figure
@@ -14,11 +15,11 @@ from imulab.units import from_si
 
 def sphere_figure(record: Calibration) -> Figure:
     """Return the attitudes as points on the hemispheres around +z and −z, coloured by their residual."""
-    data = record.data["attitudes"]
-    force = np.array(data["force"])
+    data = attitudes_of(record)
+    force = np.array(data.force)
     u = force / np.linalg.norm(force, axis=1, keepdims=True)
-    residual = np.array([float(from_si(value, "ug")) for value in data["residual"]])
-    weight = np.array(data["down_weight"])
+    residual = np.array([float(from_si(value, "ug")) for value in data.residual])
+    weight = np.array(data.down_weight)
     limit = float(np.quantile(np.abs(residual[weight >= ALARM]), 0.95)) if (weight >= ALARM).any() else 1.0
     up = u[:, 2] >= 0
     traces: list[dict[str, Any]] = []
@@ -45,7 +46,7 @@ def sphere_figure(record: Calibration) -> Figure:
                     "showscale": upper,
                     "colorbar": {"title": {"text": "|f| − g, µg"}, "thickness": 12},
                 },
-                "text": [label for label, c in zip(data["label"], chosen.tolist(), strict=True) if c],
+                "text": [label for label, c in zip(data.label, chosen.tolist(), strict=True) if c],
                 "customdata": u[chosen].round(3).tolist(),
                 "hovertemplate": "%{text}<br>up (%{customdata[0]}, %{customdata[1]}, %{customdata[2]})<extra></extra>",
             }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from imulab.procedures.tumble.engineering import engineering_rows, micro_g, propagated_rows
+from imulab.procedures.tumble.sections import Prior, Trials, fit_of, model_of
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Table, format_uncertain, plain_number
 
@@ -12,24 +13,24 @@ _AGREE = 10.0
 
 def _basis(record: Calibration) -> str:
     """Say what the uncertainties rest on."""
-    fit = record.fit
-    freedom = fit.get("effective_degrees_of_freedom", fit["degrees_of_freedom"])
-    if fit["noise"] != "known" and freedom is None:
+    fit = fit_of(record)
+    freedom = fit.freedom
+    if fit.noise != "known" and freedom is None:
         return "As many parameters as attitudes: nothing tells the noise, and no uncertainty is stated."
-    if fit["noise"] != "known":
+    if fit.noise != "known":
         return f"Noise estimated from the residuals; Student's t with {freedom:.0f} degrees of freedom."
-    if not fit["excess"]["value"] or freedom is None:
+    if not fit.excess.value or freedom is None:
         return "Noise known from the attitudes' own scatter; normal quantiles."
     return (
-        f"Noise known from the attitudes' own scatter, with {micro_g(fit['excess']['value']):.3g} µg more for each "
+        f"Noise known from the attitudes' own scatter, with {micro_g(fit.excess.value):.3g} µg more for each "
         f"attitude, as its residual makes plausible; Student's t with {freedom:.0f} effective degrees of freedom."
     )
 
 
 def parameters_table(record: Calibration) -> Table:
     """Return the parameters with their uncertainties."""
-    blend = record.fit.get("blend")
-    factors = {False: record.fit["coverage_factor_95"], True: record.fit.get("gyro", {}).get("coverage_factor_95")}
+    fit, model = fit_of(record), model_of(record)
+    factors = {False: fit.coverage_factor_95, True: None if fit.gyro is None else fit.gyro.coverage_factor_95}
     rows = []
     for row in engineering_rows(record):
         factor = factors[row.name.startswith("gyro_")]
@@ -38,26 +39,27 @@ def parameters_table(record: Calibration) -> Table:
         if row.standard_uncertainty is not None and factor is not None:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
-        given = [] if blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]
+        given = [] if fit.blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]
         rows.append([row.name, value, uncertainty, *given, interval, row.unit])
     basis = _basis(record)
-    if blend is not None:
+    if fit.blend is not None:
         basis += (
-            f" The standard uncertainty holds whatever the order is, up to {blend['highest_order']}; beside it what it "
-            f"would be if order {record.model['order']} were known to be right."
+            f" The standard uncertainty holds whatever the order is, up to {fit.blend.highest_order}; beside it what "
+            f"it would be if order {model.order} were known to be right."
         )
     turned = ""
-    if "gyro" in record.fit:
-        degrees = record.fit["gyro"]["degrees_of_freedom"]
-        turned = f" Gyroscopes: M = S (T ω + b + G f), Student's t with {degrees} degrees of freedom."
+    if fit.gyro is not None:
+        turned = (
+            f" Gyroscopes: M = S (T ω + b + G f), Student's t with {fit.gyro.degrees_of_freedom} degrees of freedom."
+        )
     return Table(
         title="Parameters",
-        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {record.model['gauge']}.{turned}",
+        caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {model.gauge}.{turned}",
         columns=[
             "parameter",
             "value",
             "standard uncertainty",
-            *([] if blend is None else [f"if order {record.model['order']} is right"]),
+            *([] if fit.blend is None else [f"if order {model.order} is right"]),
             "95 % interval",
             "unit",
         ],
@@ -65,15 +67,14 @@ def parameters_table(record: Calibration) -> Table:
     )
 
 
-def propagated_table(record: Calibration) -> Table:
+def propagated_table(record: Calibration, trials: Trials) -> Table:
     """Return the intervals by propagation of distributions beside the linear ones."""
-    trials = record.fit["monte_carlo"]
-    rows = propagated_rows(record)
-    failed = f", {trials['failed']} more did not converge" if trials["failed"] else ""
+    rows = propagated_rows(record, trials)
+    failed = f", {trials.failed} more did not converge" if trials.failed else ""
     return Table(
         title="Monte Carlo",
         message=_agreement(rows),
-        caption=f"95 % intervals of {trials['trials']} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
+        caption=f"95 % intervals of {trials.trials} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
         "from 1 means that the model is not linear over its own uncertainty: trust the trials then.",
         columns=["parameter", "linear", "Monte Carlo", "ratio of widths", "unit"],
         rows=rows,
@@ -82,6 +83,8 @@ def propagated_table(record: Calibration) -> Table:
 
 def _agreement(rows: list[list[str]]) -> str:
     """Say within what the linear and the Monte Carlo intervals agree."""
+    if not rows:
+        return ""
     name, *_, ratio, _ = max(rows, key=lambda row: abs(float(row[3]) - 1))
     percent = 100 * abs(float(ratio) - 1)
     if percent <= _AGREE:
@@ -92,13 +95,12 @@ def _agreement(rows: list[list[str]]) -> str:
     )
 
 
-def shares_table(record: Calibration) -> Table:
+def shares_table(prior: Prior) -> Table:
     """Return what each parameter owes to the prior."""
-    prior = record.fit["prior"]
-    rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior["shares"].items()]
+    rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior.shares.items()]
     return Table(
         title="Prior and data",
-        caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior['created']}) or "
+        caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior.created}) or "
         "these attitudes; variance now over that of the prior with what it aged since.",
         columns=["parameter", "from the prior", "from the data"],
         rows=rows,
@@ -107,27 +109,25 @@ def shares_table(record: Calibration) -> Table:
 
 def orders_table(record: Calibration) -> Table:
     """Return what the choice of the order rests on."""
+    fit, chosen = fit_of(record), model_of(record).order
     rows, highlight = [], None
-    for index, row in enumerate(record.fit["orders"]):
-        if row["order"] == record.model["order"]:
+    for index, row in enumerate(fit.orders):
+        if row.order == chosen:
             highlight = index
-        probability = row["f_probability"]
         rows.append(
             [
-                str(row["order"]),
-                str(row["parameters"]),
-                plain_number(micro_g(row["rms"]), 4),
-                plain_number(micro_g(row["leave_one_out"]), 4) if row["leave_one_out"] is not None else "–",
-                f"{probability:.2g}" if probability is not None else "–",
-                f"{row['bic']:.1f}" if row["bic"] is not None else "–",
-                plain_number(micro_g(predicted), 3)
-                if (predicted := row.get("largest_uncertainty")) is not None
-                else "–",
-                plain_number(row["condition_number"], 3),
-                "yes" if row["observable"] else f"no, rank {row['rank']} of {row['parameters']}",
+                str(row.order),
+                str(row.parameters),
+                plain_number(micro_g(row.rms), 4),
+                plain_number(micro_g(row.leave_one_out), 4) if row.leave_one_out is not None else "–",
+                f"{row.f_probability:.2g}" if row.f_probability is not None else "–",
+                f"{row.bic:.1f}" if row.bic is not None else "–",
+                plain_number(micro_g(row.largest_uncertainty), 3) if row.largest_uncertainty is not None else "–",
+                plain_number(row.condition_number, 3),
+                "yes" if row.observable else f"no, rank {row.rank} of {row.parameters}",
             ]
         )
-    huber = " Rms of all attitudes, a down-weighted one by its weight." if record.fit["loss"] == "huber" else ""
+    huber = " Rms of all attitudes, a down-weighted one by its weight." if fit.loss == "huber" else ""
     return Table(
         title="Choice of the order",
         caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "

@@ -92,13 +92,14 @@ def _spread(text: str, option: str) -> tuple[float, float]:
 def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     """Read a record that can be a prior for this recording."""
     from imulab.procedures.tumble.checks import check_prior, made_from
+    from imulab.procedures.tumble.sections import model_of
 
     record = access.record(file)
     try:
         check_prior(record)
     except RecordError as error:
         raise RecordError(f"{file}: {error}") from None
-    unit, needed = recording.triad_unit("accel"), record.model["output_unit"]
+    unit, needed = recording.triad_unit("accel"), model_of(record).output_unit
     if unit != needed:
         raise RecordError(f"{file}: the prior has outputs in {needed}, {recording.name} in {unit}")
     if made_from(record, recording):
