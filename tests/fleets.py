@@ -82,12 +82,12 @@ def children(pid: int) -> list[int]:
 
 
 def workers_of(pid: int) -> list[int]:
-    """Processes that do its work: those of its fork server."""
+    """Processes that do its work: those that joblib has started for it."""
     found = []
     for child in children(pid):
         try:
-            if b"forkserver" in Path(f"/proc/{child}/cmdline").read_bytes():
-                found += children(child)
+            if b"loky.backend.popen" in Path(f"/proc/{child}/cmdline").read_bytes():
+                found.append(child)
         except OSError:
             continue
     return found

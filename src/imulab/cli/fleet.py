@@ -53,16 +53,9 @@ def run(
 
     Exit status 2 if a unit failed; all others are finished. Killed at any moment, the next run does what is missing.
     """
-    from imulab.fleet import processes
-    from imulab.fleet.manifest import load_fleet, modules_of
-
-    count = None if workers is None else whole_number(workers, "--workers")
-    fleet = load_fleet(manifest)
-    if engine == "local" and (count or processes.available()) > 1:
-        processes.prepare(modules_of(fleet))  # they load what they need while this one does
-
     from imulab.fleet.run import run_fleet
 
+    count = None if workers is None else whole_number(workers, "--workers")
     with ExitStack() as stack:
         update: list[Any] = []
 
@@ -70,7 +63,7 @@ def run(
             update.append(stack.enter_context(progress_bar("units", total)))
 
         state = run_fleet(
-            fleet,
+            manifest,
             output,
             engine=engine,
             scheduler=scheduler,

@@ -1,4 +1,4 @@
-"""Where the work is done: processes of this machine, or the workers of a Dask cluster, through joblib."""
+"""Where the work is done: processes of this machine, or the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from typing import Any, Protocol
 
 from imulab._version import VERSION
@@ -20,6 +21,8 @@ from imulab.fleet.work import Job, Outcome, work
 ENGINES = ("local", "dask")
 _CONNECT = 10.0
 """Seconds to wait for a scheduler, and as many for its first worker: both must be over within 45 s."""
+_AHEAD = 3
+"""Units at the scheduler for each thread of the cluster, so that none waits for the driver."""
 _LOST = 30.0
 """Seconds without scheduler, without workers, or with nothing left of what was submitted, before giving up."""
 
@@ -41,12 +44,8 @@ class Engine(Protocol):
 class LocalEngine:
     """Processes of this machine: nothing to start; one process works without a second."""
 
-    def __init__(self, workers: int, modules: Sequence[str]) -> None:
+    def __init__(self, workers: int) -> None:
         self.workers = workers
-        if workers > 1:
-            processes.prepare(modules)
-        else:
-            processes.keep_memory()
 
     def run(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
         """Work on the units in several processes."""
@@ -66,7 +65,7 @@ def _local(units: Sequence[Unit], job: Job, workers: int) -> Iterator[Outcome]:
 
 
 class DaskEngine:
-    """Workers of a Dask cluster, through joblib's backend."""
+    """Workers of a Dask cluster."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._client = client
@@ -77,13 +76,9 @@ class DaskEngine:
         results: queue.SimpleQueue[Outcome | BaseException | None] = queue.SimpleQueue()
 
         def consume() -> None:
-            from joblib import Parallel, delayed, parallel_config
-
             try:
-                with parallel_config(backend=_cluster_backend(self._client)):
-                    parallel = Parallel(return_as="generator_unordered", pre_dispatch="3 * n_jobs")
-                    for outcome in parallel(delayed(work)(unit, job) for unit in units):
-                        results.put(outcome)
+                for outcome in self._outcomes(units, job):
+                    results.put(outcome)
                 results.put(None)
             except BaseException as error:
                 results.put(error)
@@ -104,27 +99,25 @@ class DaskEngine:
                 raise WorkersLostError(str(result)) from None
             yield result
 
+    def _outcomes(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
+        """Give each outcome as it comes; the scheduler has a few units for each thread."""
+        from distributed import as_completed
+
+        threads = sum(self._client.ncores().values())
+        waiting = (self._client.submit(work, unit, job, pure=False) for unit in units)
+        first = list(islice(waiting, _AHEAD * max(threads, 1)))
+        running = as_completed(first, loop=self._client.loop, with_results=True)  # type: ignore[no-untyped-call]
+        for _, outcome in running:
+            yield outcome
+            running.update(list(islice(waiting, 1)))  # type: ignore[no-untyped-call]
+
     def run_alone(self, unit: Unit, job: Job) -> Iterator[Outcome]:
         """Work on one unit."""
         return self.run([unit], job)
 
 
-def _cluster_backend(client: Any) -> Any:
-    """Return joblib's backend for a cluster, which has work to do even where it has but one worker.
-
-    Where a backend has room for one task joblib does the work itself; but it is the cluster that sees the files.
-    """
-    from joblib._dask import DaskDistributedBackend
-
-    class ClusterBackend(DaskDistributedBackend):  # type: ignore[misc]
-        def effective_n_jobs(self, n_jobs: int) -> int:
-            return max(2, int(super().effective_n_jobs(n_jobs)))
-
-    return ClusterBackend(client=client, wait_for_workers_timeout=_CONNECT)
-
-
 class _Watch:
-    """Notices that nothing more will come of a cluster, which joblib's backend would wait for without end."""
+    """Notices that nothing more will come of a cluster, which Dask would wait for without end."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._client = client
@@ -162,10 +155,8 @@ class _Watch:
 
 
 @contextmanager
-def open_engine(
-    kind: str, *, scheduler: str | None, workers: int | None, modules: Sequence[str] = ()
-) -> Iterator[Engine]:
-    """Give the engine for a run; `modules` are those that its work needs.
+def open_engine(kind: str, *, scheduler: str | None, workers: int | None) -> Iterator[Engine]:
+    """Give the engine for a run.
 
     Raises
     ------
@@ -181,7 +172,7 @@ def open_engine(
     if workers is not None and workers < 1:
         raise OptionError(f"--workers {workers}: expected 1 or more")
     if kind == "local":
-        yield LocalEngine(workers or processes.available(), modules)
+        yield LocalEngine(workers or processes.available())
         return
     with ExitStack() as stack:
         yield _dask(scheduler, workers, stack)

@@ -37,12 +37,6 @@ class FleetManifest:
     units: tuple[Unit, ...]
 
 
-def modules_of(fleet: FleetManifest) -> list[str]:
-    """Return the modules that those need who work on a fleet."""
-    needed = dict.fromkeys(name for unit in fleet.units for name in PROCEDURES[unit.procedure].task.modules)
-    return ["imulab.fleet.work", *needed]
-
-
 def load_fleet(path: str) -> FleetManifest:
     """Read and check a manifest, CSV or Parquet.
 

@@ -15,7 +15,7 @@ from imulab.atomic_write import real_path, write_text
 from imulab.errors import OptionError
 from imulab.fleet.engine import Engine, WorkersLostError, open_engine
 from imulab.fleet.history import History, open_history
-from imulab.fleet.manifest import FleetManifest, Unit, load_fleet, modules_of
+from imulab.fleet.manifest import FleetManifest, Unit, load_fleet
 from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
@@ -125,9 +125,7 @@ def run_fleet(
     with ExitStack() as stack:
         notes: list[str] = []
         past = _open_history(history, stack) if history else None
-        machine = stack.enter_context(
-            open_engine(engine, scheduler=scheduler, workers=workers, modules=modules_of(fleet))
-        )
+        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=workers))
         token = stack.enter_context(store.run())
         if history is None:
             try:
@@ -137,9 +135,11 @@ def run_fleet(
         store.keep_manifest(fleet)
         started(len(fleet.units))
         keeper = _Keeper(store, fleet, past, progress)
-        _work_through(machine, Job(str(store.folder), fleet.base, token), keeper)
+        try:
+            _work_through(machine, Job(str(store.folder), fleet.base, token), keeper)
+        finally:
+            store.tidy()
         keeper.flush()
-        store.tidy()
         rows = keeper.rows()
         write_table(rows, table_file)
     return FleetState(

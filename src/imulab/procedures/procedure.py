@@ -67,8 +67,6 @@ class Task:
         Fewest and most files; None for any number.
     options
         The options of its fit.
-    modules
-        What its fit loads: whoever has several processes fit loads them once, before.
     values
         Texts of options and how messages call an option (``"--{}"``) to checked values; raises OptionError.
     fit
@@ -78,7 +76,6 @@ class Task:
     files: str
     count: tuple[int, int | None]
     options: tuple[Option, ...]
-    modules: tuple[str, ...]
     values: Callable[[Mapping[str, str], str], dict[str, Any]]
     fit: Callable[[Sequence[str], Mapping[str, Any], Files, Callable[[int], None]], Calibration]
 

@@ -57,12 +57,6 @@ TASK = Task(
     files="the manifest of one test",
     count=(1, 1),
     options=OPTIONS,
-    modules=(
-        "imulab.readers",
-        "imulab.procedures.centrifuge.manifest",
-        "imulab.procedures.centrifuge.fit",
-        "scipy.special",
-    ),
     values=_values,
     fit=_fit,
 )

@@ -79,7 +79,6 @@ TASK = Task(
     files="STILL, or STILL;MOVING",
     count=(1, 2),
     options=OPTIONS,
-    modules=("imulab.readers", "imulab.procedures.gyro_array.fit", "scipy.special"),
     values=_values,
     fit=_fit,
 )

@@ -167,7 +167,6 @@ TASK = Task(
     files="one recording or table of attitudes",
     count=(1, 1),
     options=OPTIONS,
-    modules=("imulab.readers", "imulab.procedures.tumble.segment", "imulab.procedures.tumble.fit", "scipy.special"),
     values=_values,
     fit=_fit,
 )

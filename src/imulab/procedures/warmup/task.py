@@ -114,7 +114,6 @@ TASK = Task(
     files="the recordings of its power cycles",
     count=(1, None),
     options=OPTIONS,
-    modules=("imulab.readers", "imulab.procedures.warmup.cycles", "imulab.procedures.warmup.fit", "scipy.special"),
     values=_values,
     fit=_fit,
 )
