@@ -184,9 +184,12 @@ def test_streams_one_behind_the_other_are_joined_or_refused_but_never_lost(file,
     # One that only ends early does not hold up the other.
     ended = log(sorted([*mine, *theirs[:200]], key=lambda m: m[0]), "ended.ulg")
     recording = il.read(ended)
-    np.testing.assert_array_equal(recording.triad("accel"), accel)
-    late = accel_times > gyro_times[199]
-    np.testing.assert_array_equal(np.isnan(recording.column("gyro_x")), late)
+    there = accel_times <= gyro_times[199]
+    assert (~there).sum() > 300
+    np.testing.assert_array_equal(recording.triad("accel"), accel[there])
+    rows, ends = recording.notes[-2:]
+    assert rows.startswith(f"{(~there).sum()} rows of the accelerometer left out where the gyroscope")
+    assert ends.startswith("truncated stream: the gyroscope ends 1.7")
 
 
 @pytest.mark.parametrize("rows", [1 << 16, 50])
@@ -194,12 +197,17 @@ def test_nothing_is_made_up_where_a_stream_has_not_begun_or_has_ended(file, stre
     monkeypatch.setattr("imulab.readers.streams._ROWS", rows)
     monkeypatch.setattr("imulab.readers.logs.BLOCK_BYTES", 3001)
     accel_times, gyro_times, accel, gyro = streams
-    # Much longer than the steps of the gyroscope, 1.25 ms: the rows stay, without its readings.
+    # Much longer than the steps of the gyroscope, 1.25 ms: the first rows stay, without its readings.
     part = (gyro_times > 5_300_000) & (gyro_times < 6_700_000)
     first, last = gyro_times[part][0], gyro_times[part][-1]
     recording = il.read(file(px4_log(accel_times, gyro_times[part], accel, gyro[part])))
-    np.testing.assert_array_equal(recording.triad("accel"), accel)
-    known = (accel_times >= first) & (accel_times <= last)
+    before_end = accel_times <= last
+    np.testing.assert_array_equal(recording.triad("accel"), accel[before_end])
+    known = accel_times[before_end] >= first
+    lost = (accel_times[-1] - last) / 1e6
+    (said,) = [note for note in recording.notes if "rows end there" in note]
+    assert said.startswith(f"truncated stream: the gyroscope ends {lost:.4g} s before the accelerometer")
+    assert f"{lost:.4g} s ({100 * lost / ((accel_times[-1] - accel_times[0]) / 1e6):.2g} %) of the acc" in said
     for axis in AXES:
         np.testing.assert_array_equal(np.isfinite(recording.column(f"gyro_{axis}")), known)
     # By a few steps: these rows are left out, and nothing else.
@@ -212,9 +220,21 @@ def test_nothing_is_made_up_where_a_stream_has_not_begun_or_has_ended(file, stre
     np.testing.assert_array_equal(recording.triad("accel"), accel[kept])
     assert np.isfinite(recording.triad("gyro")).all()
     said = [note for note in recording.notes if "of the accelerometer left out where the gyroscope" in note]
-    assert sum(int(note.split()[0]) for note in dict.fromkeys(said)) in (np.count_nonzero(~kept), 1)
+    assert [int(note.split()[0]) for note in said] == [np.count_nonzero(~kept)]
     blocks = list(il.read_blocks(file(px4_log(accel_times, gyro_times[near], accel, gyro[near]))))
     assert [b.first_row for b in blocks] == np.cumsum([1, *map(len, blocks[:-1])]).tolist()
+
+
+def test_every_command_warns_of_a_gyroscope_that_stops_early(file, streams, imulab):
+    accel_times, gyro_times, accel, gyro = streams
+    path = file(px4_log(accel_times, gyro_times[:160], accel, gyro[:160]))
+    done = imulab("convert", path, "-o", "out.csv")
+    assert done.returncode == 0
+    (line,) = [line for line in done.stderr.splitlines() if "warning" in line]
+    assert "truncated stream: the gyroscope ends" in line
+    assert "warning: truncated stream" in imulab("show", path).stdout
+    with pytest.raises(ReadError, match="the accelerometer and the gyroscope have no time in common"):
+        il.read(file(px4_log(accel_times, gyro_times[:160] - 1_000_000, accel, gyro[:160]), "apart.ulg"))
 
 
 def low_rate_log(accel_count, combined_count):
@@ -244,6 +264,37 @@ def test_the_topic_of_the_higher_rate_is_read(file):
     recording = il.read(file(data))
     np.testing.assert_array_equal(recording.triad("accel"), accel)
     assert not any("sensor_combined" in note for note in recording.notes)
+
+
+def test_the_combined_topic_is_not_read_where_one_sensor_has_plainly_more(file):
+    slow, fast, both = (1_000_000 + np.arange(200, step=step) * 1000 for step in (10, 1, 4))
+    gyro = vectors(200, 3)
+    combined = ((t, (9, (t, 0, 0, 0, 4000, 0, 0, 0, 0, 4000, 0))) for t in both.tolist())
+    data = ordered(sensor(3, slow, vectors(20, 1)), sensor(4, fast, gyro), combined)
+    subscriptions = [(0, 3, "sensor_accel"), (0, 4, "sensor_gyro"), (0, 9, "sensor_combined")]
+    recording = il.read(file(ulog(FORMATS, subscriptions, data)))
+    np.testing.assert_array_equal(recording.triad("gyro"), gyro[::10])
+    assert (
+        "sensor_combined, which has 50 samples, is not read: there are 20 of sensor_accel and 200 of sensor_gyro; "
+        "a topic chooses" in recording.notes
+    )
+
+
+@pytest.mark.parametrize("gyros", [0, 5])
+def test_raw_accelerations_of_ardupilot_do_not_cost_the_gyroscope(file, gyros):
+    slow, fast = 1_000_000 + np.arange(10) * 40_000, 1_000_000 + np.arange(400) * 1000
+    few, many = vectors(10, 1), vectors(400, 2)
+    rows = ordered(
+        imu_rows(slow, few, -few),
+        ((t, ("ACC", (t, 0, t, *many[i].tolist()))) for i, t in enumerate(fast.tolist())),
+        ((t, ("GYR", (t, 0, t, 0.0, 0.0, 0.0))) for t in slow[:gyros].tolist()),
+    )
+    recording = il.read(file(dataflash({**IMU, **RAW}, rows), "raw.bin"))
+    np.testing.assert_array_equal(recording.triad("gyro"), -few)
+    assert (
+        f"ACC, which has 400 samples, is not read but 10 of IMU: of GYR there are {gyros}; a topic chooses"
+        in recording.notes
+    )
 
 
 def test_raw_messages_of_ardupilot_are_read_where_they_are_logged_faster(file):

@@ -1,5 +1,7 @@
 """``imulab array merge``: files of one gyroscope each, joined by time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -111,6 +113,52 @@ def test_a_motion_that_repeats_or_rest_gives_no_offset():
         assert not any("its motion comes" in note for note in merge_recordings([first, second]).notes)
         with pytest.raises(DataError, match=r"b\.csv: --align: found no motion that fits a\.csv"):
             merge_recordings([first, second], align=True)
+
+
+@pytest.mark.parametrize("jumps", [(), (700, 1300)])
+def test_readings_that_hardly_change_have_no_offset(imulab, tmp_path, jumps):
+    """A dead gyroscope, and one whose last digit changes at rest."""
+    for name, later in (("a.csv", 0), ("b.csv", 40)):
+        rate = np.full(2000, 0.5)
+        for jump in jumps:
+            rate[jump + later] += 0.01
+        columns = {"time": np.arange(2000) / 100, "gyro": rate}
+        il.write_csv(
+            Recording(columns=columns, units={"time": "s", "gyro": "deg/s"}, metadata={"serial": name}), tmp_path / name
+        )
+    done = imulab("array", "merge", "a.csv", "b.csv", "-o", "array.csv")
+    assert (done.returncode, done.stderr) == (0, "")
+    done = imulab("array", "merge", "a.csv", "b.csv", "--align", "-o", "moved.csv")
+    assert done.returncode == 2
+    assert done.stderr == "imulab: b.csv: --align: found no motion that fits a.csv at one offset of time only\n"
+
+
+def test_the_head_holds_what_all_agree_on_and_the_serial_of_each():
+    heads = (
+        {"serial": "A1", "model": "G9", "board": "7", "truth_bias": "0.1"},
+        {"serial": "A2", "model": "G8", "board": "7", "truth_bias": "0.1"},
+        {"board": "7", "truth_bias": "0.1"},
+    )
+    alone = [replace(gyro(0, 10, 100, seed=i), metadata=head) for i, head in enumerate(heads, start=1)]
+    assert merge_recordings(alone).recording.metadata == {
+        "board": "7",
+        "element_serials": "A1 A2 unknown",
+        "element_1": "1.csv",
+        "element_2": "2.csv",
+        "element_3": "3.csv",
+    }
+    same = [replace(one, metadata={"serial": "BOARD 3"}) for one in alone]
+    assert merge_recordings(same).recording.metadata["serial"] == "BOARD 3"
+
+
+def test_how_far_the_times_differ_is_said():
+    first, second = gyro(0, 10, 100), gyro(0.003, 10, 100, seed=2)
+    (said,) = merge_recordings([first, second]).notes
+    assert said == (
+        "2.csv: 100 Hz interpolated to the times of the first file, 100 Hz, "
+        "which lie up to 0.003 s from its own samples"
+    )
+    assert merge_recordings([first, gyro(0, 10, 100, seed=2)]).notes == ()
 
 
 def test_refusals_name_the_file(imulab, tmp_path):

@@ -8,8 +8,9 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
-from imulab.errors import ReadError, UnitError
+from imulab.errors import DataError, ReadError, UnitError
 from imulab.readers import load_layout, read
+from imulab.recording import check_time
 
 
 @pytest.fixture
@@ -88,9 +89,34 @@ def test_a_counter_that_begins_again_is_carried_on_and_its_gaps_stay(layout, fil
     np.testing.assert_array_equal(recording.time, kept / 50)
 
 
-def test_a_counter_that_starts_anew_from_the_middle_is_not_taken_for_one_that_is_full(layout, file):
-    made = layout('sample_rate = 1\n[columns]\ntime = { from = 0, unit = "count" }\n')
-    assert read(file(b"1000\n1001\n0\n1\n"), made).time.tolist() == [1000, 1001, 0, 1]
+COUNTER = 'sample_rate = 100\n[columns]\ntime = { from = 0, unit = "count"%s }\n'
+
+
+@pytest.mark.parametrize(("last", "size"), [(1001, 7), (40_000, 1 << 21), (40_000, 7), (199, 1 << 21), (230, 64)])
+def test_a_counter_that_starts_anew_before_it_is_full_is_time_that_runs_backwards(
+    layout, file, monkeypatch, last, size
+):
+    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    numbers = [*range(last - 9, last + 1), 0, 1, 2]
+    recording = read(file("".join(f"{number}\n" for number in numbers).encode()), layout(COUNTER % ""))
+    np.testing.assert_array_equal(recording.time, np.array(numbers) / 100)
+    with pytest.raises(DataError, match=r"row 11 \(line 11\), column time: time runs backwards"):
+        check_time(recording)
+
+
+@pytest.mark.parametrize("size", [7, 1 << 21])
+def test_a_counter_is_carried_on_before_it_is_scaled(layout, file, monkeypatch, size):
+    monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
+    numbers = np.arange(240, 280)
+    content = b"".join(b"%d\n" % (number % 256) for number in numbers.tolist())
+    recording = read(file(content), layout(COUNTER % ", scale = 3.7"))
+    np.testing.assert_allclose(recording.time, 3.7 * numbers / 100, rtol=1e-14)
+
+
+def test_a_counter_of_larger_steps_is_carried_on(layout, file):
+    numbers = np.arange(65_000, 67_000, 50)
+    content = b"".join(b"%d\n" % (number % 65_536) for number in numbers.tolist())
+    np.testing.assert_array_equal(read(file(content), layout(COUNTER % "")).time, numbers / 100)
 
 
 TITLES = "时间,加速度X\n0,1\n1,2\n"

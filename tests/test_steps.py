@@ -34,6 +34,38 @@ def test_noise_has_no_steps(kind):
     assert false <= 0.01 * trials
 
 
+HOUR = np.arange(90_000) / 90_000
+DRIFTS = {
+    "short exponential": 0.05 * np.exp(-HOUR * 3600 / 30),
+    "exponential": 0.05 * np.exp(-HOUR * 3600 / 100),
+    "long exponential": 0.05 * np.exp(-HOUR * 3600 / 300),
+    "large exponential": 5 * np.exp(-HOUR * 3600 / 100),
+    "two exponentials": 0.1 * np.exp(-HOUR * 3600 / 60) + 0.1 * np.exp(-HOUR * 3600 / 600),
+    "fourth order": 0.3 * HOUR**4,
+    "ramp of the temperature": 0.3 * np.clip((HOUR - 0.3) / 0.15, 0, 1),
+    "from level to level": 0.3 * np.tanh((HOUR - 0.5) * 12),
+}
+
+
+@pytest.mark.parametrize("kind", DRIFTS)
+def test_a_drift_is_no_step(kind):
+    """Warm-up drifts of an hour, in noise of 0.1 from sample to sample at 25 Hz."""
+    rng = np.random.default_rng(10)
+    assert sum(find_step(DRIFTS[kind] + 0.1 * rng.normal(size=90_000)) is not None for _ in range(10)) == 0
+
+
+def test_a_step_on_a_drift_is_found():
+    rng = np.random.default_rng(11)
+    found = 0
+    for _ in range(20):
+        samples = DRIFTS["long exponential"] + 0.1 * rng.normal(size=90_000)
+        at = int(rng.integers(20_000, 80_000))
+        samples[at:] += 0.06
+        step = find_step(samples)
+        found += step is not None and abs(step.sample - at) <= step.within
+    assert found >= 16
+
+
 def test_a_step_is_found_where_it_is_and_as_large_as_it_is():
     rng = np.random.default_rng(8)
     missed = 0
@@ -66,7 +98,7 @@ def test_allan_says_that_a_step_is_no_noise(tmp_path, monkeypatch, capsys):
     out, error = capsys.readouterr()
     (line,) = [line for line in error.splitlines() if "level" in line]
     assert line.startswith(
-        "imulab: warning: a.csv: column gyro_y: the level changes at once by 0.098 deg/s near 69.92 s"
+        "imulab: warning: a.csv: column gyro_y: the level changes by 0.098 deg/s within 1.8 s near 69.92 s"
     )
     assert "gyro_x" not in line
     walk = json.loads(out)["columns"]["gyro_y"]["rate_random_walk"]["value"]

@@ -144,12 +144,15 @@ def column_noise(samples: Array, rate: float, moved: str = "") -> ColumnNoise:
 
 
 def _step_line(recording: Recording, name: str, step: Step) -> str:
-    """Say that a level changed at once, which the coefficients take for noise."""
+    """Say that a level jumped, which the coefficients take for noise."""
     unit = recording.units[name]
-    when = "" if recording.time is None else f" near {recording.time[step.sample]:.4g} s"
+    when = f" within {step.within} rows near {recording.place(step.sample)}"
+    if recording.time is not None:
+        duration = step.within * float(recording.time[-1] - recording.time[0]) / (len(recording) - 1)
+        when = f" within {duration:.2g} s near {recording.time[step.sample]:.4g} s"
     size = from_si(abs(step.size), unit) if parse_unit(unit).quantity in _STILL else abs(step.size)
     return (
-        f"{recording.name}: column {name}: the level changes at once by {size:.2g} {unit}{when}, which is no noise: "
+        f"{recording.name}: column {name}: the level changes by {size:.2g} {unit}{when}, which is no noise: "
         "bias instability and rate random walk contain it; read the parts before and after it apart (--window)"
     )
 

@@ -10,6 +10,8 @@ from imulab.errors import DataError
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import to_si
 
+WIDEST_GAP = 10.0
+"""Sampling intervals across which readings are interpolated at most."""
 _FEWEST = 3
 _GAP = 1.5
 _COARSE = 0.2

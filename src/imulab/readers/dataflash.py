@@ -234,10 +234,17 @@ def _choose(
     topic = selection.topic or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
     samples = {title: contents.counts[there[title, instance][0], instance] for title, n in there if n == instance}
     if not selection.topic and samples.get("ACC", 0) > logs.PLAINLY_MORE * samples.get("IMU", np.inf):
-        topic = "ACC"
-        contents.notes.append(
-            f"ACC, which has {samples['ACC']} samples, is read rather than {samples['IMU']} of IMU; a topic chooses"
-        )
+        gyros = samples.get("GYR", 0)
+        if samples["IMU"] > logs.PLAINLY_MORE * gyros:
+            contents.notes.append(
+                f"ACC, which has {samples['ACC']} samples, is not read but {samples['IMU']} of IMU: of GYR there are "
+                f"{gyros}; a topic chooses"
+            )
+        else:
+            topic = "ACC"
+            contents.notes.append(
+                f"ACC, which has {samples['ACC']} samples, is read rather than {samples['IMU']} of IMU; a topic chooses"
+            )
     if (topic, instance) not in there:
         found = ", ".join(f"{title} {number}" for title, number in sorted(there))
         raise OptionError(f"{name}: no {topic} of instance {instance}; found {found}")

@@ -2,26 +2,28 @@
 
 Logs interleave the samples of several sensors. The accelerometer's samples (or whatever stream comes first) are the
 clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file. Before a
-stream's first sample and after its last nothing is known of it, and nothing is made up: the few rows by which streams
-that begin and end together overlap each other are left out, and longer parts without a stream hold no numbers of it.
+stream's first sample and after its last nothing is known of it, and nothing is made up: rows end with the first stream
+that ends, and the few rows before one that begins a little later are left out; more of them hold no numbers of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import ReadError
+from imulab.estimation.sampling import WIDEST_GAP
 from imulab.recording import Array, Recording
 
 Ticks = NDArray[np.int64]
 
 _ROWS = 1 << 16
 _PATIENCE = 1 << 20
-_WIDEST_GAP = 10.0
+_MUCH = 0.1
+"""Part of a stream whose loss is warned of by every command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +55,13 @@ class _Buffer:
         self.count = 0
         self.step = np.nan
         self.first: int | None = None
+        self.last: int | None = None
+        self.left_out = 0
 
     def add(self, piece: Piece) -> None:
+        if piece.ticks.size:
+            last = int(piece.ticks.max())
+            self.last = last if self.last is None else max(self.last, last)
         self._waiting.append(piece)
         self.count += len(piece.ticks)
 
@@ -107,6 +114,7 @@ def on_one_clock(
     buffers = [_Buffer(stream) for stream in streams]
     clock, others = buffers[0], buffers[1:]
     row, done = 1, np.iinfo(np.int64).min
+    held: Recording | None = None  # until it is known whether it is the last, which says how the streams ended
     for piece in _and_end(pieces):
         if piece is not None:
             if piece.stream and piece.ticks.size and piece.ticks[-1] < done:
@@ -118,21 +126,22 @@ def on_one_clock(
             buffer.join()
         whole = _ready(clock, others)
         ready = clock.count if piece is None else whole
+        ended = piece is None
         if clock.count > _PATIENCE and whole < clock.count // 2:
             # A stream that has ended does not hold up the others; one that is only late has half of them as a margin.
+            ended = True
             ready = clock.count // 2
             done = max(done, int(clock.ticks[:ready].max()))
         if ready == 0:
             continue
-        whole_time = [(other, *_bounds(clock, other, ended=piece is None)) for other in others]
         ticks = clock.ticks[:ready]
         kept = np.ones(ready, dtype=np.bool_)
-        said = list(notes)
-        for other, from_tick, to_tick in whole_time:
+        for other in others:
+            from_tick, to_tick = _bounds(clock, other, ended=ended)
             within = (ticks >= from_tick) & (ticks <= to_tick)
-            if not within.all():
-                said.append(_left_out(other, clock, int(np.count_nonzero(~within))))
+            other.left_out += int(np.count_nonzero(~within))
             kept &= within
+        said = list(notes)
         ticks = ticks[kept]
         if not ticks.size:
             clock.drop(ready)
@@ -149,13 +158,19 @@ def on_one_clock(
                     said.append(_note(buffer, clock, per_second))
             columns |= {key: np.ascontiguousarray(values[:, i]) for i, key in enumerate(buffer.stream.units)}
             units |= buffer.stream.units
-        yield Recording(
+        if held is not None:
+            yield held
+        held = Recording(
             columns=columns, units=units, metadata=metadata(start), name=name, first_row=row, notes=tuple(said)
         )
         row += len(ticks)
         clock.drop(ready)
-    if row == 1:
+    if held is None:
+        apart = [other.stream.what for other in others if other.left_out]
+        if apart:
+            raise ReadError(f"{name}: the {clock.stream.what} and the {apart[0]} have no time in common")
         raise ReadError(f"{name}: no samples of the {clock.stream.what}")
+    yield replace(held, notes=(*held.notes, *_left_out(clock, others), *_ends(buffers, per_second)))
 
 
 def _and_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
@@ -184,22 +199,40 @@ def _ready(clock: _Buffer, others: list[_Buffer]) -> int:
 def _bounds(clock: _Buffer, other: _Buffer, *, ended: bool) -> tuple[float, float]:
     """Return the ticks between which the clock's rows are kept, for a stream that begins later or ends earlier.
 
-    Rows before and after it are left out where they are few, and kept without its values where they are many.
+    Rows before it are left out where they are few, and kept without its values where they are many.
     """
-    low, high = -np.inf, np.inf
-    if other.stream.slow or not other.count or np.isnan(other.step):
-        return low, high
-    few = _WIDEST_GAP * other.step
-    if clock.first is not None and other.first is not None and 0 < other.first - clock.first <= few:
-        low = other.first
-    if ended and 0 < clock.ticks[-1] - other.ticks[-1] <= few:
-        high = int(other.ticks[-1])
-    return low, high
+    if other.stream.slow or other.first is None or other.last is None:
+        return -np.inf, np.inf
+    late = other.first - clock.first if clock.first is not None else 0
+    low = other.first if 0 < late <= WIDEST_GAP * np.nan_to_num(other.step) else -np.inf
+    return low, other.last if ended else np.inf
 
 
-def _left_out(other: _Buffer, clock: _Buffer, count: int) -> str:
-    rows = f"{count} row{'s' * (count > 1)}"
-    return f"{rows} of the {clock.stream.what} left out where the {other.stream.what} has not begun or has ended"
+def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:
+    return [
+        f"{other.left_out} row{'s' * (other.left_out > 1)} of the {clock.stream.what} left out where the "
+        f"{other.stream.what} has not begun or has ended"
+        for other in others
+        if other.left_out
+    ]
+
+
+def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
+    """Say by how much the first stream that ends ends before the others, and warn where that is much of them."""
+    timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and not b.stream.slow]
+    end, _, first = min(timed, key=lambda one: one[0])
+    said = []
+    for last, start, buffer in timed:
+        left = last - end
+        if left > WIDEST_GAP * np.nan_to_num(max(first.step, buffer.step)):
+            lost = f"{left / per_second:.4g} s"
+            share = left / (last - start)
+            said.append(
+                f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
+                f"{buffer.stream.what}: rows end there, and {lost} ({100 * share:.2g} %) of the "
+                f"{buffer.stream.what} are left out"
+            )
+    return said
 
 
 def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:
@@ -222,7 +255,7 @@ def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, n
     left = np.clip(right - 1, 0, None)
     if not buffer.stream.slow and not np.isnan(buffer.step):
         # Across a gap there is no reading: that is not invented.
-        values[~met & (buffer.ticks[right] - buffer.ticks[left] > _WIDEST_GAP * buffer.step)] = np.nan
+        values[~met & (buffer.ticks[right] - buffer.ticks[left] > WIDEST_GAP * buffer.step)] = np.nan
     values[outside] = np.nan
     # The sample before the last tick stays: the next block may begin right behind it.
     buffer.drop(max(int(np.searchsorted(buffer.ticks, ticks.max(), side="right")) - 1, 0))

@@ -176,14 +176,19 @@ def _choose(
     if wanted == ["sensor_accel"] and "sensor_gyro" in titles:
         wanted.append("sensor_gyro")
     if topic is None and raw:
-        samples = {t: contents.counts[there[t, instance]] for t in (*raw, "sensor_combined") if (t, instance) in there}
-        combined = samples.pop("sensor_combined", 0)
-        if samples and combined > logs.PLAINLY_MORE * min(samples.values()):
-            wanted = ["sensor_combined"]
-            few = " and ".join(f"{count} of {title}" for title, count in samples.items())
-            contents.notes.append(
-                f"sensor_combined, which has {combined} samples, is read rather than {few}; a topic chooses"
-            )
+        samples = {t: contents.counts[there[t, instance]] if (t, instance) in there else 0 for t in _TOPICS}
+        combined = samples.pop("sensor_combined")
+        few = " and ".join(f"{count} of {title}" for title, count in samples.items())
+        if any(combined > logs.PLAINLY_MORE * count for count in samples.values()):
+            if any(count > logs.PLAINLY_MORE * combined for count in samples.values()):
+                contents.notes.append(
+                    f"sensor_combined, which has {combined} samples, is not read: there are {few}; a topic chooses"
+                )
+            else:
+                wanted = ["sensor_combined"]
+                contents.notes.append(
+                    f"sensor_combined, which has {combined} samples, is read rather than {few}; a topic chooses"
+                )
     chosen = [title for title in wanted if (title, instance) in there]
     if not chosen:
         found = ", ".join(f"{title} {number}" for title, number in sorted(there))

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from imulab.errors import DataError, UnitError
-from imulab.estimation.sampling import usual_step
+from imulab.estimation.sampling import WIDEST_GAP, usual_step
 from imulab.procedures.gyro_array.model import MOST_ELEMENTS
 from imulab.recording import Array, Recording, check_time
 from imulab.units import conversion_factor, parse_unit
 
-_WIDEST_GAP = 10.0
 _MOST_POINTS = 1 << 20
-_FEWEST_POINTS = 100
+_FEWEST_POINTS, _FEWEST_LEVELS = 100, 8
+_LEAST_MOTION = 1e-6  # of the variance of the whole
 _ALIKE = 0.8
 _SECOND = 0.9
 
@@ -90,22 +90,36 @@ def merge_recordings(
             f"{recordings[i].name}: {times[i][0]:.9g} to {times[i][-1]:.9g} s, no time in common with {first.name}, "
             f"{times[0][0]:.9g} to {times[0][-1]:.9g} s; clocks that began apart are moved by --align"
         )
-    notes += [_joined(r, t, times[0]) for r, t in zip(recordings[1:], times[1:], strict=True)]
+    for recording, time in zip(recordings[1:], times[1:], strict=True):
+        notes += _joined(recording, time, times[0], times[0][rows])
     columns, units = {"time": first.column("time")[rows]}, {"time": first.units["time"]}
-    for i, (time, read) in enumerate(zip(times, values, strict=True), start=1):
-        at = read[rows] if i == 1 else _interpolated(times[0][rows], time, read)
+    for i, (time, readings) in enumerate(zip(times, values, strict=True), start=1):
+        joined = readings[rows] if i == 1 else _interpolated(times[0][rows], time, readings)
         for k, name in enumerate(names[0]):
             title = f"gyro_{'xyz'[k]}_{i}" if len(names[0]) > 1 else f"gyro_{i}"
-            columns[title], units[title] = np.ascontiguousarray(at[:, k]), first.units[name]
-    elements = {f"element_{i}": Path(recording.name).name for i, recording in enumerate(recordings, start=1)}
+            columns[title], units[title] = np.ascontiguousarray(joined[:, k]), first.units[name]
     merged = Recording(
         columns=columns,
         units=units,
-        metadata={**first.metadata, **elements},
+        metadata=_head(recordings),
         name="the merged recording",
         corrected_by=tuple(dict.fromkeys(entry for recording in recordings for entry in recording.corrected_by)),
     )
     return Merged(merged, tuple(notes))
+
+
+def _head(recordings: Sequence[Recording]) -> dict[str, str]:
+    """Return what the heads of all recordings agree on, without a truth, and what each element is."""
+    first = recordings[0].metadata
+    head = {
+        key: text
+        for key, text in first.items()
+        if not key.startswith("truth_") and all(recording.metadata.get(key) == text for recording in recordings)
+    }
+    serials = [recording.metadata.get("serial", "unknown") for recording in recordings]
+    if len(set(serials)) > 1:
+        head["element_serials"] = " ".join(serials)
+    return head | {f"element_{i}": Path(recording.name).name for i, recording in enumerate(recordings, start=1)}
 
 
 def _refuse_twice(recordings: Sequence[Recording]) -> None:
@@ -170,15 +184,29 @@ def _in_unit_of(first: Recording, wanted: Sequence[str], recording: Recording, n
 def _interpolated(wanted: Array, time: Array, values: Array) -> Array:
     """Return readings at other times, shape (m, axes); NaN across gaps."""
     found = np.column_stack([np.interp(wanted, time, column) for column in values.T])
-    right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
-    bridged = (time[right] - time[right - 1] > _WIDEST_GAP * usual_step(np.diff(time))[0]) & (time[right] != wanted)
-    found[bridged & (time[right - 1] != wanted)] = np.nan
+    away, across = _away(wanted, time)
+    found[across & (away > 0)] = np.nan
     return found
 
 
-def _joined(recording: Recording, time: Array, clock: Array) -> str:
+def _away(wanted: Array, time: Array) -> tuple[Array, np.ndarray]:
+    """Return how far times, shape (m,), lie from the nearest sample, s, and which lie in a gap too wide to bridge."""
+    right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
+    away = np.minimum(np.abs(time[right] - wanted), np.abs(wanted - time[right - 1]))
+    return away, time[right] - time[right - 1] > WIDEST_GAP * usual_step(np.diff(time))[0]
+
+
+def _joined(recording: Recording, time: Array, clock: Array, wanted: Array) -> list[str]:
+    """Say between which rates a recording is interpolated, and how far its own samples are from the times wanted."""
+    away, across = _away(wanted, time)
+    most = float(away[~across].max(initial=0.0))
+    if most == 0:
+        return []
     rates = [1 / usual_step(np.diff(t))[0] for t in (time, clock)]
-    return f"{recording.name}: {rates[0]:.6g} Hz interpolated to the times of the first file, {rates[1]:.6g} Hz"
+    return [
+        f"{recording.name}: {rates[0]:.6g} Hz interpolated to the times of the first file, {rates[1]:.6g} Hz, "
+        f"which lie up to {most:.2g} s from its own samples"
+    ]
 
 
 def _offset(time: Array, values: Array, other: Array, others: Array) -> float | None:
@@ -191,7 +219,7 @@ def _offset(time: Array, values: Array, other: Array, others: Array) -> float | 
     step = max(step, max(time[-1] - time[0], other[-1] - other[0]) / _MOST_POINTS)
     a, b = _size_of_rate(time, values, step), _size_of_rate(other, others, step)
     shorter = min(len(a), len(b))
-    if shorter < _FEWEST_POINTS:
+    if shorter < _FEWEST_POINTS or not (_moves(values) and _moves(others)):
         return None
     length = 1 << (len(a) + len(b)).bit_length()
 
@@ -205,9 +233,11 @@ def _offset(time: Array, values: Array, other: Array, others: Array) -> float | 
     mean_a, mean_b = correlated(a, ones[1]) / count, correlated(ones[0], b) / count
     power_a = correlated(a**2, ones[1]) / count - mean_a**2
     power_b = correlated(ones[0], b**2) / count - mean_b**2
-    floor = 1e-6 * max(float(a.var() + b.var()), 1e-300)
-    alike = (correlated(a, b) / count - mean_a * mean_b) / np.sqrt(np.maximum(power_a * power_b, floor**2))
-    alike[count < shorter / 2] = -1.0
+    # Where one of both hardly changes there is no motion to compare, and no likeness.
+    moves = (power_a > _LEAST_MOTION * a.var()) & (power_b > _LEAST_MOTION * b.var()) & (count >= shorter / 2)
+    together = correlated(a, b) / count - mean_a * mean_b
+    spread = np.sqrt(np.where(moves, power_a, 1.0)) * np.sqrt(np.where(moves, power_b, 1.0))
+    alike = np.where(moves, together / spread, -1.0)
     best = int(np.argmax(alike))
     if alike[best] < _ALIKE:
         return None
@@ -218,10 +248,15 @@ def _offset(time: Array, values: Array, other: Array, others: Array) -> float | 
         return None  # a motion that repeats fits at several offsets
     shift = float(best - (len(a) - 1))
     if 0 < best < len(alike) - 1:
-        before, peak, after = alike[best - 1 : best + 2]
-        curve = before - 2 * peak + after
-        shift += 0.5 * (before - after) / curve if curve < 0 else 0.0
+        left_of, peak, right_of = alike[best - 1 : best + 2]
+        curve = left_of - 2 * peak + right_of
+        shift += 0.5 * (left_of - right_of) / curve if curve < 0 else 0.0
     return float(other[0] - time[0] + shift * step)
+
+
+def _moves(values: Array) -> bool:
+    """Whether readings, shape (n, axes), take more values than the last digits of a gyroscope at rest."""
+    return any(len(np.unique(column[np.isfinite(column)])) >= _FEWEST_LEVELS for column in values.T)
 
 
 def _size_of_rate(time: Array, values: Array, step: float) -> Array:
