@@ -11,6 +11,8 @@ from imulab.readers.layout import Layout
 from imulab.recording import Array
 
 _COUNTERS = [2.0**8, 2.0**16, 2.0**32]
+_LOST_AT_WRAP = 16
+"""Steps that a counter may miss where it begins again."""
 
 
 class BackwardsError(ReadError):
@@ -27,6 +29,7 @@ class Readings:
     def __init__(self, layout: Layout, name: str) -> None:
         self._layout, self._name = layout, name
         self._last = np.nan
+        self._step = np.inf
         self._carried = 0.0
         self._dates: dict[str, tuple[int, int]] = {}
 
@@ -41,16 +44,18 @@ class Readings:
         dates = [name for name in columns if self._layout.columns[name].date and len(columns[name])]
         for name in dates:
             self._check_dates(name, columns[name], first_row, lines_before)
+        rate = self._layout.sample_rate
+        if rate is not None and "time" in columns:
+            columns["time"][:] = self._unwrapped(columns["time"])
         for name, values in columns.items():
             if name in dates:
                 self._count_from_first(name, values)
             else:
                 self._layout.columns[name].convert(values)
-        rate = self._layout.sample_rate
         if rate is None:
             return dict(columns)
         if "time" in columns:
-            return {**columns, "time": self._unwrapped(columns["time"]) / rate}
+            return {**columns, "time": columns["time"] / rate}
         count = len(next(iter(columns.values())))
         return {"time": np.arange(first_row - 1, first_row - 1 + count) / rate, **columns}
 
@@ -79,11 +84,18 @@ class Readings:
             )
 
     def _unwrapped(self, numbers: Array) -> Array:
-        """Carry a counter on where it begins again, having come near to 2^8, 2^16 or 2^32."""
+        """Carry a counter on where it begins again within a few of its steps of 2^8, 2^16 or 2^32.
+
+        Where it begins again elsewhere, the number stays as it is: that is time that runs backwards.
+        """
+        if not len(numbers):
+            return numbers
         before = np.concatenate([[self._last], numbers[:-1]])
-        fall = before - numbers
+        rise = numbers - before
+        step = np.minimum(np.minimum.accumulate(np.where(rise > 0, rise, np.inf)), self._step)
         size = np.select([before < limit for limit in _COUNTERS], _COUNTERS, np.inf)
-        carried = self._carried + np.cumsum(np.where(fall > size / 2, size, 0.0))
-        if len(numbers):
-            self._last, self._carried = float(numbers[-1]), float(carried[-1])
+        few = np.minimum(_LOST_AT_WRAP * np.where(np.isfinite(step), step, 1.0), size / 4)
+        wraps = (rise < 0) & (rise + size <= few) & np.isfinite(size)
+        carried = self._carried + np.cumsum(np.where(wraps, size, 0.0))
+        self._last, self._step, self._carried = float(numbers[-1]), float(step[-1]), float(carried[-1])
         return numbers + carried
