@@ -59,8 +59,8 @@ def test_a_record_made_at_a_time_is_read(created):
 def test_what_imulab_writes_it_reads(tmp_path):
     odd = replace(madeup.tumble(1), warnings=("file\u2028name\x1b.csv: odd",), options={"layout\n": "a\u202eb"})
     odd.save(tmp_path / "r.json")
-    assert il.load(tmp_path / "r.json").warnings == ("file\\u2028name\\u001b.csv: odd",)
-    assert il.load(tmp_path / "r.json").options == {"layout\\u000a": "a\\u202eb"}
+    assert il.load(tmp_path / "r.json").warnings == ("file\\u2028name\\x1b.csv: odd",)
+    assert il.load(tmp_path / "r.json").options == {"layout\\x0a": "a\\u202eb"}
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)
@@ -110,7 +110,7 @@ def test_the_terminal_sees_no_escape_sequences_of_a_file(tmp_path, capsys):
     (tmp_path / "evil.csv").write_text("# serial: \x1b]0;owned\x07SN\u202e1\ntime [s],accel_x [g]\n0,1\n1,1\n")
     assert main(["show", str(tmp_path / "evil.csv")]) == 0
     shown = capsys.readouterr()
-    assert "serial: \\u001b]0;owned\\u0007SN\\u202e1" in shown.out
+    assert "serial: \\x1b]0;owned\\x07SN\\u202e1" in shown.out
     (tmp_path / "title.csv").write_text("time [s],acc\x1b[31mel [g]\n0,1\n")
     assert main(["show", str(tmp_path / "title.csv")]) == 2
     assert "\x1b" not in capsys.readouterr().err
@@ -143,4 +143,4 @@ def test_a_page_loads_nothing_uploads_nothing_and_makes_no_links(tmp_path, chrom
 
 
 def test_a_recording_from_python_is_cleaned_as_well():
-    assert Recording({}, {}, metadata={"serial\n": "SN\u2028"}).metadata == {"serial\\u000a": "SN\\u2028"}
+    assert Recording({}, {}, metadata={"serial\n": "SN\u2028"}).metadata == {"serial\\x0a": "SN\\u2028"}

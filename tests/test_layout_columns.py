@@ -233,7 +233,7 @@ REFUSED = {
     ),
     "dates of a rate": (
         '[columns]\nfog = { from = 0, unit = "iso" }\n',
-        "column fog: expected a unit of rate or output, found 's' (time)",
+        "column fog: expected a unit of rate or output, found 'iso' (dates)",
     ),
     "scaled dates": (
         '[columns]\ntime = { from = 0, unit = "iso", scale = 2 }\n',

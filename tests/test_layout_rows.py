@@ -141,6 +141,13 @@ def test_a_layout_file_says_that_time_is_a_date(file):
     assert read(file(content), layout).time.tolist() == [0, 1.5]
 
 
+def test_messages_of_prefixes_and_skipped_rows(file):
+    with pytest.raises(ReadError, match=r"row 2 \(line 2\): expected 2 fields behind the prefix, found none"):
+        read(file("IMU,0,1\nIMU\nIMU,2,1\n"), columns("time", "accel_x", prefix="IMU"))
+    found = read(file("0,1\n1,\n2,3\n"), columns("time", "accel_x", skip_incomplete=True))
+    assert found.notes[0].startswith("1 row was skipped that lacks a reading of time accel_x ")
+
+
 # --- prefix and skip_incomplete -----------------------------------------------------------------------------------
 
 MIXED = "GPS,1,2,3,4\nIMU,0,1.5,x\n\nIMU , 1,2.5,y\nIMUX,9,9,9\n#IMU,9,9,9\nIMU,2,3.5\r\n"

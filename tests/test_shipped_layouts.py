@@ -278,3 +278,41 @@ def test_a_fleet_takes_a_layout_by_name(imulab, tmp_path):
     done = imulab("fleet", "run", "m.csv", "-o", "out")
     assert done.returncode == 0, done.stderr
     assert "phyphox" in (tmp_path / "out" / "A.json").read_text()
+
+
+@pytest.mark.parametrize(("delimiter", "decimal"), [(";", ","), ("\t", ",")])
+def test_other_separators_are_named_with_what_to_change(imulab, tmp_path, delimiter, decimal):
+    text = FILES["phyphox"]().replace(",", delimiter).replace(".", decimal)
+    (tmp_path / "f.csv").write_text(text)
+    written = delimiter.replace("\t", "\\t")
+    said = f'phyphox) and set delimiter = "{written}" and decimal = "{decimal}"\n'
+    for layout in ([], ["--layout", "phyphox"]):
+        done = imulab("tumble", "fit", "f.csv", "--gravity", "9.81", "-o", "r.json", *layout)
+        assert done.returncode == 2
+        assert done.stderr.endswith(said)
+        assert done.stderr.count("\n") == 1
+    mended = shipped_file("phyphox").read_text().replace('delimiter = ","', f'delimiter = "{written}"\ndecimal = ","')
+    (tmp_path / "l.toml").write_text(mended)
+    assert len(il.read(tmp_path / "f.csv", tmp_path / "l.toml")) == ROWS
+
+
+@pytest.mark.parametrize("rows", ["0,1,\n1,2,\n", "0,1,\r\n1,2,\r\n"])
+def test_a_delimiter_at_the_end_of_every_row_is_passed_over(tmp_path, rows):
+    (tmp_path / "f.csv").write_bytes(b"t,a\n" + rows.encode())
+    layout = tmp_path / "l.toml"
+    columns = '[columns]\ntime = { from = "t", unit = "s" }\naccel_x = { from = "a", unit = "g" }\n'
+    for more in ("", "skip_incomplete = true\n"):
+        layout.write_text('delimiter = ","\n' + more + columns)
+        assert il.read(tmp_path / "f.csv", layout).column("accel_x").tolist() == [1, 2]
+    (tmp_path / "n.csv").write_bytes(b"time [s],accel_x [g]\n" + rows.encode())
+    assert il.read(tmp_path / "n.csv").column("accel_x").tolist() == [1, 2]
+    (tmp_path / "n.csv").write_bytes(b"time [s],accel_x [g]\n" + rows.encode() + b"2,3\n")
+    with pytest.raises(ReadError, match=r"row 3 \(line 4\): expected 3 fields, found 2"):
+        il.read(tmp_path / "n.csv")
+
+
+def test_a_line_of_titles_without_end_is_not_printed_as_a_whole(tmp_path):
+    (tmp_path / "f.csv").write_text("a" * 50 + "," + ",".join(f"title{i}" for i in range(10_000)) + "\n1,2\n")
+    with pytest.raises(ReadError) as caught:
+        il.read(tmp_path / "f.csv", "euroc")
+    assert len(str(caught.value)) < 600

@@ -93,3 +93,18 @@ def test_a_path_is_a_file_and_a_bare_name_one_that_comes_along(tmp_path, monkeyp
     assert read("log.txt", tmp_path.joinpath("phyphox").relative_to(tmp_path)).time.tolist() == [0, 1]
     assert read("log.txt", "./phyphox").time.tolist() == [0, 1]
     assert "accel_x" in load_layout("phyphox").columns
+
+
+def test_messages_of_the_command_line_call_options_as_they_are_typed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.csv").write_text("time [s],gyro_x [rad/s]\n" + "".join(f"{i},{i % 3}\n" for i in range(50)))
+    (tmp_path / "odd.csv").write_text("\x1b[31mtime [s]\x1b[0m,gyro_x [rad/s]\n0,1\n")
+    for command, said in (
+        ("tumble fit a.csv --loss Huber", "--loss 'Huber': expected one of square huber auto; did you mean 'huber'?"),
+        ("allan a.csv --taus dens", "--taus 'dens': expected octave or dense"),
+        ("show odd.csv", r"odd.csv: column title '\x1b[31mtime [s]\x1b[0m': expected plain text, found a control"),
+    ):
+        assert main(command.split()) == 2
+        assert capsys.readouterr().err.startswith(f"imulab: {said}")
+    assert main(["tumble", "check", "r.json", "a.csv", "--threshold", "5"]) == 2
+    assert "did you mean" not in capsys.readouterr().err

@@ -15,12 +15,27 @@ def listed(known: Iterable[str], found: object) -> str:
     return " ".join(names) + meant(names, found)
 
 
-def meant(known: Iterable[str], found: object) -> str:
-    """Return ``; did you mean 'huber'?`` where a word nearly is one of those known, else nothing."""
+def quoted(value: object, longest: int = 60) -> str:
+    """Return what was found for a message: as Python writes it, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= longest else text[: longest - 3] + "..."
+
+
+def several(words: Iterable[str], longest: int = 300) -> str:
+    """Return words for a message, as many as a line has room for."""
+    text = " ".join(words)
+    return text if len(text) <= longest else text[: longest - 4] + " ..."
+
+
+def meant(known: Iterable[str], found: object, alike: float = 0.6) -> str:
+    """Return ``; did you mean 'huber'?`` where a word nearly is one of those known, else nothing.
+
+    `alike` is how much of two words must agree, from 0 to 1.
+    """
     from difflib import get_close_matches
 
     names = {name.lower(): name for name in known}
-    close = get_close_matches(str(found).lower(), names, n=1)
+    close = get_close_matches(str(found).lower(), names, n=1, cutoff=alike)
     return f"; did you mean {names[close[0]]!r}?" if close else ""
 
 

@@ -19,9 +19,15 @@ def has_hidden(text: str) -> bool:
     return _HIDDEN.search(text) is not None
 
 
+def _escape(found: re.Match[str]) -> str:
+    r"""Return a character as Python writes it in `repr`: ``\x1b``, ``\u2028``."""
+    code = ord(found[0])
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
 def printable(text: str, *, lines: bool = False) -> str:
     """Return a text with its control and bidirectional characters as escapes; with `lines`, line breaks stay."""
-    return (_HIDDEN_IN_LINES if lines else _HIDDEN).sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return (_HIDDEN_IN_LINES if lines else _HIDDEN).sub(_escape, text)
 
 
 def first_hidden(value: Any, where: str = "") -> str | None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from imulab.errors import OptionError, UnitError
@@ -101,6 +103,18 @@ def interval(text: str, option: str) -> tuple[float, float]:
     if len(ends) != 2 or not ends[0] < ends[1]:
         raise OptionError(f"{option} {text!r}: expected FROM:TO in seconds, such as 468:496")
     return ends[0], ends[1]
+
+
+@contextmanager
+def labelled(label: str, names: Iterable[str]) -> Iterator[None]:
+    """Put an option's label before a refusal that begins with its bare name; `label` is ``"--{}"`` or the like."""
+    try:
+        yield
+    except OptionError as error:
+        word = str(error).partition(" ")[0].rstrip(":")
+        if word not in names:
+            raise
+        raise OptionError(label.format(word) + str(error)[len(word) :]) from None
 
 
 def number(text: str, option: str) -> float:

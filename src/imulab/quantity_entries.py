@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from imulab.errors import ReadError, UnitError, listed
+from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.units import Unit, parse_scale_factor, parse_unit
 
 
@@ -23,7 +23,7 @@ class ScaleFactor:
 def scale_factor_of(entry: Any, place: str, example: str) -> ScaleFactor:
     """Return a scale factor ``{ value = 0.02, unit = "V/(deg/s)" }``; `example` is how the whole line is written."""
     if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
-        raise ReadError(f"{place}: expected {example}, found {entry!r}")
+        raise ReadError(f"{place}: expected {example}, found {quoted(entry)}")
     value = number_of(entry["value"], place)
     if value == 0:
         raise ReadError(f"{place}: expected a value other than 0")
@@ -38,13 +38,13 @@ def check_keys(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> N
     """Refuse a key that is none of `keys`: a misspelt one must not pass."""
     for key in table:
         if key not in keys:
-            raise ReadError(f"{place}: unknown key {key!r}; known keys: {listed(keys, key)}")
+            raise ReadError(f"{place}: unknown key {quoted(key)}; known keys: {listed(keys, key)}")
 
 
 def number_of(value: Any, place: str) -> float:
     """Return a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ReadError(f"{place}: expected a number, found {value!r}")
+        raise ReadError(f"{place}: expected a number, found {quoted(value)}")
     return float(value)
 
 
@@ -55,5 +55,5 @@ def unit_of(text: Any, kind: str, place: str) -> str:
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
     if unit.quantity != kind:
-        raise UnitError(f"{place}: expected a unit of {kind}, found {text!r} ({unit.quantity})")
+        raise UnitError(f"{place}: expected a unit of {kind}, found {quoted(text)} ({unit.quantity})")
     return unit.symbol

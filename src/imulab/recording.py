@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.errors import DataError, UnitError
+from imulab.errors import DataError, UnitError, quoted
 from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
 
@@ -253,6 +253,8 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
 
 def _check_name(name: str, title: str, file: str) -> None:
     """Refuse what is meant as a name of the vocabulary but is not one."""
+    if has_hidden(title.replace("\t", "")):
+        raise UnitError(f"{file}: column title {quoted(title.strip())}: expected plain text, found a control character")
     if ";" in title or "\t" in title or title.count("[") > 1:
         mark = "';'" if ";" in title else "a tab" if "\t" in title else "blanks"
         raise UnitError(

@@ -35,11 +35,13 @@ def allan(
 ) -> None:
     """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
     from imulab.estimation.column_noise import analyse
+    from imulab.quantities import labelled
     from imulab.readers import read
 
     check_outputs([report], [name for name in (file, layout) if name])
     recording = read(file, layout, **chosen(topic, instance, window, element))
-    found = analyse(recording, taus)
+    with labelled("--{}", ["taus"]):
+        found = analyse(recording, taus)
     if report:
         from imulab.atomic_write import write_text
         from imulab.report.noise_figures import noise_page

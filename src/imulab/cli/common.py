@@ -16,6 +16,7 @@ from imulab.cli import project
 from imulab.cli.speech import choose, note, speech, tell
 from imulab.errors import OptionError, listed, meant
 
+_ALIKE = 0.75  # --threshold is no misspelt --hold
 _CHOICES: dict[str, tuple[str, ...]] = {
     "tumble plan --criterion": ("imulab.procedures.tumble.optimal:CRITERIA",),
     "tumble plan --from": ("sphere", "fixture:15", "head:15"),
@@ -165,5 +166,5 @@ def usage(error: Any) -> str:
     close = ""
     if hasattr(error, "possibilities"):  # typer names the options that it finds like it, in its own words
         options = [name for parameter in context.command.params for name in parameter.opts]
-        message, close = f"No such option: {error.option_name}", meant(options, error.option_name)
+        message, close = f"No such option: {error.option_name}", meant(options, error.option_name, _ALIKE)
     return f"{message.rstrip('.')}; see '{context.command_path} --help'{close}"

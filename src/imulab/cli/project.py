@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from imulab.errors import OptionError, listed
+from imulab.errors import OptionError, listed, quoted
 from imulab.toml import load_toml
 
 NAME = "imulab.toml"
@@ -44,11 +44,11 @@ def load(path: Path, shown: str) -> dict[str, str]:
     found: dict[str, str] = {}
     for key, value in table.items():
         if key not in KEYS:
-            raise OptionError(f"{shown}: unknown key {key!r}; known keys: {listed(KEYS, key)}")
+            raise OptionError(f"{shown}: unknown key {quoted(key)}; known keys: {listed(KEYS, key)}")
         if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
-            raise OptionError(f"{shown}: {key} = {value!r}: expected a text or a number, as --{key} takes it")
+            raise OptionError(f"{shown}: {key} = {quoted(value)}: expected a text or a number, as --{key} takes it")
         if key in _PATHS and not isinstance(value, str):
-            raise OptionError(f"{shown}: {key} = {value!r}: expected the name of a file")
+            raise OptionError(f"{shown}: {key} = {quoted(value)}: expected the name of a file")
         found[key] = _file(key, str(value), shown) if key in _PATHS else str(value)
     if "gravity" in found and len(found.keys() & set(_GRAVITY)) > 1:
         raise OptionError(f"{shown}: gravity together with latitude or height: expected one or the other")
@@ -66,9 +66,9 @@ def _file(key: str, value: str, shown: str) -> str:
         return value
     path = Path(os.path.normpath(Path(shown).parent / value))
     if path.is_dir():
-        raise OptionError(f"{shown}: {key} = {value!r}: expected the name of a file, found a folder")
+        raise OptionError(f"{shown}: {key} = {quoted(value)}: expected the name of a file, found a folder")
     if not path.is_file():
-        raise OptionError(f"{shown}: {key} = {value!r}: no such file beside it")
+        raise OptionError(f"{shown}: {key} = {quoted(value)}: no such file beside it")
     return f"./{path}" if key == "layout" and shipped_file(str(path)) else str(path)
 
 

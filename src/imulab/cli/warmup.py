@@ -197,10 +197,11 @@ def table(
     from imulab.device.blob import is_blob
     from imulab.procedures.loading import load
     from imulab.procedures.warmup.spreadsheet import read_table, record_of_table, write_table
+    from imulab.quantities import labelled
 
     check_outputs([output], [file])
     if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason
-        with naming(file):
+        with naming(file), labelled("--{}", ["per-second"]):
             text = write_table(load(file), per_second=per_second)
         if not output.lower().endswith(".csv"):
             raise OptionError(f"{output}: expected a name that ends in .csv")

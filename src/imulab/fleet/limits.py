@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
 
-from imulab.errors import ReadError, UnitError, listed
+from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.fleet.display import to_parameter_unit
 from imulab.procedures.registry import PROCEDURES
 from imulab.toml import load_toml
@@ -49,7 +49,7 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
     for procedure, entries in table.items():
         if procedure not in PROCEDURES:
             raise ReadError(
-                f"{path}: unknown procedure {procedure!r}; known procedures: {listed(PROCEDURES, procedure)}"
+                f"{path}: unknown procedure {quoted(procedure)}; known procedures: {listed(PROCEDURES, procedure)}"
             )
         if not isinstance(entries, dict):
             raise ReadError(f'{path}: {procedure}: expected lines such as bias_x = {{ upper = 20, unit = "mg" }}')
@@ -58,7 +58,7 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
             names = [name for name in known if fnmatchcase(name, pattern)]
             if not names:
                 shown = listed(known, pattern) or "none, there is no record of this procedure"
-                raise ReadError(f"{path}: {procedure}: no parameter {pattern!r}; parameters: {shown}")
+                raise ReadError(f"{path}: {procedure}: no parameter {quoted(pattern)}; parameters: {shown}")
             for name in names:
                 key = procedure, name
                 found[key] = _limits(entry, units[key], f"{path}: {procedure}: {pattern}")
@@ -67,7 +67,7 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
 
 def _limits(entry: Any, unit: str, place: str) -> Limits:
     if not isinstance(entry, dict):
-        raise ReadError(f'{place}: expected {{ lower = -20, upper = 20, unit = "{unit}" }}, found {entry!r}')
+        raise ReadError(f'{place}: expected {{ lower = -20, upper = 20, unit = "{unit}" }}, found {quoted(entry)}')
     extra = sorted(set(entry) - {"lower", "upper", "unit"})
     if extra:
         raise ReadError(f"{place}: unknown key {extra[0]!r}; known keys: lower upper unit")
@@ -77,7 +77,7 @@ def _limits(entry: Any, unit: str, place: str) -> Limits:
     for name in set(entry) - {"unit"}:
         value = entry[name]
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ReadError(f"{place}: {name} = {value!r}: expected a number")
+            raise ReadError(f"{place}: {name} = {quoted(value)}: expected a number")
         try:
             ends[name] = to_parameter_unit(float(value), str(entry["unit"]), unit)
         except UnitError as error:

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from imulab.errors import OptionError, ReadError, listed
+from imulab.errors import OptionError, ReadError, listed, several
 from imulab.fleet.sources import local_file, parent_of
 from imulab.procedures.registry import PROCEDURES
 
@@ -126,8 +126,7 @@ def _parquet(data: bytes, name: str) -> list[tuple[str, list[str]]]:
 def _check_columns(titles: Sequence[str], name: str) -> None:
     for title in COLUMNS:
         if title not in titles:
-            found = " ".join(titles)
-            raise OptionError(f"{name}: no column {title}; found {found if len(found) < 300 else found[:300] + ' ...'}")
+            raise OptionError(f"{name}: no column {title}; found {several(titles)}")
     known = [*COLUMNS, *dict.fromkeys(option for entry in PROCEDURES.values() for option in entry.task.names)]
     for index, title in enumerate(titles):
         if title.replace("-", "_") not in known:

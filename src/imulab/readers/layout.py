@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import ReadError, UnitError, listed
+from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.quantity_entries import check_keys, number_of, scale_factor_of
 from imulab.recording import Array, check_unit
 from imulab.toml import load_toml
@@ -125,10 +125,9 @@ class Layout:
 
     def skipped(self, count: int, *, so_far: bool = False) -> str:
         """Say how many rows were skipped by ``skip_incomplete``."""
-        what = ("rows were" if count > 1 else "row was") + (" so far" if so_far else "")
-        return (
-            f"{count} {what} skipped that lack a reading of {' '.join(self.columns)} (skip_incomplete in {self.name})"
-        )
+        what, lack = ("rows were", "lack") if count > 1 else ("row was", "lacks")
+        columns, far = " ".join(self.columns), " so far" if so_far else ""
+        return f"{count} {what}{far} skipped that {lack} a reading of {columns} (skip_incomplete in {self.name})"
 
 
 class IfNeeded(str):
@@ -171,25 +170,25 @@ def _layout(table: dict[str, Any], path: str) -> Layout:
     check_keys(table, _KEYS, path)
     delimiter = table.get("delimiter", "whitespace")
     if not isinstance(delimiter, str) or delimiter not in _DELIMITERS:
-        raise ReadError(f"{path}: delimiter {delimiter!r}; expected 'whitespace' ',' ';' or a tab")
+        raise ReadError(f"{path}: delimiter {quoted(delimiter)}; expected 'whitespace' ',' ';' or a tab")
     decimal = table.get("decimal", ".")
     if decimal not in (".", ",") or decimal == delimiter:
-        raise ReadError(f"{path}: decimal {decimal!r}; expected '.' or ',', and another sign than the delimiter")
+        raise ReadError(f"{path}: decimal {quoted(decimal)}; expected '.' or ',', and another sign than the delimiter")
     columns = table.get("columns")
     if not isinstance(columns, dict) or not columns:
         raise ReadError(f'{path}: no [columns]; expected lines such as accel_x = {{ from = 1, unit = "count" }}')
     skip_lines = table.get("skip_lines", 0)
     if type(skip_lines) is not int or skip_lines < 0:
-        raise ReadError(f"{path}: skip_lines = {skip_lines!r}; expected a number of lines")
+        raise ReadError(f"{path}: skip_lines = {quoted(skip_lines)}; expected a number of lines")
     for key in ("header", "skip_incomplete"):
         if not isinstance(table.get(key, False), bool):
-            raise ReadError(f"{path}: {key} = {table[key]!r}; expected true or false")
+            raise ReadError(f"{path}: {key} = {quoted(table[key])}; expected true or false")
     sample_rate = _sample_rate(table.get("sample_rate"), path)
     columns = _with_tables(columns, table, path)
     parsed = {name: _column(name, entry, path, counted=sample_rate is not None) for name, entry in columns.items()}
     metadata = table.get("metadata", {})
     if not isinstance(metadata, dict):
-        raise ReadError(f"{path}: metadata = {metadata!r}; expected a table of keys and texts")
+        raise ReadError(f"{path}: metadata = {quoted(metadata)}; expected a table of keys and texts")
     if sample_rate is not None and "time" in parsed and parsed["time"].unit != "count":
         raise ReadError(
             f"{path}: both a time column and sample_rate; expected one of them, or a time of unit count, which numbers "
@@ -217,10 +216,10 @@ def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> d
     for key, example in _BY_COLUMN.items():
         entries = table.get(key, {})
         if not isinstance(entries, dict):
-            raise ReadError(f"{path}: {key}: expected lines such as gyro_x = {example}, found {entries!r}")
+            raise ReadError(f"{path}: {key}: expected lines such as gyro_x = {example}, found {quoted(entries)}")
         for name, entry in entries.items():
             if name not in columns:
-                raise ReadError(f"{path}: {key}: no column {name!r}; columns: {listed(columns, name)}")
+                raise ReadError(f"{path}: {key}: no column {quoted(name)}; columns: {listed(columns, name)}")
             if isinstance(found[name], dict):
                 if key in found[name]:
                     raise ReadError(f"{path}: column {name}: {key} is given twice, here and under [{key}]")
@@ -231,17 +230,20 @@ def _with_tables(columns: dict[str, Any], table: dict[str, Any], path: str) -> d
 def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
     place = f"{path}: column {name}"
     if not isinstance(entry, dict) or "from" not in entry or "unit" not in entry:
-        raise ReadError(f'{place}: expected {name} = {{ from = 1, unit = "count" }}, found {entry!r}')
+        raise ReadError(f'{place}: expected {name} = {{ from = 1, unit = "count" }}, found {quoted(entry)}')
     check_keys(entry, _COLUMN_KEYS, place)
     origin = entry["from"]
     if not (isinstance(origin, str) or (type(origin) is int and origin >= 0)):
-        raise ReadError(f"{place}: from = {origin!r}; expected a column number from 0, or a name")
+        raise ReadError(f"{place}: from = {quoted(origin)}; expected a column number from 0, or a name")
     scale = number_of(entry.get("scale", 1.0), f"{place}: scale")
     if scale == 0:
-        raise ReadError(f"{place}: scale = {entry['scale']!r}; expected a number other than 0")
+        raise ReadError(f"{place}: scale = {quoted(entry['scale'])}; expected a number other than 0")
     _check_size(scale, f"{place}: scale")
     if entry["unit"] == "iso":
-        check_unit(name, "s", path)
+        try:
+            check_unit(name, "s", path)
+        except UnitError as error:
+            raise UnitError(str(error).replace("'s' (time)", "'iso' (dates)")) from None
         converts = sorted(set(entry) & {"scale", "zero", "scale_factor"})
         if converts:
             raise ReadError(f"{place}: {converts[0]}: expected none for dates, whose seconds are counted")
@@ -262,8 +264,8 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
         factor = known.value * conversion_factor(known.output.symbol, unit.symbol)
     except UnitError:
         raise UnitError(
-            f"{place}: unit = {entry['unit']!r}; expected {known.output.symbol}, the output in the scale factor's unit "
-            f"{entry['scale_factor']['unit']}"
+            f"{place}: unit = {quoted(entry['unit'])}; expected {known.output.symbol}, the output in the scale "
+            f"factor's unit {entry['scale_factor']['unit']}"
         ) from None
     _check_size(factor, f"{place}: scale_factor")
     check_unit(name, known.measured.symbol, path)
@@ -275,7 +277,7 @@ def _zero(entry: Any, unit: Unit, place: str) -> float:
     if entry is None:
         return 0.0
     if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
-        raise ReadError(f"{place}: expected zero = {_BY_COLUMN['zero']}, found {entry!r}")
+        raise ReadError(f"{place}: expected zero = {_BY_COLUMN['zero']}, found {quoted(entry)}")
     try:
         factor = conversion_factor(str(entry["unit"]), unit.symbol)
     except UnitError as error:
@@ -294,7 +296,9 @@ def _check_size(value: float, place: str) -> None:
 
 def _prefix(prefix: Any, delimiter: str, path: str) -> str:
     if not isinstance(prefix, str) or prefix.strip() != prefix or not prefix or {delimiter, "\n"} & set(prefix):
-        raise ReadError(f'{path}: prefix = {prefix!r}; expected the first field of the lines that count, such as "IMU"')
+        raise ReadError(
+            f'{path}: prefix = {quoted(prefix)}; expected the first field of the lines that count, such as "IMU"'
+        )
     return prefix
 
 
@@ -306,12 +310,12 @@ def _encoding(name: Any, path: str) -> str:
         decoded = ""
     except (LookupError, TypeError, ValueError):
         raise ReadError(
-            f"{path}: encoding = {name!r}; expected the name of an encoding such as gbk, shift_jis or latin-1"
+            f"{path}: encoding = {quoted(name)}; expected the name of an encoding such as gbk, shift_jis or latin-1"
         ) from None
     if decoded != _ASCII.decode("ascii"):
         raise ReadError(
-            f"{path}: encoding = {name!r}; expected one that writes letters and digits as ASCII does: save the file as "
-            "UTF-8"
+            f"{path}: encoding = {quoted(name)}; expected one that writes letters and digits as ASCII does: save the "
+            "file as UTF-8"
         )
     return str(name)
 
@@ -322,9 +326,9 @@ def _sample_rate(entry: Any, path: str) -> float | None:
     if isinstance(entry, int | float) and not isinstance(entry, bool):
         entry = {"value": entry, "unit": "Hz"}
     if not isinstance(entry, dict) or set(entry) != {"value", "unit"} or entry["unit"] != "Hz":
-        raise ReadError(f'{path}: sample_rate: expected {{ value = 100, unit = "Hz" }}, found {entry!r}')
+        raise ReadError(f'{path}: sample_rate: expected {{ value = 100, unit = "Hz" }}, found {quoted(entry)}')
     value = entry["value"]
     low, high = _RATES
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise ReadError(f"{path}: sample_rate: expected a number of Hz from {low:g} to {high:g}, found {value!r}")
+        raise ReadError(f"{path}: sample_rate: expected a number of Hz from {low:g} to {high:g}, found {quoted(value)}")
     return to_si(float(value), "Hz")

@@ -62,9 +62,29 @@ def _fits(entry: Shipped, line: str) -> bool:
 def advice(head: bytes, layout: str | None = None) -> str:
     """Return which layout to try with a text file by its first lines; empty where none fits, or `layout` does."""
     names = fitting(head)
-    if not names or layout in names:
+    if not names:
+        return _separated(head)
+    if layout in names:
         return ""
     return f"looks like a file of {' or '.join(names)}: try {' or '.join(f'--layout {name}' for name in names)}"
+
+
+def _separated(head: bytes) -> str:
+    """Return which layout fits but for what stands between columns, and what to change; empty where none does."""
+    lines = head.decode("utf-8-sig", "replace").splitlines()[:_MOST_LINES]
+    for entry in shipped():
+        for delimiter in {",", ";", "\t"} - {entry.layout.delimiter}:
+            for number, line in enumerate(lines):
+                if not entry.titles or not entry.titles.issubset(titles_of(line, delimiter)):
+                    continue
+                rows = "".join(lines[number + 1 :])
+                decimal = ' and decimal = ","' if delimiter != "," and "," in rows and "." not in rows else ""
+                written = delimiter.replace("\t", "\\t")
+                return (
+                    f"looks like a file of {entry.name} with other separators: copy its layout (imulab show --formats "
+                    f'{entry.name}) and set delimiter = "{written}"{decimal}'
+                )
+    return ""
 
 
 def is_titled(head: bytes) -> bool:

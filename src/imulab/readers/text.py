@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from imulab.errors import ReadError
+from imulab.errors import ReadError, several
 from imulab.readers import _text
 from imulab.readers.layout import Layout
 from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Crew, Lines
@@ -79,6 +79,8 @@ class TextFile:
         self._most_fields = 0
         self._passed = self._incomplete = 0
         self._titles, self._units, self._slots = self._layout_head(layout) if layout else self._native_head()
+        if layout is None or layout.header:
+            self._pass_last_delimiter()
 
     def blocks(self) -> Iterator[Recording]:
         """Yield the rows as recordings; there is at least one row, or the file is refused."""
@@ -210,7 +212,7 @@ class TextFile:
             index = origin if isinstance(origin, int) else present.index(origin) if origin in present else -1
             if not 0 <= index < len(present):
                 what = f"column {origin}" if isinstance(origin, int) else f"a column named {origin!r}"
-                found = f"{len(present)} columns" if isinstance(origin, int) else " ".join(present)
+                found = f"{len(present)} columns" if isinstance(origin, int) else several(present)
                 raise ReadError(f"{self._name}: {layout.name} takes {name} from {what}, found {found}")
             if slots[index] >= 0:
                 other = list(layout.columns)[slots[index] & ~_DATE]
@@ -219,6 +221,17 @@ class TextFile:
         if self._skips:
             slots = slots[: int(np.flatnonzero(slots >= 0)[-1]) + 1]
         return list(layout.columns), layout.units, slots
+
+    def _pass_last_delimiter(self) -> None:
+        """Allow an empty field more than there are titles, in every row, where the first row ends with a delimiter."""
+        line = self._lines.next_line().decode("utf-8", "replace").rstrip("\r")
+        titles = self._most_fields or len(self._slots)
+        if self._delimiter == " " or self._prefix or not line.endswith(self._delimiter):
+            return
+        if len(_fields(line, self._delimiter)) == titles + 1:
+            self._most_fields = titles + 1
+            if not self._skips:
+                self._slots = np.append(self._slots, np.int32(-1))
 
     def _first_fields(self, layout: Layout) -> int:
         """Return how many fields the rows have: as the first, or as many as are asked for where rows may lack some."""
@@ -268,7 +281,7 @@ class TextFile:
         )
         raise ReadError(
             f"{self._name}: {layout.name} takes {name} from a column named {origin!r}, "
-            f"found {' '.join(best) or 'no titles'}"
+            f"found {several(best) or 'no titles'}"
         )
 
     # --- rows --------------------------------------------------------------------------------------------------
@@ -330,6 +343,8 @@ class TextFile:
         place = f"{self._name}: row {row + index} (line {self._lines.before + self._passed + above})"
         line = job.rows.split(b"\n", index + 1)[index].decode("utf-8", "replace").rstrip("\r")
         expected = self._most_fields or len(self._slots)
+        if self._prefix and not line.strip(" \t"):
+            raise ReadError(f"{place}: expected {expected} fields behind the prefix, found none")
         if not line.strip(" \t"):
             raise ReadError(f"{place}: expected {expected} fields, found an empty line")
         if problem == _WRONG_COUNT:

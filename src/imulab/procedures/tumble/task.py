@@ -21,7 +21,7 @@ from imulab.procedures.options import (
 )
 from imulab.procedures.procedure import Files, Task
 from imulab.procedures.tumble.choices import LOSSES, METHODS, ORDERS
-from imulab.quantities import quantity
+from imulab.quantities import labelled, quantity
 from imulab.units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
+_NAMED = ("order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo")
 _CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
 
 
@@ -154,11 +155,12 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 
     values = read_options(OPTIONS, texts, label)
     values["ageing"] = values["ageing"] or ()
-    check_options(
-        values["order"], values["method"], values["loss"],
-        monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
-        nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
-    )  # fmt: skip
+    with labelled(label, _NAMED):
+        check_options(
+            values["order"], values["method"], values["loss"],
+            monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
+            nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
+        )  # fmt: skip
     values["gravity"] = gravity_option(values["gravity"], values["latitude"], values["height"], label)
     return {**values, "part": part_of(values, label)}
 
