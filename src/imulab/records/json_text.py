@@ -1,21 +1,24 @@
-"""Plain JSON values as text: with an indent as a file, without spaces and with sorted keys to be hashed.
-
-The texts are those of the standard library, whose encoder is slow with an indent; C (`_digits`) writes both at once.
-"""
+"""Plain JSON values as text: with an indent as a file, without spaces and with sorted keys to be hashed."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from typing import Any
 
-from imulab.writers import _digits
-from imulab.writers.decimals import prepare
-
 
 def json_text(content: Mapping[str, Any]) -> str:
-    """Return ``json.dumps(content, indent=1, ensure_ascii=False)`` and a line break."""
-    return _texts(content)[1].decode("utf-8") + "\n"
+    """Return JSON with an indent of 1, and a line break.
+
+    Raises
+    ------
+    TypeError
+        A value is not of JSON's kinds (NumPy's are not).
+    ValueError
+        A number is not finite.
+    """
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def sealed_text(content: Mapping[str, Any]) -> tuple[str, str]:
@@ -24,13 +27,12 @@ def sealed_text(content: Mapping[str, Any]) -> tuple[str, str]:
     Raises
     ------
     TypeError
-        A value is not of JSON's kinds (NumPy's are not), or a key no text.
+        A value is not of JSON's kinds (NumPy's are not).
     ValueError
         A number is not finite, or a text is no Unicode.
     """
-    compact, indented = _texts(content)
-    sha256 = hashlib.sha256(compact).hexdigest()
-    return sha256, f'{indented[:-2].decode("utf-8")},\n "content_sha256": "{sha256}"\n}}\n'
+    sha256 = content_sha256(content)
+    return sha256, json_text({**content, "content_sha256": sha256})
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
@@ -38,13 +40,11 @@ def content_sha256(content: Mapping[str, Any]) -> str:
 
     Raises
     ------
+    TypeError
+        A value is not of JSON's kinds (NumPy's are not).
     ValueError
         A number is not finite, or a text is no Unicode.
     """
-    compact, _ = _texts({key: value for key, value in content.items() if key != "content_sha256"})
-    return hashlib.sha256(compact).hexdigest()
-
-
-def _texts(content: Mapping[str, Any]) -> tuple[bytes, bytes]:
-    prepare()
-    return _digits.json(content)
+    plain = {key: value for key, value in content.items() if key != "content_sha256"}
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()

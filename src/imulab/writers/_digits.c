@@ -3,15 +3,16 @@
  * The decimal is found without trial by three multiplications with a power of ten of 128 bits (R. Giulietti, "The
  * Schubfach way to render doubles", 2020; its names are kept) and written as Python writes it: 0.1, 1e-05, 1e+16, nan.
  */
-#include "_digits.h"
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
 #include <stdint.h>
 #include <string.h>
 
 enum { LOWEST = -292, HIGHEST = 324, POWERS = HIGHEST - LOWEST + 1 };
+enum { LONGEST = 25 }; /* bytes of a number and what separates it from the next */
 
 static int prepared = 0;
-
-int numbers_prepared(void) { return prepared; }
 
 #ifdef __SIZEOF_INT128__
 /* 10^k, scaled to 128 bits and rounded up: high and low half of each; filled by prepare(). */
@@ -71,7 +72,8 @@ static char *repeated(char *out, char c, int count) {
     return out;
 }
 
-char *print_number(double value, char *out) {
+/* The shortest decimal that reads back as `value`, at `out`, as Python writes it; returns where it ends. */
+static char *print_number(double value, char *out) {
     uint64_t bits;
     memcpy(&bits, &value, sizeof bits);
     const uint64_t magnitude = bits & ~(UINT64_C(1) << 63);
@@ -143,11 +145,6 @@ char *print_number(double value, char *out) {
     *out++ = (char)('0' + power % 10);
     return out;
 }
-#else
-char *print_number(double value, char *out) {
-    (void)value;
-    return out;
-}
 #endif
 
 PyDoc_STRVAR(rows_doc,
@@ -211,7 +208,6 @@ static PyObject *prepare(PyObject *module, PyObject *args) {
 
 static PyMethodDef methods[] = {{"rows", rows, METH_VARARGS, rows_doc},
                                 {"prepare", prepare, METH_VARARGS, prepare_doc},
-                                {"json", json_texts, METH_O, json_doc},
                                 {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef definition = {
