@@ -44,6 +44,32 @@ def test_help_imports_no_numerics():
     assert done.stdout.endswith("set()\n")
 
 
+def test_a_fit_and_noise_load_no_package_that_takes_longer_than_they_do(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    il.write_csv(il.simulate_tumble(gravity=9.81, seed=1), "tumble.csv")
+    heavy = "{'scipy.special._basic', 'scipy.optimize', 'scipy.linalg', 'scipy.signal', 'numpy.f2py', 'numpy.testing'}"
+    for words in (["tumble", "fit", "tumble.csv", "--gravity", "9.81"], ["allan", "tumble.csv"]):
+        code = f"import sys; from imulab.cli import main; print(main({words}), {heavy} & set(sys.modules))"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.endswith("\n0 set()\n")
+
+
+@pytest.mark.parametrize("words", [["tumble", "--help"], ["show", "--help"], ["--help"]])
+def test_a_command_built_alone_says_the_same_as_among_all(words):
+    from imulab.cli.app import command
+
+    def said(root):
+        shown = []
+        group = root
+        for word in words:
+            group = group.commands.get(word) if hasattr(group, "commands") and not word.startswith("-") else group
+        with group.make_context("imulab", [], resilient_parsing=True) as context:
+            shown.append(group.get_help(context))
+        return shown
+
+    assert said(command(words)) == said(command())
+
+
 def test_no_submodule_hides_a_public_function():
     """Importing a submodule puts it where its package looks names up: imulab.apply must stay the function."""
     import importlib

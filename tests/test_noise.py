@@ -5,12 +5,13 @@ import json
 import allantools
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation.allan import allan_deviation
 from imulab.estimation.column_noise import analyse, column_noise, noise_lines
-from imulab.estimation.noise_coefficients import read_coefficients
+from imulab.estimation.noise_coefficients import not_negative, read_coefficients
 from imulab.estimation.sampling import sampling_rate
 from imulab.estimation.spectral_lines import spectral_lines
 from imulab.recording import Recording
@@ -250,3 +251,14 @@ def test_the_command_prints_tables_and_json_and_refuses_in_one_line(imulab, tmp_
         refused = imulab("allan", file)
         assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
         assert text in refused.stderr
+
+
+@pytest.mark.parametrize("size", [3, 4])
+def test_least_squares_that_are_not_negative_equal_those_of_scipy(size):
+    rng = np.random.default_rng(size)
+    for _ in range(200):
+        columns, target = rng.standard_normal((9, size)), rng.standard_normal(9)
+        peer, left = nnls(np.column_stack([columns, -columns[:, 3:]]), target)  # the fourth may have either sign
+        mine, misfit = not_negative(columns, target)
+        np.testing.assert_allclose(mine, np.append(peer[:3], peer[3:4] - peer[4:5]), atol=1e-12)
+        assert misfit == pytest.approx(left, rel=1e-12)

@@ -25,6 +25,8 @@ def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int
     """
     # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Nor does anything here need plugins of pydantic, which looks for them in every package that is installed.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     try:
         from imulab.cli.speech import begin
 
@@ -48,7 +50,9 @@ def _main(arguments: Sequence[str] | None) -> int:
         if hasattr(stream, "reconfigure"):  # a terminal without µ gets a question mark, not a fault
             stream.reconfigure(errors="replace")
     try:
-        status = command().main(args=arguments, prog_name="imulab", standalone_mode=False)
+        status = command(sys.argv[1:] if arguments is None else arguments).main(
+            args=arguments, prog_name="imulab", standalone_mode=False
+        )
         sys.stdout.flush()
         release()
     except ImulabError as error:

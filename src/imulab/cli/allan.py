@@ -61,7 +61,7 @@ def allan(
 
 def describe(found: dict[str, Any]) -> str:
     """Return coefficients and curves as tables."""
-    from imulab.cli.show import aligned
+    from imulab.cli.columns import aligned
     from imulab.report.elements import plain_number
     from imulab.report.noise_figures import coefficient_rows, shown_unit
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from json import dumps
 
-from imulab.cli.show import aligned
+from imulab.cli.columns import aligned
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.experiments import ExperimentRow
 from imulab.procedures.gyro_array.model import unit_of_angle

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from imulab.atomic_write import replacing
+from imulab.cli.columns import aligned
 from imulab.cli.options import check_outputs, is_json, quantity, whole_number
-from imulab.cli.show import aligned
 from imulab.errors import ImulabError, OptionError, RecordError
 from imulab.procedures.loading import load
 from imulab.procedures.tumble.engineering import predicted_rows

@@ -187,7 +187,7 @@ def show(
 
 def _show_formats(names: list[str], *, json: bool) -> None:
     """Print what can be read, or the layouts of these names."""
-    from imulab.cli.show import aligned
+    from imulab.cli.columns import aligned
     from imulab.readers import formats, shipped
     from imulab.readers.layout import EXAMPLE, shipped_file, shipped_names
     from imulab.toml import load_toml

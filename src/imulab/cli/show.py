@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from imulab.cli.columns import aligned
 from imulab.cli.speech import coloured
-from imulab.device.blob import Blob
 from imulab.errors import ReadError
 from imulab.printable import printable
 from imulab.procedures.reports import change_unit, exhibits_of
-from imulab.procedures.tumble.figures import gyro_headline
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Comparison
 from imulab.records.json_text import json_text
 from imulab.report.elements import Table, format_uncertain, plain_number
 from imulab.verdict import SENTENCES, Verdict
+
+if TYPE_CHECKING:
+    from imulab.device.blob import Blob
 
 _GAP = 1.5
 
@@ -45,6 +48,8 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
 
 def describe_gyro(record: Calibration, accelerometers: str) -> str:
     """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
+    from imulab.procedures.tumble.figures import gyro_headline
+
     table = next(item for item in exhibits_of(record).items if isinstance(item, Table))
     rows = [row for row in table.rows if row[0].startswith("gyro_")]
     serial = record.sensor.get("serial", "unit without serial number")
@@ -242,21 +247,3 @@ def recording_json(blocks: Iterable[Recording]) -> str:
             "notes": found.notes,
         }
     ).rstrip()
-
-
-def aligned(titles: list[str], rows: list[list[str]]) -> list[str]:
-    """Return a table as lines of text; texts to the left, numbers to the right."""
-    table = [titles, *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
-    numeric = [all(_numeric(row[i]) for row in rows) for i in range(len(titles))]
-    return [
-        "  ".join(
-            cell.rjust(width) if right else cell.ljust(width)
-            for cell, width, right in zip(row, widths, numeric, strict=True)
-        ).rstrip()
-        for row in table
-    ]
-
-
-def _numeric(text: str) -> bool:
-    return text in ("–", "not stated") or text.lstrip("+-")[:1].isdigit()

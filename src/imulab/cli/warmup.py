@@ -54,7 +54,7 @@ def plan(
     """Write the chamber programme and its duration; say which temperatures are missing."""
     from math import sqrt
 
-    from imulab.cli.show import aligned
+    from imulab.cli.columns import aligned
     from imulab.procedures.warmup.plan import plan_warmup, programme
     from imulab.writers import write_csv
 

@@ -291,7 +291,7 @@ def robust_scale(standardised: Array, size: int) -> Array:
 
 def f_test(cost: float, size: int, larger_cost: float, larger_size: int, count: int) -> float:
     """Return the probability of so large a gain if the larger of two nested models were no better (F-test)."""
-    from scipy.special import fdtrc
+    from imulab.estimation.special import fdtrc
 
     if larger_size >= count:
         return 1.0
@@ -309,14 +309,14 @@ def bayesian_information(cost: float, size: int, count: int) -> float:
 
 def chi_square_limit(freedom: int, probability: float = 1e-2) -> float:
     """Return the value that chi-square exceeds with the given probability; infinite without degrees of freedom."""
-    from scipy.special import chdtri
+    from imulab.estimation.special import chdtri
 
     return float(chdtri(freedom, probability)) if freedom > 0 else float("inf")
 
 
 def coverage_factor(freedom: float | None, probability: float = 0.95) -> float:
     """Return the two-sided coverage factor: Student's t, or the normal quantile where `freedom` is None."""
-    from scipy.special import ndtri, stdtrit
+    from imulab.estimation.special import ndtri, stdtrit
 
     tail = 0.5 + probability / 2
     return float(ndtri(tail) if freedom is None else stdtrit(freedom, tail))
@@ -324,6 +324,6 @@ def coverage_factor(freedom: float | None, probability: float = 0.95) -> float:
 
 def chi_square_probability(value: float, freedom: float) -> float:
     """Return the probability that chi-square with `freedom` degrees exceeds `value`."""
-    from scipy.special import chdtrc
+    from imulab.estimation.special import chdtrc
 
     return float(chdtrc(freedom, value))

@@ -167,8 +167,9 @@ def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray
     found = np.zeros((2, len(known)), dtype=np.bool_)
     good = np.flatnonzero(~known)
     if len(good) >= 2 * _AROUND:
+        part = good if len(good) < len(known) else slice(None)
         for column in values:
-            found[:, good] |= _far(column if len(good) == len(column) else column[good])
+            found[:, part] |= _far(column[part])
     return found[0] & ~found[1], found[1]
 
 

@@ -230,7 +230,7 @@ def line_drift(days: Array, values: Array, used: NDArray[np.bool_]) -> Drift | N
     day, value = days[used], values[used]
     if len(day) < _FEWEST_FOR_DRIFT or np.ptp(day) < _SHORTEST_SPAN:
         return None
-    from scipy.special import stdtrit
+    from imulab.estimation.special import stdtrit
 
     centred = day - day.mean()
     spread = float(centred @ centred)
@@ -289,7 +289,7 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
 
 def change_limit(count: int) -> float:
     """Return the deviations that one in so many normal changes is beyond in one set out of a hundred."""
-    from scipy.special import ndtri
+    from imulab.estimation.special import ndtri
 
     return float(-ndtri(_FALSE_ALARM / 2 / max(count, 1)))
 
@@ -308,7 +308,7 @@ def _compared(
     share = sum((part / u) ** 4 / freedom for part, freedom in parts)
     if share <= 0:
         return u, ratio
-    from scipy.special import ndtri, stdtr
+    from imulab.estimation.special import ndtri, stdtr
 
     chance = max(float(stdtr(1 / share, -abs(ratio))), 1e-300)
     return u, math.copysign(-float(ndtri(chance)), ratio)

@@ -82,7 +82,7 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
 
 def interval(column: dict[str, Any]) -> tuple[Array, Array]:
     """Return the 95 % interval of a column's Allan deviation, by chi-square with its degrees of freedom."""
-    from scipy.special import chdtri
+    from imulab.estimation.special import chdtri
 
     deviation, u = np.array(column["deviation"]), np.array(column["standard_uncertainty"])
     known = u > 0

@@ -137,7 +137,7 @@ def check_tumble(
     value, probability = contradiction(seen, rows, known.covariance, noise)
     freedom = _freedom(record)
     if freedom is not None:
-        from scipy.special import fdtrc
+        from imulab.estimation.special import fdtrc
 
         probability = float(fdtrc(len(seen), freedom, value / len(seen)))
     total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))

@@ -172,7 +172,7 @@ def _shifts(white: _Whitened, chosen: Index) -> tuple[Array, Array, float]:
 
 def _admissible(z: Array, gain: float, rss: float, n: int, freedom: int, known: bool) -> bool:
     """Whether chance hardly gives the weakest member of a set, nor the set."""
-    from scipy.special import fdtrc, ndtr, stdtr
+    from imulab.estimation.special import fdtrc, ndtr, stdtr
 
     m, least = len(z), float(np.abs(z).min())
     tests = n - m + 1
