@@ -1,0 +1,122 @@
+"""The rooms of the package: which module imports which, read from the source without importing any."""
+
+import ast
+import graphlib
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).resolve().parents[1] / "src"
+ROOMS = [
+    {"cli", "fleet", "demo", "__main__"},
+    {"procedures", "readers", "exporters", "report", "writers"},
+    {"estimation", "device", "records"},
+]
+"""From above (design.md); everything else lies in the root, below them all."""
+PROCEDURES = {path.parent.name for path in (SOURCE / "imulab" / "procedures").glob("*/entry.py")}
+KNOWN_ABOVE = {
+    ("imulab.records.json_text", "imulab.writers.decimals"),  # records print numbers as files do
+}
+KNOWN_CIRCLE = ("imulab.cli.records", "imulab.cli")  # `imulab demo` runs other commands
+KNOWN_NAMES = {
+    "imulab.device.blob",
+    "imulab.device.tables",
+    "imulab.exporters.c",
+}
+"""Modules that name the structs of the C core, some of which are called as procedures are."""
+KNOWN_INSIDE = {
+    "imulab.exporters.model",  # the sections of a tumble record, which other programs' files are made from
+    "imulab.fleet.simulate",  # a simulated line is one of tumble tests
+}
+
+
+def _modules() -> dict[str, ast.Module]:
+    found = {}
+    for path in sorted((SOURCE / "imulab").rglob("*.py")):
+        name = ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
+        found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+MODULES = _modules()
+
+
+def _imported(node: ast.AST) -> set[str]:
+    """What a module imports anywhere, in functions too, but for what only type checkers see; C modules left out."""
+    if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+        return set().union(*map(_imported, node.orelse))
+    if isinstance(node, ast.Import):
+        return {each.name for each in node.names if each.name in MODULES}
+    if isinstance(node, ast.ImportFrom):
+        assert not node.level, "relative imports hide from where a name comes"
+        full = {each.name: f"{node.module}.{each.name}" for each in node.names}
+        found = {path for path in full.values() if path in MODULES}
+        values = [name for name, path in full.items() if path not in MODULES and not name.startswith("_")]
+        return found | ({node.module} & MODULES.keys() if values else set())
+    return set().union(*map(_imported, ast.iter_child_nodes(node)))
+
+
+ARROWS = {name: _imported(tree) - {name} for name, tree in MODULES.items()}
+
+
+def _room(name: str) -> str:
+    return [*name.split("."), ""][1]
+
+
+def _height(name: str) -> int:
+    return next((len(ROOMS) - k for k, rooms in enumerate(ROOMS) if _room(name) in rooms), 0)
+
+
+def _procedure(name: str) -> str | None:
+    parts = name.split(".")
+    return parts[2] if len(parts) > 2 and parts[1] == "procedures" and parts[2] in PROCEDURES else None
+
+
+def test_the_graph_is_that_of_the_package():
+    assert {"tumble", "gyro_array", "warmup", "centrifuge"} <= PROCEDURES
+    assert "imulab.procedures.registry" in ARROWS["imulab.procedures.run"]
+    assert "imulab.procedures.tumble.fit" in ARROWS["imulab.procedures.tumble.task"]  # within a function
+
+
+def test_arrows_go_down_only():
+    above = {(a, b) for a in ARROWS for b in ARROWS[a] if a != "imulab" and _height(a) < _height(b)}
+    assert above == KNOWN_ABOVE
+
+
+def test_no_circles():
+    arrows = {a: {b for b in ARROWS[a] if (a, b) != KNOWN_CIRCLE} for a in ARROWS}
+    try:
+        graphlib.TopologicalSorter(arrows).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(f"modules import each other in a circle: {' <- '.join(error.args[1])}")
+    assert KNOWN_CIRCLE[1] in ARROWS[KNOWN_CIRCLE[0]], "the known circle is gone: take it out of this test"
+
+
+def test_procedures_do_not_import_each_other():
+    across = {(a, b) for a in ARROWS for b in ARROWS[a] if _procedure(a) and _procedure(b)}
+    assert not {(a, b) for a, b in across if _procedure(a) != _procedure(b)}
+
+
+def test_only_the_registry_reaches_into_procedures():
+    free = {"cli", "demo", ""}  # groups of commands, the simulated instruments, the public names
+    inside = {a for a in ARROWS for b in ARROWS[a] if _procedure(b) and not _procedure(a) and _room(a) not in free}
+    assert inside == KNOWN_INSIDE | {"imulab.procedures.registry"}
+
+
+def _names_procedures(tree: ast.Module) -> bool:
+    """Whether a module compares something with a procedure's name, or lists several."""
+    names = PROCEDURES | {"array"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare | ast.MatchValue):
+            if any(isinstance(part, ast.Constant) and part.value in names for part in ast.walk(node)):
+                return True
+        elif isinstance(node, ast.Dict | ast.List | ast.Tuple | ast.Set):
+            parts = node.keys if isinstance(node, ast.Dict) else node.elts
+            if sum(isinstance(part, ast.Constant) and part.value in names for part in parts) > 1:
+                return True
+    return False
+
+
+def test_nobody_outside_tells_procedures_apart_by_name():
+    outside = {name for name, tree in MODULES.items() if _room(name) not in {"cli", "demo", "procedures"}}
+    assert {name for name in outside if _names_procedures(MODULES[name])} == KNOWN_NAMES
