@@ -9,6 +9,7 @@ import numpy as np
 
 from imulab.device.unit import Unit
 from imulab.errors import DataError, RecordError, UnitError
+from imulab.procedures.centrifuge.sections import highest_force
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import from_si, parse_unit
@@ -67,20 +68,6 @@ def beyond_message(record: Calibration, count: int, largest: float) -> str:
         f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {from_si(largest, 'g'):.1f} g), "
         "the highest level of the record's test: K(a) is extrapolated there"
     )
-
-
-def highest_force(record: Calibration) -> float:
-    """Return the specific force of the highest level, m/s^2.
-
-    Raises
-    ------
-    RecordError
-        The record does not say.
-    """
-    try:
-        return max(float(level["specific_force"]["value"]) for level in record.sections["levels"])
-    except (KeyError, TypeError, ValueError):
-        raise RecordError("the record lacks its levels") from None
 
 
 def _force(recording: Recording, name: str) -> Array:

@@ -9,6 +9,7 @@ import numpy as np
 from imulab.device.tables import Field, Table, field_of
 from imulab.device.unit import Unit
 from imulab.errors import RecordError
+from imulab.procedures.centrifuge.sections import highest_force
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -43,7 +44,7 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
             [p.value if (p := record.parameters.get(f"{axis}_{name}")) is not None else 0.0 for axis in "xy"]
         )
 
-    highest = max(float(level["specific_force"]["value"]) for level in record.sections["levels"])
+    highest = highest_force(record)
     table = Table(
         "centrifuge",
         (

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from imulab.errors import RecordError
 from imulab.estimation.estimate import coverage_factor
 from imulab.procedures.centrifuge.model import curve
+from imulab.procedures.centrifuge.sections import Centrifuge, centrifuge_of, force_of, level_of
 from imulab.procedures.centrifuge.tables import (
     PER_G,
     budget_table,
@@ -15,6 +17,7 @@ from imulab.procedures.centrifuge.tables import (
     cycle_tables,
     level_table,
     parameters_table,
+    relative,
     run_table,
 )
 from imulab.recording import Array
@@ -37,18 +40,20 @@ _CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
-    sets = prefixes(record)
+    sets, r = prefixes(record), centrifuge_of(record)
+    if not sets or not all(numbers(record, prefix) for prefix in sets):
+        raise RecordError("the record lacks x_K0, or the K of any level")
     items: list[Figure | Table] = [_zeta(record, sets)]
     if any(f"{p}direction" in record.parameters for p in sets):
         items.append(_polar(record, [p for p in sets if f"{p}direction" in record.parameters]))
-    items += [_repeatability(record, sets), *_spectra(record)]
+    items += [_repeatability(record, r, sets), *_spectra(r)]
     items += [
-        level_table(record, sets),
-        *cycle_tables(record),
-        curve_table(record, sets),
-        budget_table(record),
-        parameters_table(record),
-        run_table(record),
+        level_table(record, r.levels, sets),
+        *cycle_tables(r.fit.power_cycles),
+        curve_table(r.fit, sets),
+        budget_table(r.fit),
+        parameters_table(record, r.fit),
+        run_table(r.runs),
     ]
     return Exhibits(headline=_headline(record, sets[0]), facts=_facts(record, sets), items=items)
 
@@ -60,12 +65,7 @@ def prefixes(record: Calibration) -> list[str]:
 
 def numbers(record: Calibration, prefix: str) -> list[int]:
     """Return the levels of a set, rising."""
-    return [row["level"] for row in record.sections["levels"] if f"{prefix}K_{row['level']}" in record.parameters]
-
-
-def _force(record: Calibration, level: int) -> float:
-    row = next(row for row in record.sections["levels"] if row["level"] == level)
-    return float(row["specific_force"]["value"])
+    return [row.level for row in centrifuge_of(record).levels if f"{prefix}K_{row.level}" in record.parameters]
 
 
 def _label(prefix: str) -> str:
@@ -76,19 +76,19 @@ def _headline(record: Calibration, prefix: str) -> str:
     """Return the g-sensitivity in one sentence, and by how much it departs from the linear."""
     levels = numbers(record, prefix)
     last = levels[-1]
-    first, top = _g(_force(record, levels[0])), _g(_force(record, last))
+    first, top = _g(force_of(record, levels[0])), _g(force_of(record, last))
     if last == levels[0]:
         return f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{last}')} at {first}."
-    zeta = record.parameters[f"{prefix}zeta_{last}"]
+    zeta = record.parameter(f"{prefix}zeta_{last}")
     measured = _change(zeta.value, zeta.standard_uncertainty)
-    curved = _curve_change(record, prefix, _force(record, last))
-    if record.model["curve"][prefix.rstrip("_")] == "constant":
+    curved = _curve_change(record, prefix, force_of(record, last))
+    if centrifuge_of(record).model.curve[prefix.rstrip("_")] == "constant":
         return (
             f"{_label(prefix)} drifts linearly with g, by {_per_g(record, f'{prefix}K0')} from {first} to {top}; the "
             f"factor at {top} is {measured} than that at {first}."
         )
-    K, _ = curve_at(record, prefix, np.array([_force(record, last)]))
-    fitted = _change(float(K[0]) / record.value(f"{prefix}K0") - 1, curved)
+    K, _ = curve_at(record, prefix, np.array([force_of(record, last)]))
+    fitted = _change(relative(float(K[0]), record.value(f"{prefix}K0")), curved)
     return (
         f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}, its drift factor; "
         f"at {top} the factor is {measured} measured directly against {first}, and {fitted} by the curve through all "
@@ -97,7 +97,7 @@ def _headline(record: Calibration, prefix: str) -> str:
 
 
 def _per_g(record: Calibration, name: str) -> str:
-    K = record.parameters[name]
+    K = record.parameter(name)
     value, u = format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
     return f"{value} ± {u} deg/h per g"
 
@@ -112,10 +112,9 @@ def _curve_change(record: Calibration, prefix: str, force: float) -> float:
     names = [n for n in (f"{prefix}c1", f"{prefix}c2") if n in record.parameters]
     if not names:
         return 0.0
-    order = [record.covariance.names.index(n) for n in names]
-    C = record.covariance.array()[np.ix_(order, order)]
+    C = record.covariance.block(names)
     gradient = np.array([force if n.endswith("c1") else force**2 for n in names])
-    return float(np.sqrt(gradient @ C @ gradient))
+    return float(np.sqrt(max(gradient @ C @ gradient, 0.0)))
 
 
 def curve_at(record: Calibration, prefix: str, force: Array) -> tuple[Array, Array]:
@@ -125,8 +124,7 @@ def curve_at(record: Calibration, prefix: str, force: Array) -> tuple[Array, Arr
     }
     K = curve(force, **terms)
     names = [n for n in ("K0", "c1", "c2") if f"{prefix}{n}" in record.parameters]
-    order = [record.covariance.names.index(f"{prefix}{n}") for n in names]
-    C = record.covariance.array()[np.ix_(order, order)]
+    C = record.covariance.block([f"{prefix}{n}" for n in names])
     gradient = {"K0": K / terms["K0"], "c1": terms["K0"] * force, "c2": terms["K0"] * force**2}
     J = np.stack([gradient[n] for n in names], axis=1)
     return K, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
@@ -135,16 +133,17 @@ def curve_at(record: Calibration, prefix: str, force: Array) -> tuple[Array, Arr
 def _facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
     facts = []
     for prefix in sets[:2]:
-        K0 = record.parameters[f"{prefix}K0"]
+        K0 = record.parameter(f"{prefix}K0")
         value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G, digits=1)
         digits = u.replace(".", "").lstrip("0")
         facts.append((f"K0 {_label(prefix)}, deg/h/g", f"{value}({digits})"))
-    loaded = [row for row in record.sections["runs"] if row["role"] == "loaded"]
+    r = centrifuge_of(record)
+    loaded = [row for row in r.runs if row.role == "loaded"]
     facts += [
-        ("curve", ", ".join(dict.fromkeys(str(m) for m in record.model["curve"].values()))),
-        ("levels", str(len(record.sections["levels"]))),
+        ("curve", ", ".join(dict.fromkeys(r.model.curve.values()))),
+        ("levels", str(len(r.levels))),
         ("loaded runs", str(len(loaded))),
-        ("highest level", _g(record.model["highest_specific_force"]["value"])),
+        ("highest level", _g(r.model.highest_specific_force.value)),
     ]
     return facts
 
@@ -172,7 +171,7 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
     for number, prefix in enumerate(shown):
         axis = "" if number == 0 else str(number + 1)
         levels = numbers(record, prefix)
-        force = np.array([_force(record, level) for level in levels])
+        force = np.array([force_of(record, level) for level in levels])
         grid = np.linspace(0.0, 1.02 * force.max(), _POINTS)
         K0 = record.value(f"{prefix}K0")
         K, _ = curve_at(record, prefix, grid)
@@ -189,10 +188,10 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
                 showlegend=number == 0, **where),
         ]  # fmt: skip
         measured = np.array([record.value(f"{prefix}K_{level}") for level in levels])
-        factors = record.fit["coverage_factor_95"]
+        factors = centrifuge_of(record).fit.coverage_factor_95
         u = np.array(
             [
-                (record.parameters[f"{prefix}K_{level}"].standard_uncertainty or 0.0) * factors[f"{prefix}K_{level}"]
+                (record.parameter(f"{prefix}K_{level}").standard_uncertainty or 0.0) * factors[f"{prefix}K_{level}"]
                 for level in levels
             ]
         )
@@ -206,9 +205,7 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
         if later:
             zeta = [100 * record.value(f"{prefix}zeta_{level}") for level in later]
             bars = [
-                100
-                * (record.parameters[f"{prefix}zeta_{n}"].standard_uncertainty or 0.0)
-                * factors[f"{prefix}zeta_{n}"]
+                100 * (record.parameter(f"{prefix}zeta_{n}").standard_uncertainty or 0.0) * factors[f"{prefix}zeta_{n}"]
                 for n in later
             ]
             spread = 0.012 * float(force.max()) / STANDARD_GRAVITY
@@ -255,15 +252,15 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
         mark = "" if number == 0 else str(number + 1)
         where = {"xaxis": f"x{mark}", "yaxis": f"y{mark}"}
         key = prefix[0] if "down" not in prefix else f"{prefix[0]}_down"
-        rows = [row for row in record.sections["levels"] if key in row]
-        z = np.array([complex(row[key]["A"], row[key]["B"]) for row in rows]) * PER_G
-        force = [from_si(row["specific_force"]["value"], "g") for row in rows]
+        rows = [(row, line) for row in centrifuge_of(record).levels if (line := row.line(key)) is not None]
+        if not rows:
+            raise RecordError(f"the record lacks levels with {key}")
+        z = np.array([complex(line.A, line.B) for _, line in rows]) * PER_G
+        force = [from_si(row.specific_force.value, "g") for row, _ in rows]
         angle = np.linspace(0, 2 * np.pi, 49)
-        for index, row in enumerate(rows):
-            C = np.array(row[key]["covariance"]) * PER_G**2
-            ring = np.linalg.cholesky(C + 1e-12 * np.trace(C) * np.eye(2) + 1e-30 * np.eye(2)) @ np.array(
-                [np.cos(angle), np.sin(angle)]
-            )
+        for index, (_, line) in enumerate(rows):
+            size, axes = np.linalg.eigh(np.array(line.covariance) * PER_G**2)
+            ring = axes * np.sqrt(np.maximum(size, 0.0)) @ np.array([np.cos(angle), np.sin(angle)])
             ring *= 2.448  # 95 % of a two-dimensional normal distribution
             traces.append(
                 _scatter(z[index].real + ring[0], z[index].imag + ring[1], "95 % region", mode="lines",
@@ -299,25 +296,28 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
     return Figure("Complex drift factor of each level", caption, traces, layout, height=440)
 
 
-def _repeatability(record: Calibration, sets: list[str]) -> Figure:
+def _repeatability(record: Calibration, r: Centrifuge, sets: list[str]) -> Figure:
     """K of every run against its level's K, by power cycle."""
     traces: list[dict[str, Any]] = []
     axes = list(dict.fromkeys(p[0] for p in sets))
-    cycles = sorted({row["power_cycle"] for row in record.sections["runs"] if row["role"] == "loaded"})
-    level_of = {run: row for row in record.sections["levels"] for run in row["runs"]}
+    cycles = sorted({row.power_cycle for row in r.runs if row.role == "loaded"})
+    number_of = {run: row.level for row in r.levels for run in row.runs}
     for number, axis in enumerate(axes):
         mark = "" if number == 0 else str(number + 1)
         for cycle_number, cycle in enumerate(cycles):
             x, y, bars = [], [], []
-            for index, run in enumerate(record.sections["runs"]):
-                if run["role"] != "loaded" or run["power_cycle"] != cycle or "K" not in run.get(axis, {}):
+            for index, run in enumerate(r.runs):
+                found = run.line(axis)
+                if run.role != "loaded" or run.power_cycle != cycle or found is None or found.K is None:
                     continue
-                prefix = f"{axis}_" + ("down_" if run["spin_axis"] == "down" else "")
-                level = level_of[index]
-                K = record.value(f"{prefix}K_{level['level']}")
-                x.append(level["level"] + 0.5 * ((cycle_number + 0.5) / len(cycles) - 0.5) + 0.06 * (run["sense"] < 0))
-                y.append(100 * (run[axis]["K"]["value"] / K - 1))
-                bars.append(100 * run[axis]["K"]["standard_uncertainty"] / K)
+                prefix = f"{axis}_" + ("down_" if run.spin_axis == "down" else "")
+                if index not in number_of:
+                    raise RecordError(f"levels: none has run {index}")
+                level = number_of[index]
+                K = record.value(f"{prefix}K_{level}")
+                x.append(level + 0.5 * ((cycle_number + 0.5) / len(cycles) - 0.5) + 0.06 * (run.sense < 0))
+                y.append(100 * relative(found.K.value, K))
+                bars.append(100 * (relative(found.K.standard_uncertainty or 0.0, K) + 1))
             colour = _CYCLES[cycle_number % len(_CYCLES)]
             traces.append(
                 _scatter(x, y, f"power cycle {cycle}", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
@@ -326,21 +326,19 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
                          showlegend=number == 0)
             )  # fmt: skip
     layout = _panels([f"{axis.upper()}: K off its level, %" for axis in axes], "level (number)")
-    ticks = [row["level"] for row in record.sections["levels"]]
-    texts = [
-        f"{row['level']}<br>{from_si(row['specific_force']['value'], 'g'):.3g} g" for row in record.sections["levels"]
-    ]
+    ticks = [row.level for row in r.levels]
+    texts = [f"{row.level}<br>{from_si(row.specific_force.value, 'g'):.3g} g" for row in r.levels]
     for number in range(len(axes)):
         mark = "" if number == 0 else str(number + 1)
         layout[f"xaxis{mark}"] |= {"tickvals": ticks, "ticktext": texts}
         layout[f"yaxis{mark}"] |= {"zeroline": True, "zerolinecolor": QUIET}
-    found = record.fit["repeatability"]
+    spread = r.fit.repeatability
     words = [
         f"{what} by {size:.2g} {unit} beyond their noise"
         for what, size, unit in (
-            ("K differs from cycle to cycle", 100 * found["relative_standard_deviation"], "%"),
-            ("its direction", np.degrees(found["direction"]["value"]), "deg"),
-            ("K differs from run to run", 100 * found["within_power_cycle"], "%"),
+            ("K differs from cycle to cycle", 100 * spread.relative_standard_deviation, "%"),
+            ("its direction", np.degrees(spread.direction.value), "deg"),
+            ("K differs from run to run", 100 * spread.within_power_cycle, "%"),
         )
         if size
     ]
@@ -350,28 +348,32 @@ def _repeatability(record: Calibration, sets: list[str]) -> Figure:
     return Figure("Repeatability over power cycles", caption, traces, layout, height=400)
 
 
-def _spectra(record: Calibration) -> list[Figure]:
+def _spectra(r: Centrifuge) -> list[Figure]:
     """Spectra of X, FOG and residual around the table rate, at the lowest, a middle and the highest level."""
-    found = [s for s in record.data["spectra"] if s["spin_axis"] == record.data["spectra"][0]["spin_axis"]]
+    found = [spectrum for spectrum in r.data.spectra if spectrum.spin_axis == r.data.spectra[0].spin_axis]
+    if not found:
+        return []
     picked = sorted({0, len(found) // 2, len(found) - 1})[:_SHOWN_SPECTRA]
-    by_level = {row["level"]: row for row in record.sections["levels"]}
     traces: list[dict[str, Any]] = []
     titles, annotations = [], []
     for number, index in enumerate(picked):
         spectrum = found[index]
         mark = "" if number == 0 else str(number + 1)
-        rate = from_si(np.array(spectrum["rate"]), "deg/s")
+        rate = from_si(np.array(spectrum.rate), "deg/s")
         lines = zip(_SPECTRA, (QUIET, "#b8860b", GOOD), ("solid", "dot", "dash"), strict=True)
         for (name, label), colour, dash in lines:
-            height = np.maximum(from_si(np.array(spectrum["height"][name]), "deg/h"), 1e-6)
+            height = np.maximum(from_si(np.array(spectrum.height[name]), "deg/h"), 1e-6)
             width = 2.4 if name == "residual_x" else 1.6
             traces.append(
                 _scatter(rate, height, label, mode="lines", line={"color": colour, "width": width, "dash": dash},
                          xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0)
             )  # fmt: skip
-        row = by_level[spectrum["level"]]
-        key = "x" if spectrum["spin_axis"] == "up" else "x_down"
-        K, a = abs(complex(row[key]["A"], row[key]["B"])), row["specific_force"]["value"]
+        row = level_of(r.levels, spectrum.level)
+        key = "x" if spectrum.spin_axis == "up" else "x_down"
+        drift, a = row.line(key), row.specific_force.value
+        if drift is None:
+            raise RecordError(f"level {row.level} lacks {key}")
+        K = abs(complex(drift.A, drift.B))
         line = from_si(K * a, "deg/h")
         centre = float(np.median(rate))
         traces.append(

@@ -60,6 +60,10 @@ class CycleRow(Part):
     x_down: dict[str, Quantity] = field(default_factory=dict)
     y_down: dict[str, Quantity] = field(default_factory=dict)
 
+    def of(self, key: str) -> dict[str, Quantity]:
+        """Return the values of ``x``, ``y``, ``x_down`` or ``y_down``."""
+        return {"x": self.x, "y": self.y, "x_down": self.x_down, "y_down": self.y_down}[key]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Error(Part):
@@ -112,6 +116,10 @@ class Level(Part):
     x_down: Line | None = None
     y_down: Line | None = None
 
+    def line(self, key: str) -> Line | None:
+        """Return the drift of ``x``, ``y``, ``x_down`` or ``y_down``."""
+        return {"x": self.x, "y": self.y, "x_down": self.x_down, "y_down": self.y_down}[key]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run(Part):
@@ -130,6 +138,10 @@ class Run(Part):
     x: Line | None = None
     y: Line | None = None
     fog: Line
+
+    def line(self, axis: str) -> Line | None:
+        """Return the line of ``x`` or ``y``."""
+        return {"x": self.x, "y": self.y}[axis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +182,11 @@ def check(record: Calibration) -> None:
     centrifuge_of(record)
 
 
+def highest_force(record: Calibration) -> float:
+    """Return the specific force of the highest level, m/s^2; errors as for `centrifuge_of`."""
+    return max(float(level.specific_force.value) for level in centrifuge_of(record).levels)
+
+
 def level_of(levels: list[Level], number: int) -> Level:
     """Return the level of this number.
 
@@ -182,3 +199,8 @@ def level_of(levels: list[Level], number: int) -> Level:
         if level.level == number:
             return level
     raise RecordError(f"levels: level {number} is missing")
+
+
+def force_of(record: Calibration, number: int) -> float:
+    """Return the specific force of a level, m/s^2; errors as for `level_of`."""
+    return float(level_of(centrifuge_of(record).levels, number).specific_force.value)

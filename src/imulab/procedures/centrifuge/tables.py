@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from imulab.procedures.centrifuge.sections import CycleRow, Error, Fit, Level, Line, Run
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Table, format_uncertain, plain_number
 from imulab.units import STANDARD_GRAVITY, from_si
@@ -32,38 +31,36 @@ _BUDGET = {
 }
 
 
-def parameters_table(record: Calibration) -> Table:
+def parameters_table(record: Calibration, fit: Fit) -> Table:
     """Return every parameter with its uncertainty and interval."""
     rows = []
-    factors = record.fit["coverage_factor_95"]
-    freedom = record.fit["degrees_of_freedom"]
     for name, parameter in record.parameters.items():
-        stem = next(part for part in name.split("_")[1:] if part != "down")
-        factor, unit = _ENGINEERING[stem]
+        stem = next((part for part in name.split("_")[1:] if part != "down"), "")
+        factor, unit = _ENGINEERING.get(stem, (1.0, parameter.unit))
         value, u = parameter.value * factor, (parameter.standard_uncertainty or 0.0) * factor
-        ends = " to ".join(format_uncertain(value + sign * factors[name] * u, u)[0] for sign in (-1, 1))
-        nu = freedom[name]
+        ends = " to ".join(format_uncertain(value + sign * fit.coverage_factor_95[name] * u, u)[0] for sign in (-1, 1))
+        nu = fit.degrees_of_freedom[name]
         rows.append([name, *format_uncertain(value, u), ends, unit, "many" if nu > 999 else f"{nu:.0f}"])
     return Table(
         title="Parameters",
         caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a "
         "term that is absent is 0; "
-        f"direction: from X toward Y. Noise: {record.fit['noise']}; 95 % intervals by Student's t.",
+        f"direction: from X toward Y. Noise: {fit.noise}; 95 % intervals by Student's t.",
         columns=["parameter", "value", "standard uncertainty", "95 % interval", "unit", "degrees of freedom"],
         rows=rows,
     )
 
 
-def level_table(record: Calibration, sets: list[str]) -> Table:
+def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> Table:
     """Return K and zeta at each level."""
     columns = ["level", "specific force, g", "runs"]
     for prefix in sets:
         label = prefix.rstrip("_").replace("_", " ")
         columns += [f"K {label}, deg/h/g", "u", f"zeta {label}, %", "u"]
     rows = []
-    for level in record.sections["levels"]:
-        number = level["level"]
-        row = [str(number), f"{from_si(level['specific_force']['value'], 'g'):.4g}", str(len(level["runs"]))]
+    for level in levels:
+        number = level.level
+        row = [str(number), f"{from_si(level.specific_force.value, 'g'):.4g}", str(len(level.runs))]
         for prefix in sets:
             K = record.parameters.get(f"{prefix}K_{number}")
             zeta = record.parameters.get(f"{prefix}zeta_{number}")
@@ -79,15 +76,15 @@ def level_table(record: Calibration, sets: list[str]) -> Table:
     return Table("K and zeta at each level", "u: standard uncertainty. All zeta share the error of K_1.", columns, rows)
 
 
-def curve_table(record: Calibration, sets: list[str]) -> Table:
+def curve_table(fit: Fit, sets: list[str]) -> Table:
     """Return the models of the curve that were tried."""
     rows = []
     for prefix in sets:
-        found = record.fit["curves"][prefix.rstrip("_")]
+        found = fit.curves[prefix.rstrip("_")]
         axis = prefix.rstrip("_").replace("_", " ")
         rows += [
-            [axis, each["model"], str(each["coefficients"]), f"{each['chi_square']:.2f}", "chosen" * each["chosen"]]
-            for each in found["tried"]
+            [axis, each.model, str(each.coefficients), f"{each.chi_square:.2f}", "chosen" * each.chosen]
+            for each in found.tried
         ]
     return Table(
         "Terms of the curve",
@@ -98,24 +95,23 @@ def curve_table(record: Calibration, sets: list[str]) -> Table:
     )
 
 
-def cycle_tables(record: Calibration) -> list[Table]:
+def cycle_tables(cycles: list[CycleRow]) -> list[Table]:
     """Return zeta of each power cycle by itself, where there are several; older records do not hold it."""
-    cycles = record.fit.get("power_cycles", [])
     if len(cycles) < 2:
         return []
-    sets = [key for key in ("x", "y", "x_down", "y_down") if any(key in cycle for cycle in cycles)]
-    names = [name for name in dict.fromkeys(n for c in cycles for n in c.get(sets[0], {})) if "zeta" in name]
+    sets = [key for key in ("x", "y", "x_down", "y_down") if any(cycle.of(key) for cycle in cycles)]
+    names = [n for n in dict.fromkeys(n for c in cycles for key in sets[:1] for n in c.of(key)) if "zeta" in n]
     if not names:
         return []
     rows = []
     for cycle in cycles:
         for key in sets:
-            found = cycle.get(key, {})
+            found = cycle.of(key)
             cells = [
-                " ± ".join(format_uncertain(100 * z["value"], 100 * z["standard_uncertainty"])) if z else "–"
+                " ± ".join(format_uncertain(100 * z.value, 100 * (z.standard_uncertainty or 0.0))) if z else "–"
                 for z in (found.get(name) for name in names)
             ]
-            rows.append([str(cycle["power_cycle"]), key.replace("_", " "), *cells])
+            rows.append([str(cycle.power_cycle), key.replace("_", " "), *cells])
     return [
         Table(
             "zeta of each power cycle, %",
@@ -126,14 +122,14 @@ def cycle_tables(record: Calibration) -> list[Table]:
     ]
 
 
-def budget_table(record: Calibration) -> Table:
+def budget_table(fit: Fit) -> Table:
     """Return the error budget."""
     rows = []
-    for entry in record.fit["error_budget"]:
-        factor, unit = _BUDGET[entry["unit"]]
+    for entry in fit.error_budget:
+        factor, unit = _BUDGET.get(entry.unit, (1.0, entry.unit))
         rows.append(
-            [entry["error"], "yes" if entry["bounded"] else "no", *_sized(entry, factor), unit, _share(entry["effect"]),
-             "–" if entry["removed"] is None else _share(entry["removed"]), entry["basis"]]
+            [entry.error, "yes" if entry.bounded else "no", *_sized(entry, factor), unit, _share(entry.effect),
+             "–" if entry.removed is None else _share(entry.removed), entry.basis]
         )  # fmt: skip
     return Table(
         "Error budget (X axis)",
@@ -144,13 +140,18 @@ def budget_table(record: Calibration) -> Table:
     )
 
 
-def _sized(entry: dict[str, Any], factor: float) -> tuple[str, str]:
-    value, u = entry["value"], entry["standard_uncertainty"]
+def _sized(entry: Error, factor: float) -> tuple[str, str]:
+    value, u = entry.value, entry.standard_uncertainty
     if value is None:
         return "–", "–" if u is None else plain_number(u * factor, 2)
     if u is None or u == 0:
         return plain_number(value * factor, 3), "–"
     return format_uncertain(value * factor, u * factor)
+
+
+def relative(value: float, other: float) -> float:
+    """Return how much larger a value is than another, as a share; nan where that is 0."""
+    return value / other - 1 if other else float("nan")
 
 
 def _share(value: float) -> str:
@@ -160,33 +161,32 @@ def _share(value: float) -> str:
     return "< 0.0001 %" if percent < 1e-4 else f"{plain_number(percent, 2)} %"
 
 
-def run_table(record: Calibration) -> Table:
+def run_table(runs: list[Run]) -> Table:
     """Return what was measured in each run; a column that says the same of all runs goes to the caption."""
-    runs = record.sections["runs"]
-    axes = [axis for axis in "xy" if any(axis in run for run in runs)]
-    origins = list(dict.fromkeys(run["table_rate_from"] for run in runs if run["role"] == "loaded"))
-    said = ["cycle"] * (len({run["power_cycle"] for run in runs}) > 1)
-    said += ["spin axis"] * (len({run["spin_axis"] for run in runs}) > 1)
+    axes = [axis for axis in "xy" if any(run.line(axis) is not None for run in runs)]
+    origins = list(dict.fromkeys(run.table_rate_from for run in runs if run.role == "loaded"))
+    said = ["cycle"] * (len({run.power_cycle for run in runs}) > 1)
+    said += ["spin axis"] * (len({run.spin_axis for run in runs}) > 1)
     columns = ["run", "file", *said, "g", "sense", "table rate, deg/s"]
     columns += ["from"] * (len(origins) > 1)
     columns += ["periods"]
     columns += [*(f"{axis.upper()} drift ± u, deg/h" for axis in axes), "FOG line, deg/h"]
     rows = []
     for index, run in enumerate(runs):
-        row = [str(index + 1), " ".join([run["file"], *([run["window"]] if "window" in run else [])])]
-        row += [str(run["power_cycle"] if name == "cycle" else run["spin_axis"]) for name in said]
-        if run["role"] == "static":
+        row = [str(index + 1), " ".join([run.file, *([] if run.window is None else [run.window])])]
+        row += [str(run.power_cycle if name == "cycle" else run.spin_axis) for name in said]
+        if run.role == "static":
             rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])
             continue
         row += [
-            f"{from_si(run['specific_force']['value'], 'g'):.4g}",
-            f"{run['sense']:+d}",
-            f"{from_si(run['table_rate_used']['value'], 'deg/s'):.5f}",
+            f"{from_si(run.specific_force.value, 'g'):.4g}",
+            f"{run.sense:+d}",
+            f"{from_si(run.table_rate_used.value, 'deg/s'):.5f}",
         ]
-        row += [run["table_rate_from"]] * (len(origins) > 1)
-        row += [f"{run['periods']:.0f}"]
-        row += [" ± ".join(_line(run[axis])) for axis in axes]
-        rows.append([*row, _line(run["fog"])[0]])
+        row += [run.table_rate_from] * (len(origins) > 1)
+        row += [f"{run.periods:.0f}"]
+        row += ["–" if (line := run.line(axis)) is None else " ± ".join(_line(line)) for axis in axes]
+        rows.append([*row, _line(run.fog)[0]])
     source = f" Table rates from: {origins[0]}." if len(origins) == 1 else ""
     caption = (
         "Drift: what X and Y show at the table rate, less what the FOG shows there (rotation), with its standard "
@@ -195,7 +195,7 @@ def run_table(record: Calibration) -> Table:
     return Table("Runs", caption, columns, rows)
 
 
-def _line(entry: dict[str, Any]) -> tuple[str, str]:
-    size = from_si(float(np.hypot(entry["A"], entry["B"])), "deg/h")
-    u = from_si(float(np.sqrt(np.trace(np.array(entry["covariance"])) / 2)), "deg/h")
+def _line(entry: Line) -> tuple[str, str]:
+    size = from_si(float(np.hypot(entry.A, entry.B)), "deg/h")
+    u = from_si(float(np.sqrt(max(np.trace(np.array(entry.covariance)), 0.0) / 2)), "deg/h")
     return format_uncertain(size, u)
