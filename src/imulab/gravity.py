@@ -247,6 +247,16 @@ def normal_gravity(latitude: float, height: float = 0.0) -> float:
     ------
     OptionError
         Latitude or height out of range.
+
+    Examples
+    --------
+    On the equator, at the poles, and a kilometre above the latitude of 45 degrees:
+
+    >>> import math
+    >>> import imulab as il
+    >>> latitudes = (0.0, math.pi / 2, math.pi / 4)
+    >>> [round(il.normal_gravity(at, height), 5) for at, height in zip(latitudes, (0.0, 0.0, 1000.0))]
+    [9.78033, 9.83218, 9.80311]
     """
     if not abs(latitude) <= math.pi / 2 * (1 + 1e-12):
         raise OptionError(f"latitude {math.degrees(latitude):g} deg: expected -90 to 90 deg")

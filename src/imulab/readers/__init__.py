@@ -72,6 +72,14 @@ def read(
         The file cannot be read; the message names file, row and column.
     OptionError
         The file has no such topic, instance, element or window.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.write_csv(il.simulate_tumble(gravity=9.81), "tumble.csv")
+    >>> recording = il.read("tumble.csv")
+    >>> recording.units["gyro_x"], recording.metadata["gravity"], recording.source.file
+    ('deg/s', '9.81 m/s^2', 'tumble.csv')
     """
     selection = Selection(topic, instance, window, element)
     name, known = name or _name(file), _layout(layout)

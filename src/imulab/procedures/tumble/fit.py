@@ -131,6 +131,16 @@ def fit_tumble(
         An option has an unknown value, or does not go with another.
     RecordError
         The prior lacks a parameter, or has outputs in another unit.
+
+    Examples
+    --------
+    A simulated unit, whose true bias stands in the recording's head:
+
+    >>> import imulab as il
+    >>> recording = il.simulate_tumble(gravity=9.81)
+    >>> fit = il.fit_tumble(il.find_attitudes(recording), order=1, gravity=9.81)
+    >>> abs(fit.calibration.parameters["bias_x"].value - float(recording.metadata["truth_bias_x"])) < 1e-3
+    True
     """
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
