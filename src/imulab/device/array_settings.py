@@ -16,7 +16,6 @@ from imulab.recording import Array
 MOST_ELEMENTS = 64
 MOST_COUNT = 1_000_000_000
 """Largest starting count of the growing memory."""
-_LEAST_WHITE = 0.05
 
 
 @dataclass(frozen=True)
@@ -180,21 +179,3 @@ def _shaped(values: Any, shape: tuple[int, ...], name: str) -> Array | None:
     if not np.isfinite(found).all():
         raise OptionError(f"{name}: expected finite numbers")
     return found.reshape(shape)
-
-
-def element_white_noise(sections: Mapping[str, Any]) -> Array:
-    """Return the angle random walk of each element, rad/s s^1/2, shape (axes, n), from the sections of a record.
-
-    Where it is not determined, or next to nothing, it is what the covariance at its averaging time would be as white
-    noise: a weight needs a size.
-    """
-    shared = sections["correlation"]
-    variance = np.array([np.diag(matrix) for matrix in shared["covariance"]], dtype=np.float64)
-    size: Array = np.sqrt(variance * shared["averaging_time"]["value"])
-    found = [
-        np.atleast_1d(np.array(element["angle_random_walk"]["value"], dtype=np.float64))
-        for element in sections["elements"]
-    ]
-    white = np.array(found).T
-    known: Array = np.where(np.isnan(white), size, np.maximum(white, _LEAST_WHITE * size))
-    return known

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from imulab.errors import RecordError
 from imulab.procedures.gyro_array.health import JUMPED, NON_FINITE, STUCK
 from imulab.procedures.gyro_array.model import unit_of_angle
+from imulab.procedures.gyro_array.sections import ComparisonRecord, comparison_of
 from imulab.procedures.gyro_array.traces import DASHES, MARGIN, allan_trace, axis, log_axis, of_axis
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, Table, plain_number
@@ -29,42 +31,41 @@ _NUMBER = {method: number for number, method in enumerate(_PALETTE)}
 
 def exhibits_of_comparison(record: Calibration) -> Exhibits:
     """Return what a report on a comparison shows."""
-    data, model = record.data, record.model
-    found = {method: rows for method, rows in data["figures"].items() if not isinstance(rows, str)}
-    best = found.get("robust") or found["mean"]
+    held = comparison_of(record)
+    data, model = held.data, held.model
+    found = {method: rows for method, rows in data.figures.items() if not isinstance(rows, str)}
     name = "robust" if "robust" in found else "mean"
-    unit = model["units"][0]
-    reduction = float(np.mean([row["reduction"] or 0.0 for row in best]))
+    best = found.get(name)
+    if best is None:
+        raise RecordError("the record holds figures of neither robust nor mean")
+    unit = model.units[0]
+    reduction = float(np.mean([row.reduction or 0.0 for row in best]))
     broken = [
         name
-        for row, working in zip(data["readings_names"], data.get("working", data["readings_names"]), strict=True)
+        for row, working in zip(data.readings_names, data.working or data.readings_names, strict=True)
         for name in row
         if name not in working
     ]
     facts = [
-        ("gyros", f"{model['elements']} × {len(model['axes'])} {'axes' if len(model['axes']) > 1 else 'axis'}"),
+        ("gyros", f"{model.elements} × {len(model.axes)} {'axes' if len(model.axes) > 1 else 'axis'}"),
         (
             "single gyro" if not broken else "working single gyro",
-            f"{plain_number(float(np.mean(data['single'])), 3)} {unit}",
+            f"{plain_number(float(np.mean(data.single)), 3)} {unit}",
         ),
-        (name, f"{plain_number(float(np.mean([row['rate_std'] for row in best])), 3)} {unit}"),
-        ("noise / limit", plain_number(float(np.mean([row["over_limit"] for row in best])), 3)),
-        ("truth", "column" if model["truth"].startswith("column") else "still unit"),
-        ("calibrated", "yes" if model["calibrated"] else "no"),
+        (name, f"{plain_number(float(np.mean([row.rate_std for row in best])), 3)} {unit}"),
+        ("noise / limit", plain_number(float(np.mean([row.over_limit for row in best])), 3)),
+        ("truth", "column" if model.truth.startswith("column") else "still unit"),
+        ("calibrated", "yes" if model.calibrated else "no"),
     ]
-    items: list[Figure | Table] = [_methods_table(record, a) for a in range(len(model["axes"]))]
-    for a in range(len(model["axes"])):
-        items += [_allan_methods(record, a), _angles(record, a)]
-        if data["health"]:
-            items.append(_health(record, a))
+    items: list[Figure | Table] = [_methods_table(held, a) for a in range(len(model.axes))]
+    for a in range(len(model.axes)):
+        items += [_allan_methods(held, a), _angles(held, a)]
+        if data.health.known:
+            items.append(_health(held, a))
     return Exhibits(
-        headline=f"Fusing {model['elements']} gyros by {name} makes the rate {plain_number(reduction, 3)} times "
+        headline=f"Fusing {model.elements} gyros by {name} makes the rate {plain_number(reduction, 3)} times "
         f"quieter than the mean single gyro{_that_works(broken)}; "
-        + (
-            "the common bias was calibrated."
-            if model["calibrated"]
-            else "the bias that all share remains: calibrate it."
-        ),
+        + ("the common bias was calibrated." if model.calibrated else "the bias that all share remains: calibrate it."),
         facts=facts,
         items=items,
     )
@@ -78,13 +79,13 @@ def _that_works(broken: list[str]) -> str:
     return f" that works ({named} did not)"
 
 
-def _methods_table(record: Calibration, a: int) -> Table:
+def _methods_table(record: ComparisonRecord, a: int) -> Table:
     data, model = record.data, record.model
-    unit = model["units"][a]
+    unit = model.units[a]
     angle, factor = unit_of_angle(unit)
-    halves = any(not isinstance(rows, str) and rows[a]["split_half"] is not None for rows in data["figures"].values())
+    halves = any(not isinstance(rows, str) and rows[a].split_half is not None for rows in data.figures.values())
     rows, highlight = [], None
-    for number, (method, found) in enumerate(data["figures"].items()):
+    for number, (method, found) in enumerate(data.figures.items()):
         if method == "robust":
             highlight = number
         if isinstance(found, str):
@@ -92,12 +93,12 @@ def _methods_table(record: Calibration, a: int) -> Table:
             continue
         row = found[a]
         values = [
-            row["rate_std"], row["rate_max"], factor * row["angle_std"], factor * row["angle_max"], row["reduction"],
-            row["over_limit"], row["bandwidth"], *([row["split_half"]] if halves else []),
+            row.rate_std, row.rate_max, factor * row.angle_std, factor * row.angle_max, row.reduction,
+            row.over_limit, row.bandwidth, *([row.split_half] if halves else []),
         ]  # fmt: skip
         rows.append([method, *("–" if v is None else plain_number(v, 3) for v in values)])
     return Table(
-        title=f"Methods{of_axis(model['axes'][a])}",
+        title=f"Methods{of_axis(model.axes[a])}",
         caption=f"Rates in {unit}, angles in {angle}. Rate error (standard deviation with the mean removed) and angle "
         "error against the truth; reduction of noise against the mean single gyro that works; noise from sample to "
         "sample over the limit of any fixed weights; bandwidth at −3 dB. Lower noise with less bandwidth, or below the "
@@ -122,20 +123,26 @@ def _width(method: str) -> float:
     return 3.0 if method == "robust" else 1.5
 
 
-def _allan_methods(record: Calibration, a: int) -> Figure:
-    unit = record.model["units"][a]
-    curves = record.data["allan"]
+def _allan_methods(record: ComparisonRecord, a: int) -> Figure:
+    unit = record.model.units[a]
+    curves = record.data.allan
     order = ["single gyro", *[m for m in curves if m not in ("single gyro", "robust")], "robust"]
     traces = [
-        allan_trace(curves[m][a], m, _PALETTE[m], 1.0, _width(m), number=_NUMBER[m]) for m in order if m in curves
+        allan_trace(curves[m][a], m, _PALETTE.get(m, INK), 1.0, _width(m), number=_NUMBER.get(m, 0))
+        for m in order
+        if m in curves
     ]
-    first = {m: next(d for d in curves[m][a]["deviation"] if d > 0) for m in curves if any(curves[m][a]["deviation"])}
+    first = {
+        m: next(d for d in curves[m][a].deviation if d > 0)
+        for m in curves
+        if max(curves[m][a].deviation, default=0.0) > 0
+    }
     quiet = min(first, key=first.__getitem__, default="")
     return Figure(
         message=f"At the shortest time {quiet} is the quietest, {plain_number(first[quiet], 2)} {unit}."
         if quiet
         else "",
-        title=f"Allan deviation of each method{of_axis(record.model['axes'][a])}",
+        title=f"Allan deviation of each method{of_axis(record.model.axes[a])}",
         caption="On the left, how quiet a sample is: a curve that bends down there is low-pass filtered. On the "
         "right, what the angle drifts by: no weighting changes the bias that all gyros share.",
         traces=traces,
@@ -149,27 +156,33 @@ def _allan_methods(record: Calibration, a: int) -> Figure:
     )
 
 
-def _angles(record: Calibration, a: int) -> Figure:
-    angle, factor = unit_of_angle(record.model["units"][a])
-    time = record.data["trace_time"]
+def _angles(record: ComparisonRecord, a: int) -> Figure:
+    angle, factor = unit_of_angle(record.model.units[a])
+    time = record.data.trace_time
     traces = [
         {
             "type": "scatter",
             "mode": "lines",
             "x": time,
             "y": [factor * value for value in rows[a]],
-            "line": {"color": _PALETTE[method], "width": _width(method), "dash": DASHES[_NUMBER[method]]},
+            "line": {
+                "color": _PALETTE.get(method, INK),
+                "width": _width(method),
+                "dash": DASHES[_NUMBER.get(method, 0)],
+            },
             "name": method,
             "hovertemplate": f"{method}<br>%{{x:.4g}} s: %{{y:.4g}} {angle}<extra></extra>",
         }
-        for method, rows in sorted(record.data["angle"].items(), key=lambda item: item[0] == "robust")
+        for method, rows in sorted(record.data.angle.items(), key=lambda item: item[0] == "robust")
     ]
-    ends = {method: abs(factor * rows[a][-1]) for method, rows in record.data["angle"].items()}
+    ends = {method: abs(factor * rows[a][-1]) for method, rows in record.data.angle.items()}
+    if not ends:
+        raise RecordError("data.angle: expected the angles of one method or more")
     least, most = min(ends, key=ends.__getitem__), max(ends, key=ends.__getitem__)
     return Figure(
         message=f"At the end {least} is off by {plain_number(ends[least], 2)} {angle}, {most} by "
         f"{plain_number(ends[most], 2)} {angle}.",
-        title=f"Angle error over time{of_axis(record.model['axes'][a])}",
+        title=f"Angle error over time{of_axis(record.model.axes[a])}",
         caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in nothing "
         "that counts for an attitude.",
         traces=traces,
@@ -183,15 +196,15 @@ def _angles(record: Calibration, a: int) -> Figure:
     )
 
 
-def _health(record: Calibration, a: int) -> Figure:
-    health = record.data["health"]
-    names = record.data["readings_names"][a]
-    weight = np.array(health["weight"])[:, a, :].T
-    flags = np.array(health["flags"])[:, a, :]
+def _health(record: ComparisonRecord, a: int) -> Figure:
+    health = record.data.health
+    names = record.data.readings_names[a]
+    weight = np.array(health.weight, dtype=np.float64)[:, a, :].T
+    flags = np.array(health.flags)[:, a, :]
     traces: list[dict[str, Any]] = [
         {
             "type": "heatmap",
-            "x": health["time"],
+            "x": health.time,
             "y": names,
             "z": weight.tolist(),
             "zmin": 0,
@@ -212,7 +225,7 @@ def _health(record: Calibration, a: int) -> Figure:
                 {
                     "type": "scatter",
                     "mode": "markers",
-                    "x": [health["time"][index] for index in k],
+                    "x": [health.time[index] for index in k],
                     "y": [names[index] for index in i],
                     "marker": {"symbol": symbol, "color": colour, "size": 7},
                     "name": label,
@@ -220,7 +233,7 @@ def _health(record: Calibration, a: int) -> Figure:
                 }
             )
     return Figure(
-        title=f"Weight and health of each gyro under robust{of_axis(record.model['axes'][a])}",
+        title=f"Weight and health of each gyro under robust{of_axis(record.model.axes[a])}",
         caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and is "
         "being estimated again.",
         traces=traces,

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.array_settings import ArraySettings, Fusion, array_table, element_white_noise, fusion_of
+from imulab.device.array_settings import ArraySettings, Fusion, array_table, fusion_of
 from imulab.device.tables import Table
 from imulab.device.unit import fuse_table
 from imulab.errors import RecordError
+from imulab.procedures.gyro_array.model import check_calibration
+from imulab.procedures.gyro_array.sections import array_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -26,16 +28,12 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table,
     RecordError
         It is no calibration, or the method has no table.
     """
-    if record.model.get("kind") != "calibration":
-        raise RecordError(f"expected the record of an array calibration, found one of a {record.model.get('kind')}")
-    elements = record.sections["elements"]
-    axes = len(record.model["axes"])
-    white = element_white_noise(record.sections)
+    check_calibration(record)
+    held = array_of(record)
+    white = held.white_noise
     matrices = None
-    if record.model["aligned"]:
-        matrices = np.array(
-            [e["matrix"]["value"] if "matrix" in e else [[1 / e["scale_factor"]["value"]]] for e in elements]
-        )
+    if held.model.aligned:
+        matrices = np.array([element.alignment for element in held.elements])
         white = np.sqrt(np.einsum("nab,bn->an", matrices**2, white**2))
     by = fusion or fusion_of(record.model.get("fusion"))
     weights = None
@@ -43,19 +41,19 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table,
         inverse = 1 / np.maximum(white, 1e-300) ** 2
         weights = inverse / inverse.sum(axis=1, keepdims=True)
     elif by.method == "covariance":
-        weights = np.array(record.sections["correlation"]["weights"], dtype=np.float64)
+        weights = np.array(held.correlation.weights, dtype=np.float64)
     elif by.method == "kalman":
         raise RecordError("method kalman has no table for a unit: expected another method, such as --method robust")
     settings = ArraySettings(
         by.method,
-        len(elements),
-        axes,
-        bias=np.array([np.atleast_1d(element["bias"]["value"]) for element in elements]).T,
+        len(held.elements),
+        len(held.model.axes),
+        bias=np.array([element.bias.values for element in held.elements]).T,
         matrices=matrices,
         weights=weights,
         memory=by.memory,
         start=by.start,
-        rate=float(record.fit["sample_rate"]["value"]),
+        rate=float(held.fit.sample_rate.value),
     )
     table = array_table(settings)
     return (Table(table.kind, table.fields, {**table.columns, **by.to_dict(), "unit": "rad/s", "rate": settings.rate}),)

@@ -27,6 +27,7 @@ from imulab.procedures.gyro_array.model import (
     feedback_notes,
     find_elements,
 )
+from imulab.procedures.gyro_array.sections import model_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import from_si, parse_unit
@@ -247,7 +248,7 @@ class Fuser:
 
     def _aligns(self) -> bool:
         record = self.options.calibration
-        return isinstance(record, Blob) or (record is not None and bool(record.model.get("aligned")))
+        return isinstance(record, Blob) or (record is not None and model_of(record).aligned)
 
     def _fused(self, block: Recording, out: Any, seen: int, elements: Elements) -> Fused:
         time, rate = block.si("time"), out.rate[seen:]

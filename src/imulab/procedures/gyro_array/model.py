@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from imulab.device.array_settings import element_white_noise
 from imulab.errors import DataError, RecordError, UnitError
+from imulab.procedures.gyro_array.sections import array_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
@@ -149,7 +148,7 @@ class ArrayCalibration:
     weights
         Fixed weights ``C^-1 1 / (1' C^-1 1)``, shape (axes, n).
     white, walk
-        Angle random walk, unit s^1/2 (`element_white_noise`), and rate random walk, unit s^-1/2, 0 where it is not
+        Angle random walk, unit s^1/2 (`ArrayRecord.white_noise`), and rate random walk, unit s^-1/2, 0 where it is not
         determined, shape (axes, n).
     """
 
@@ -192,20 +191,6 @@ def check_calibration(record: Calibration, name: str = "the record") -> None:
     if record.procedure != "gyro_array" or record.model.get("kind") != "calibration":
         what = record.model.get("kind", record.procedure) if record.procedure == "gyro_array" else record.procedure
         raise RecordError(f"{name}: expected the record of an array calibration, found one of a {what}")
-    parts: list[tuple[str, Any, tuple[str, ...]]]
-    parts = [("model", record.model, ("axes", "aligned")), ("the record", record.sections, ("elements", "correlation"))]
-    parts += [("correlation", record.sections.get("correlation", {}), ("covariance", "averaging_time", "weights"))]
-    aligned = record.model.get("aligned")
-    for number, element in enumerate(record.sections.get("elements", ())):
-        keys = ("bias", "angle_random_walk", "rate_random_walk", *(("matrix",) if aligned else ()))
-        if aligned and "scale_factor" in element:
-            keys = keys[:-1]
-        parts.append((f"elements[{number}]", element, keys))
-        parts += [(f"elements[{number}].{key}", element[key], ("value",)) for key in keys if key in element]
-    for place, part, keys in parts:
-        missing = [key for key in keys if key not in part]
-        if missing:
-            raise RecordError(f"{name}: {place} lacks {missing[0]}")
 
 
 def array_calibration(record: Calibration, elements: Elements, recording: str = "recording") -> ArrayCalibration:
@@ -219,11 +204,12 @@ def array_calibration(record: Calibration, elements: Elements, recording: str = 
         The readings are not rates.
     """
     check_calibration(record)
-    listed = record.sections.get("elements", [])
-    if len(listed) != elements.count or len(record.model["axes"]) != len(elements.axes):
+    held = array_of(record)
+    listed, axes = held.elements, len(held.model.axes)
+    if len(listed) != elements.count or axes != len(elements.axes):
         raise RecordError(
             f"{recording}: {elements.count} gyros on {count_of_axes(len(elements.axes))}; "
-            f"the record of the calibration holds {len(listed)} on {count_of_axes(len(record.model['axes']))}"
+            f"the record of the calibration holds {len(listed)} on {count_of_axes(axes)}"
         )
     for row, unit in zip(elements.names, elements.units, strict=True):
         if parse_unit(unit).quantity != "rate":
@@ -232,32 +218,23 @@ def array_calibration(record: Calibration, elements: Elements, recording: str = 
     def of(values: Array) -> Array:
         return np.array([from_si(row, unit) for row, unit in zip(values, elements.units, strict=True)])
 
-    def listed_as(key: str) -> Array:
-        return np.array([np.atleast_1d(np.array(e[key]["value"], dtype=np.float64)) for e in listed]).T
-
     matrices = None
-    if record.model["aligned"]:
-        matrices = np.array([_matrix(element) for element in listed])
+    if held.model.aligned:
+        matrices = np.array([element.alignment for element in listed])
         size = np.array([conversion_factor("rad/s", unit) for unit in elements.units])
         matrices *= size[:, None] / size[None, :]
     return ArrayCalibration(
-        bias=of(listed_as("bias")),
+        bias=of(np.array([element.bias.values for element in listed]).T),
         matrices=matrices,
-        weights=np.array(record.sections["correlation"]["weights"]),
-        white=of(element_white_noise(record.sections)),
-        walk=of(np.nan_to_num(listed_as("rate_random_walk"))),
+        weights=np.array(held.correlation.weights),
+        white=of(held.white_noise),
+        walk=of(np.nan_to_num(np.array([element.rate_random_walk.values for element in listed]).T)),
     )
 
 
 def count_of_axes(count: int) -> str:
     """Return ``1 axis`` or ``3 axes``, for messages."""
     return "1 axis" if count == 1 else f"{count} axes"
-
-
-def _matrix(element: dict[str, Any]) -> Array:
-    if "matrix" in element:
-        return np.array(element["matrix"]["value"], dtype=np.float64)
-    return np.array([[1 / element["scale_factor"]["value"]]])
 
 
 def fixed_weights(covariance: Array) -> tuple[Array, float]:

@@ -15,6 +15,7 @@ from imulab.records.sections import Above0, Length, Part, Positive, Quantity, pa
 T = TypeVar("T")
 PerAxis = Annotated[list[T], "axes"]
 PerElement = Annotated[list[T], "elements"]
+_LEAST_WHITE = 0.05
 Square = Annotated[list[Annotated[list[float], "elements"]], "elements"]
 
 
@@ -131,6 +132,19 @@ class ArrayRecord(Part):
     correlation: Correlation
     data: CalibrationData
 
+    @property
+    def white_noise(self) -> Array:
+        """The angle random walk of each element, rad/s s^1/2, shape (axes, n).
+
+        Where it is not determined, or next to nothing, it is what the covariance at its averaging time would be as
+        white noise: a weight needs a size.
+        """
+        variance = np.array([np.diag(matrix) for matrix in np.array(self.correlation.covariance)])
+        size: Array = np.sqrt(variance * self.correlation.averaging_time.value)
+        white = np.array([element.angle_random_walk.values for element in self.elements]).T
+        known: Array = np.where(np.isnan(white), size, np.maximum(white, _LEAST_WHITE * size))
+        return known
+
 
 @dataclass(frozen=True, kw_only=True)
 class MethodRow(Part):
@@ -154,6 +168,11 @@ class Health(Part):
     weight: Annotated[list[PerAxis[PerElement[float | None]]], "times"]
     flags: Annotated[list[PerAxis[PerElement[int]]], "times"]
 
+    @property
+    def known(self) -> bool:
+        """Whether it holds anything."""
+        return "time" in vars(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonData(Part):
@@ -165,7 +184,7 @@ class ComparisonData(Part):
     trace_time: Annotated[list[float], "trace"]
     health: Health
     single: PerAxis[float]
-    working: PerAxis[list[str]]
+    working: PerAxis[list[str]] | None = None
     readings_names: PerAxis[PerElement[str]]
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from imulab.procedures.gyro_array.sections import AllanCurve
+
 MARGIN = {"l": 70, "r": 20, "t": 64, "b": 55}
 """A legend above the plot has room below the buttons in the corner."""
 
@@ -29,10 +31,10 @@ SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-
 
 
 def allan_trace(
-    curve: dict[str, Any], name: str, colour: str, factor: float, width: float = 1.6, *, number: int = 0
+    curve: AllanCurve, name: str, colour: str, factor: float, width: float = 1.6, *, number: int = 0
 ) -> dict[str, Any]:
     """Return a line of deviation times a factor over averaging time, s; values of 0 have no place on a log scale."""
-    known = [(t, d) for t, d in zip(curve["tau"], curve["deviation"], strict=True) if d > 0]
+    known = [(t, d) for t, d in zip(curve.tau, curve.deviation, strict=False) if d > 0]
     return {
         "type": "scatter",
         "mode": "lines+markers",
