@@ -244,6 +244,15 @@ def test_a_parquet_manifest_is_as_good_as_csv(tmp_path):
     assert run(tmp_path / "in" / "manifest.parquet", tmp_path / "out").count("done") == 3
 
 
+def test_a_parquet_manifest_that_is_cut_or_cannot_be_read_is_said(tmp_path, monkeypatch):
+    (tmp_path / "m.parquet").write_bytes(b"PAR1" + bytes(100))
+    with pytest.raises(ReadError, match=r"m\.parquet: not a whole Parquet file"):
+        load_fleet(str(tmp_path / "m.parquet"))
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ReadError, match=r"m\.parquet: Parquet needs pyarrow.*pip install 'imulab\[tables\]'"):
+        load_fleet(str(tmp_path / "m.parquet"))
+
+
 def test_manifest_and_files_may_be_urls(tmp_path, monkeypatch):
     manifest = make_fleet(tmp_path / "in", 2, order=1)
     state = run(manifest.as_uri(), tmp_path / "url")
@@ -345,7 +354,7 @@ def test_other_refusals_name_what_is_wrong_and_leave_nothing(tmp_path, capsys, m
         ([manifest, "-o", "out", "--scheduler", "tcp://x:1"], "--scheduler 'tcp://x:1' needs --engine dask"),
         ([manifest, "-o", "out", "--workers", "0"], "--workers 0: expected 1 or more"),
         ([manifest, "-o", "out", "--workers", "two"], "--workers 'two': expected a whole number"),
-        ([manifest, "-o", "out", "--table", "t.xlsx"], "t.xlsx: expected a table that ends in .csv or .parquet"),
+        ([manifest, "-o", "out", "--table", "t.xlsx"], "t.xlsx: cannot write this kind of file; expected a name that "),
         ([manifest, "-o", "out", "--table", "no/t.csv"], "no/t.csv: cannot be written: no such folder"),
         ([manifest, "-o", "out", "--history", "mysql://x/y"], "history mysql://x/y: expected a URL such as sqlite:///"),
         ([manifest, "-o", "out", "--history", "nothing"], "history 'nothing': expected a URL such as sqlite:///"),

@@ -211,11 +211,11 @@ class Recording:
         return cls(columns=columns, units=units, name=name)
 
     def to_frame(self) -> Any:
-        """Return a polars data frame with columns named ``name [unit]`` (needs the extra ``tables``)."""
+        """Return a polars data frame with columns named ``name [unit]`` (needs polars)."""
         try:
             import polars
         except ImportError:
-            raise DataError("to_frame needs polars: pip install 'imulab[tables]'") from None
+            raise DataError("to_frame needs polars: pip install polars") from None
         return polars.DataFrame({f"{name} [{self.units[name]}]": values for name, values in self.columns.items()})
 
 

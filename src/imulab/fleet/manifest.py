@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from imulab.errors import OptionError, ReadError, listed, several
 from imulab.fleet.sources import local_file, parent_of
 from imulab.procedures.registry import PROCEDURES
+from imulab.readers.formats import library
 
 COLUMNS = ("serial", "procedure", "file")
 _SERIAL = re.compile(r"[^\W_][\w .+=@()-]*")
@@ -109,16 +110,15 @@ def _csv(data: bytes, name: str) -> list[tuple[str, list[str]]]:
 
 
 def _parquet(data: bytes, name: str) -> list[tuple[str, list[str]]]:
+    arrow = library("pyarrow", "Parquet", "tables", name)
+    from pyarrow import parquet
+
     try:
-        import polars
-    except ImportError:
-        raise ReadError(f"{name}: Parquet needs polars: pip install 'imulab[tables]'") from None
-    try:
-        frame = polars.read_parquet(io.BytesIO(data))
-    except (polars.exceptions.PolarsError, OSError) as error:
-        raise ReadError(f"{name}: not a whole Parquet file ({error})") from None
-    rows = [(name, [title.strip() for title in frame.columns])]
-    for number, cells in enumerate(frame.iter_rows(), start=1):
+        table = parquet.read_table(io.BytesIO(data))
+    except (arrow.ArrowException, OSError, ValueError) as error:
+        raise ReadError(f"{name}: not a whole Parquet file ({' '.join(str(error).split())[:160]})") from None
+    rows = [(name, [title.strip() for title in table.column_names])]
+    for number, cells in enumerate(zip(*(column.to_pylist() for column in table.columns), strict=True), start=1):
         rows.append((f"{name}: row {number}", ["" if cell is None else str(cell).strip() for cell in cells]))
     return rows
 

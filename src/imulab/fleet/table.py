@@ -13,6 +13,7 @@ from imulab.atomic_write import real_path, replacing
 from imulab.errors import OptionError
 from imulab.fleet.manifest import Unit
 from imulab.fleet.work import Summary
+from imulab.writers import check_writable
 
 HEAD = ("serial", "procedure", "status", "reason", "warnings", "date", "created", "software", "files", "content_sha256")
 
@@ -61,16 +62,9 @@ def check_table(path: str) -> None:
     Raises
     ------
     OptionError
-        It ends neither in .csv nor in .parquet, polars is not there to write Parquet, or there is no such folder.
+        It ends neither in .csv nor in .parquet, the library for Parquet is not here, or there is no such folder.
     """
-    kind = Path(path).suffix.lower()
-    if kind not in (".csv", ".parquet"):
-        raise OptionError(f"{path}: expected a table that ends in .csv or .parquet")
-    if kind == ".parquet":
-        try:
-            import polars  # noqa: F401
-        except ImportError:
-            raise OptionError(f"{path}: Parquet needs polars: pip install 'imulab[tables]'") from None
+    check_writable(path)
     if not real_path(path).parent.is_dir():
         raise OptionError(f"{path}: cannot be written: no such folder")
 
@@ -79,16 +73,13 @@ def write_table(rows: Sequence[Row], path: str | Path) -> None:
     """Write the table, CSV or Parquet by the name of the file, whole or not at all; numbers read back exactly."""
     columns = columns_of(rows)
     if Path(path).suffix.lower() == ".parquet":
-        import polars
+        import pyarrow
+        from pyarrow import parquet
 
-        frame = polars.DataFrame(
-            {
-                name: polars.Series(name, values, dtype=polars.String if name in HEAD else polars.Float64)
-                for name, values in columns.items()
-            }
-        )
+        kinds = [pyarrow.string() if name in HEAD else pyarrow.float64() for name in columns]
+        arrays = [pyarrow.array(values, kind) for values, kind in zip(columns.values(), kinds, strict=True)]
         with replacing(path) as stream:
-            frame.write_parquet(stream)
+            parquet.write_table(pyarrow.table(arrays, names=list(columns)), stream)
         return
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
