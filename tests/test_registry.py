@@ -1,0 +1,132 @@
+"""A procedure that nobody knows but the registry goes all the way: fit, record, report, apply, show and a fleet."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from imulab.cli.options import GivenFiles
+from imulab.device.tables import Field, Table, whole
+from imulab.procedures.options import LAYOUT, measure, read_options
+from imulab.procedures.procedure import Procedure, Section, Task, source_of
+from imulab.procedures.registry import PROCEDURES
+from imulab.procedures.run import run_task
+from imulab.procedures.tumble.apply import apply_gyro
+from imulab.procedures.tumble.device import golden_gyroscopes
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.report import elements
+
+RATE = (0.01, -0.02, 0.03)
+OPTIONS = (measure("skip", "Time at the start to leave out, s.", "time", "s", "0 s"), LAYOUT)
+NAMES = tuple(f"drift_{axis}" for axis in "xyz")
+
+
+def _fit(files, values, access, progress):
+    recording = access.recording(files[0], values["layout"])
+    at_rest = recording.column("time") >= values["skip"]
+    found = {name: recording.column(f"gyro_{name[-1]}")[at_rest] for name in NAMES}
+    spread = {name: float(column.std() / np.sqrt(len(column))) for name, column in found.items()}
+    return Calibration(
+        procedure="drift",
+        parameters={name: Parameter(float(found[name].mean()), spread[name], "rad/s") for name in NAMES},
+        covariance=Covariance(NAMES, tuple(map(tuple, np.diag([spread[name] ** 2 for name in NAMES]).tolist()))),
+        model={"output_unit": "rad/s"},
+        fit={"samples": int(at_rest.sum())},
+        options={"skip": values["skip"]},
+        sensor={"serial": recording.metadata["serial"]},
+        sources=(source_of(access, files[0]),),
+    )
+
+
+def _tables(record):
+    drift = np.array([record.value(name) for name in NAMES])
+    fields = (
+        Field("has_sensitivity", whole(False)),
+        Field("gain", np.ones(3)),
+        Field("bias", drift),
+        Field("turn", np.eye(3)),
+    )
+    return (Table("gyro", fields, {"output_unit": "rad/s"}),)
+
+
+def _exhibits(record):
+    rows = [[name, f"{record.value(name):.3f}"] for name in NAMES]
+    return elements.Exhibits(
+        "What drifts at rest.", [("samples", "1000")], [elements.Table("Drift", "", ["", ""], rows)]
+    )
+
+
+MADE_UP = Procedure(
+    name="drift",
+    command="drifts",
+    title="Drift at rest",
+    line_title="Drifts",
+    task=Task("one recording", (1, 1), OPTIONS, lambda texts, label: read_options(OPTIONS, texts, label), _fit),
+    check=lambda record: None,
+    exhibits=_exhibits,
+    tables=_tables,
+    sections=(Section("gyro", golden=golden_gyroscopes, apply=apply_gyro, triad="gyro"),),
+)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.setitem(PROCEDURES, MADE_UP.command, MADE_UP)
+    monkeypatch.chdir(tmp_path)
+    for k in (1, 2):
+        rng = np.random.default_rng(k)
+        columns = {"time": np.arange(1000) / 100}
+        columns |= {f"gyro_{a}": r + 1e-4 * rng.standard_normal(1000) for a, r in zip("xyz", RATE, strict=True)}
+        units = {name: "s" if name == "time" else "rad/s" for name in columns}
+        il.write_csv(il.Recording(columns, units, {"serial": f"SN{k}"}), f"{k}.csv")
+    return tmp_path
+
+
+@pytest.fixture
+def record(here):
+    made = run_task("drifts", ["1.csv"], {"skip": "1 s"}, GivenFiles())
+    made.save("1.json")
+    return made
+
+
+def test_its_fit_is_a_record(record):
+    assert [record.value(name) for name in NAMES] == pytest.approx(RATE, abs=2e-5)
+    assert record.fit["samples"] == 900
+    assert il.load("1.json") == record
+
+
+def test_its_record_is_reported_and_shown(record, capsys):
+    assert main(["report", "1.json", "-o", "1.html"]) == 0
+    page = Path("1.html").read_text(encoding="utf-8")
+    assert "Drift at rest" in page
+    assert "What drifts at rest." in page
+    capsys.readouterr()
+    assert main(["show", "1.json"]) == 0
+    shown = capsys.readouterr().out
+    assert "drift calibration of SN1" in shown
+    assert "drift_y" in shown
+
+
+def test_its_record_corrects_recordings(record):
+    assert main(["apply", "1.json", "1.csv", "-o", "out.csv"]) == 0
+    corrected = il.read("out.csv")
+    for axis in "xyz":
+        assert abs(corrected.column(f"gyro_{axis}").mean()) < 2e-5
+    assert main(["export", "--to", "blob", "1.json", "-o", "fw"]) == 0
+    assert main(["apply", "fw/unit.blob", "1.csv", "-o", "by_blob.csv"]) == 0
+    np.testing.assert_allclose(il.read("by_blob.csv").column("gyro_x"), corrected.column("gyro_x"), atol=1e-8)
+
+
+def test_a_fleet_runs_it(here, capsys):
+    (here / "line.csv").write_text("serial,procedure,file,skip\nSN1,drifts,1.csv,1 s\nSN2,drifts,2.csv,\n")
+    assert main(["fleet", "run", "line.csv", "-o", "out", "--workers", "1"]) == 0
+    assert capsys.readouterr().out.startswith("2 units: 2 done, 0 failed")
+    assert il.load("out/SN1.json").fit["samples"] == 900
+    assert il.load("out/SN2.json").fit["samples"] == 1000
+    assert main(["fleet", "report", "out", "-o", "line.html"]) == 0
+    assert "Drifts" in (here / "line.html").read_text(encoding="utf-8")
+    (here / "line.csv").write_text("serial,procedure,file,skip\nSN1,drifts,1.csv,a while\n")
+    assert main(["fleet", "run", "line.csv", "-o", "other", "--workers", "1"]) == 2
+    assert "skip" in capsys.readouterr().err
