@@ -128,7 +128,7 @@ def sha256_of(path: Path, name: str) -> str:
     try:
         parts: Sequence[Path] = [path]
         if path.is_dir():
-            from imulab.readers.rosfiles import files_of
+            from imulab.readers.rosfolder import files_of
 
             parts = files_of(path, name)
         for part in parts:

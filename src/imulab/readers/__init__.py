@@ -168,7 +168,7 @@ class _Hash:
         path = Path(file)
         parts = [path]
         if path.is_dir():
-            from imulab.readers.rosfiles import files_of
+            from imulab.readers.rosfolder import files_of
 
             parts = files_of(path, str(file))
         for part in parts:

@@ -17,7 +17,8 @@ import numpy as np
 
 from imulab.errors import OptionError, ReadError, listed
 from imulab.readers import logs
-from imulab.readers.rosfiles import Container, Topic, files_of, open_container
+from imulab.readers.rosfiles import Container, Topic, open_container
+from imulab.readers.rosfolder import files_of
 from imulab.readers.selection import Selection
 from imulab.readers.streams import Piece, Stream, on_one_clock
 from imulab.recording import Array, Recording
