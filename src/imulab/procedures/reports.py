@@ -6,7 +6,6 @@ from pathlib import Path
 
 from imulab import report
 from imulab.atomic_write import write_text
-from imulab.errors import RecordError
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change, Comparison, compared
@@ -29,10 +28,8 @@ def exhibits_of(record: Calibration) -> Exhibits:
     RecordError
         Its procedure is not known, or it lacks the data that they need.
     """
-    try:
-        return procedure_of(record).exhibits(record)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise RecordError(f"the record lacks data that its report needs ({error!r})") from None
+    exhibits: Exhibits = procedure_of(record).exhibits(record)
+    return exhibits
 
 
 def compare_records(first: Calibration, second: Calibration) -> Comparison:

@@ -21,11 +21,8 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table,
     RecordError
         The record lacks a parameter or has one that cannot be.
     """
-    try:
-        made_by = procedure_of(record)
-        return made_by.tables(record, fusion) if made_by.fuses else made_by.tables(record)
-    except KeyError as error:
-        raise RecordError(f"the record lacks {error.args[0]}") from None
+    made_by = procedure_of(record)
+    return made_by.tables(record, fusion) if made_by.fuses else made_by.tables(record)
 
 
 def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[Table]:

@@ -22,8 +22,7 @@ _TICK = 0.01  # s
 
 def tables_of(record: Calibration) -> tuple[Table, ...]:
     """Return the table of a warm-up record; errors as for `record_table` and `warmup_table`."""
-    record_table(record)  # says in words what the core would refuse by a number
-    return (warmup_table(record.sections["table"]),)
+    return (warmup_table(record_table(record).to_section()),)
 
 
 def warmup_table(table: Mapping[str, Any]) -> Table:

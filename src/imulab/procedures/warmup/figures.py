@@ -10,6 +10,7 @@ from imulab.procedures.warmup.engineering import engineering_unit
 from imulab.procedures.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
 from imulab.procedures.warmup.model import Table as WarmupTable
 from imulab.procedures.warmup.model import evaluate, record_table
+from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, plain_number
@@ -25,28 +26,28 @@ def exhibits(record: Calibration) -> Exhibits:
     if not record.fit:
         return _handmade(table)
     kinds = _kinds(table)
-    models = record.fit["models"]
-    chosen = next(row for row in models if row["chosen"])
-    none = next(row for row in models if row["model"] == "none")
+    fit = drawn_of(record).fit
+    chosen, none = fit.row(), fit.row("none")
     head, (label, factor) = next(iter(kinds.values())), engineering_unit(table.units[0])
-    before, after = (_rms(row["training"], head) * factor for row in (none, chosen))
+    before, after = (_rms(row.training, head) * factor for row in (none, chosen))
     left = f"{plain_number(after, 2)} {label}" if after > 0 else "nothing above the noise"
-    floor = record.fit["repeatability"]["cycle"]
-    jump = ("largest edge jump", "edge_jump") if table.model == "interval-cubic" else ("largest |Z(T_M)|", "exit_jump")
+    floor = fit.repeatability.cycle
+    edges = table.model == "interval-cubic"
+    jump = ("largest edge jump", chosen.edge_jump) if edges else ("largest |Z(T_M)|", chosen.exit_jump)
     facts = [
-        ("left at the tests", _text(chosen["training"], head, factor, f" {label}")),
-        ("temperature left out", _text(chosen["left_temperature"], head, factor, f" {label}")),
-        *_worst(record, table, head, factor, label),
+        ("left at the tests", _text(chosen.training, head, factor, f" {label}")),
+        ("temperature left out", _text(chosen.left_temperature, head, factor, f" {label}")),
+        *_worst(record, fit, table, head, factor, label),
         ("repeatability", _text(floor, head, factor, f" {label}")),
-        (jump[0], f"{_largest(chosen[jump[1]], head, factor)} {label}"),
+        (jump[0], f"{_largest(jump[1], head, factor)} {label}"),
         ("settling time T_M", f"{table.settling_time:g} s"),
-        ("power cycles", str(record.fit["cycles"])),
+        ("power cycles", str(fit.cycles)),
     ]
     items: list[Figure | Table] = []
     for kind, index in kinds.items():
         items.append(_models(record, table, kind, index))
-    if record.fit["repeatability"]["unit"] is not None:
-        items.append(_units(record, table, kinds))
+    if fit.repeatability.unit is not None:
+        items.append(_units(fit, table, kinds, fit.repeatability.unit))
     for kind, index in kinds.items():
         items.append(_cycles(record, table, kind, index))
     for kind, index in kinds.items():
@@ -55,7 +56,7 @@ def exhibits(record: Calibration) -> Exhibits:
         items.append(_by_temperature(record, table, kind, index))
     items += [_over_temperature(table), _tests(record, table)]
     return Exhibits(
-        headline=f"The {chosen['model']} table leaves {left} of "
+        headline=f"The {chosen.model} table leaves {left} of "
         f"{plain_number(before, 2)} {label} rms in the {table.settling_time:g} s after power-on"
         + (f"; power cycles repeat to {_text(floor, head, factor, f' {label}')}." if _rms(floor, head) > 0 else "."),
         facts=facts,
@@ -64,15 +65,15 @@ def exhibits(record: Calibration) -> Exhibits:
 
 
 def _worst(
-    record: Calibration, table: WarmupTable, index: list[int], factor: float, label: str
+    record: Calibration, fit: Fit, table: WarmupTable, index: list[int], factor: float, label: str
 ) -> list[tuple[str, str]]:
     """What to expect at the worst power-on temperature; nothing where a record does not hold it."""
-    at = record.fit.get("worst_temperature")
+    at = fit.worst_temperature
     names = [f"worst_temperature_error_{table.axes[i]}" for i in index]
     if at is None or not all(name in record.parameters for name in names):
         return []
     error = _text([record.value(name) for name in names], list(range(len(names))), factor, f" {label}")
-    return [(f"at worst, near {at['value']:.3g} °C", error)]
+    return [(f"at worst, near {at.value:.3g} °C", error)]
 
 
 def _handmade(table: WarmupTable) -> Exhibits:
@@ -109,24 +110,25 @@ def _text(values: list[float | None] | None, index: list[int], factor: float, un
 def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Table:
     label, factor = engineering_unit(table.units[index[0]])
     rows, highlight = [], None
-    for number, row in enumerate(record.fit["models"]):
-        if row["chosen"]:
+    fit = drawn_of(record).fit
+    for number, row in enumerate(fit.models):
+        if row.chosen:
             highlight = number
-        scales = ", ".join(plain_number(value, 3) for value in row["scales"]) or "–"
-        none = row["model"] == "none"
+        scales = ", ".join(plain_number(value, 3) for value in row.scales) or "–"
+        none = row.model == "none"
         rows.append(
             [
-                row["model"],
-                _text(row["training"], index, factor),
-                "–" if none else _text(row["left_cycle"], index, factor),
-                _text(row["left_temperature"], index, factor),
-                "–" if none else _largest(row["edge_jump"], index, factor),
-                "–" if none else _largest(row["exit_jump"], index, factor),
+                row.model,
+                _text(row.training, index, factor),
+                "–" if none else _text(row.left_cycle, index, factor),
+                _text(row.left_temperature, index, factor),
+                "–" if none else _largest(row.edge_jump, index, factor),
+                "–" if none else _largest(row.exit_jump, index, factor),
                 scales,
             ]
         )
-    floor = _text(record.fit["repeatability"]["cycle"], index, factor, f" {label}")
-    what = "unit" if record.model.get("pool") == "type" else "cycle"
+    floor = _text(fit.repeatability.cycle, index, factor, f" {label}")
+    what = "unit" if model_of(record).pool == "type" else "cycle"
     return Table(
         title=f"Models compared, {kind}, {label}",
         caption="Root mean square over all axes and the time t after power-on up to T_M, from which the unit is "
@@ -140,22 +142,21 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     )
 
 
-def _units(record: Calibration, table: WarmupTable, kinds: dict[str, list[int]]) -> Table:
+def _units(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]) -> Table:
     """Whether one table for the type is enough, axis by axis."""
-    found = record.fit["repeatability"]
+    found = fit.repeatability
     rows = []
     for index in kinds.values():
         for i in index:
             label, factor = engineering_unit(table.units[i])
-            unit, cycle = found["unit"][i], found["cycle"][i]
+            unit, cycle, uncertainty = units[i], found.cycle[i], found.standard_uncertainty[i]
             verdict = "–"
-            if cycle is not None:
-                clear = unit > cycle + 2 * found["standard_uncertainty"][i]
-                verdict = "each unit" if clear else "one per type"
-            shown = [_text(found[key], [i], factor) for key in ("unit", "cycle")]
+            if unit is not None and cycle is not None and uncertainty is not None:
+                verdict = "each unit" if unit > cycle + 2 * uncertainty else "one per type"
+            shown = [_text(values, [i], factor) for values in (units, found.cycle)]
             rows.append([table.axes[i], *shown, verdict, label])
     return Table(
-        title=f"Spread between {record.fit['units']} units",
+        title=f"Spread between {fit.units} units",
         caption="Root mean square deviation of a unit's curve from that of the type, beside that of a cycle from its "
         "unit. Where units differ clearly more than their cycles do (by two standard uncertainties of the latter), a "
         "table for each unit would gain; otherwise one per type is enough.",
@@ -164,8 +165,9 @@ def _units(record: Calibration, table: WarmupTable, kinds: dict[str, list[int]])
     )
 
 
-def _largest(values: list[float], index: list[int], factor: float) -> str:
-    return plain_number(max(values[i] for i in index) * factor, 2)
+def _largest(values: list[float | None], index: list[int], factor: float) -> str:
+    known = [value for i in index if (value := values[i]) is not None]
+    return plain_number(max(known) * factor, 2) if known else "–"
 
 
 def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
@@ -174,16 +176,16 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     cells: list[list[dict[str, Any]]] = []
     for i in index:
         traces: list[dict[str, Any]] = []
-        for cycle in record.data["cycles"]:
-            at = cycle["calibration_temperature"]
+        for cycle in drawn_of(record).data.cycles:
+            at = cycle.calibration_temperature
             colour, mark = temperature_colour(at, table.temperatures), temperature_mark(at, table.temperatures)
             traces.append(
                 {
                     "mode": "markers",
-                    "x": cycle["time"],
-                    "y": _rounded(np.array(cycle["curve"][i]) * factor),
+                    "x": cycle.time,
+                    "y": _rounded(np.array(cycle.curve[i], dtype=np.float64) * factor),
                     "marker": {"color": colour, "symbol": mark, "size": 4, "opacity": 0.55},
-                    "hovertemplate": f"{at:g} degC, {cycle['file']}<br>%{{x:.0f}} s: %{{y:.3g}} {label}<extra></extra>",
+                    "hovertemplate": f"{at:g} degC, {cycle.file}<br>%{{x:.0f}} s: %{{y:.3g}} {label}<extra></extra>",
                 }
             )
         for at in table.temperatures.tolist():
@@ -215,8 +217,9 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
 def _residuals(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
     cells: list[list[dict[str, Any]]] = [[] for _ in index]
-    for at in sorted({cycle["calibration_temperature"] for cycle in record.data["cycles"]}):
-        members = [c for c in record.data["cycles"] if c["calibration_temperature"] == at]
+    data = drawn_of(record).data
+    for at in data.knots:
+        members = [cycle for cycle in data.cycles if cycle.calibration_temperature == at]
         time, left = _mean_residual(table, members)
         for cell, i in zip(cells, index, strict=True):
             cell.append(
@@ -243,14 +246,14 @@ def _residuals(record: Calibration, table: WarmupTable, kind: str, index: list[i
     )
 
 
-def _mean_residual(table: WarmupTable, members: list[dict[str, Any]]) -> tuple[Array, Array]:
+def _mean_residual(table: WarmupTable, members: list[Cycle]) -> tuple[Array, Array]:
     """Mean over cycles of curve less table, on the bins that all of them have: time (b,), residual (axes, b)."""
-    size = min(len(c["time"]) for c in members)
+    size = min(len(cycle.time) for cycle in members)
     total, time = np.zeros((len(table.axes), size)), np.zeros(size)
     for cycle in members:
-        own = np.array(cycle["time"][:size])
-        z = evaluate(table, own, _inside(table, cycle["power_on_temperature"]))
-        curve = np.array(cycle["curve"])[:, :size]
+        own = np.array(cycle.time[:size])
+        z = evaluate(table, own, _inside(table, cycle.power_on_temperature))
+        curve = np.array(cycle.curve, dtype=np.float64)[:, :size]
         total += curve - (0.0 if z is None else z)
         time += own
     return time / len(members), total / len(members)
@@ -262,19 +265,18 @@ def _inside(table: WarmupTable, temperature: float) -> float:
 
 def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
-    models = record.fit["models"]
-    chosen = next(row for row in models if row["chosen"])
-    none = next(row for row in models if row["model"] == "none")
-    knots = sorted({cycle["calibration_temperature"] for cycle in record.data["cycles"]})
+    drawn = drawn_of(record)
+    fit, knots = drawn.fit, drawn.data.knots
+    chosen = fit.row()
     lines = [
-        ("none", none["by_temperature"], QUIET, "solid", "circle"),
-        (f"{chosen['model']}, left out", chosen["left_by_temperature"], BAD, "dash", "square"),
-        (str(chosen["model"]), chosen["by_temperature"], GOOD, "solid", "diamond"),
-        ("repeatability", record.fit["repeatability"]["by_temperature"], INK, "dot", "x"),
+        ("none", fit.row("none").by_temperature, QUIET, "solid", "circle"),
+        (f"{chosen.model}, left out", chosen.left_by_temperature, BAD, "dash", "square"),
+        (chosen.model, chosen.by_temperature, GOOD, "solid", "diamond"),
+        ("repeatability", fit.repeatability.by_temperature, INK, "dot", "x"),
     ]
-    source = next((row for row in models if row["model"] == "interval-cubic" and not row["chosen"]), None)
+    source = next((row for row in fit.models if row.model == "interval-cubic" and not row.chosen), None)
     if source is not None:
-        lines.insert(1, ("interval-cubic", source["by_temperature"], "#b08a3e", "dashdot", "triangle-up"))
+        lines.insert(1, ("interval-cubic", source.by_temperature, "#b08a3e", "dashdot", "triangle-up"))
     traces = []
     for name, rows, colour, dash, symbol in lines:
         values = [_rms(row, index) * factor for row in rows]
@@ -292,7 +294,7 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
                     "hovertemplate": f"{name}<br>%{{x:g}} degC: %{{y:.3g}} {label}<extra></extra>",
                 }
             )
-    after = [(_rms(row, index) * factor, at) for row, at in zip(chosen["by_temperature"], knots, strict=True)]
+    after = [(_rms(row, index) * factor, at) for row, at in zip(chosen.by_temperature, knots, strict=True)]
     worst, at = max((pair for pair in after if pair[0] > 0), default=(0.0, 0.0))
     return Figure(
         message=f"The chosen table is farthest off at {at:g} degC: {plain_number(worst, 2)} {label}.",
@@ -365,24 +367,23 @@ def _over_temperature(table: WarmupTable) -> Figure:
 def _tests(record: Calibration, table: WarmupTable) -> Table:
     label, factor = engineering_unit(table.units[0])
     head = next(iter(_kinds(table).values()))
-    chosen = next(row for row in record.fit["models"] if row["chosen"])
-    cycles = record.data["cycles"]
+    drawn = drawn_of(record)
+    chosen = drawn.fit.row()
     rows = []
-    knots = sorted({cycle["calibration_temperature"] for cycle in cycles})
-    for k, at in enumerate(knots):
-        members = [cycle for cycle in cycles if cycle["calibration_temperature"] == at]
-        power_on = [cycle["power_on_temperature"] for cycle in members]
-        drift = max(abs(cycle["settled_drift"][i]) for cycle in members for i in head) * factor
+    for k, at in enumerate(drawn.data.knots):
+        members = [cycle for cycle in drawn.data.cycles if cycle.calibration_temperature == at]
+        power_on = [cycle.power_on_temperature for cycle in members]
+        drift = [None if (moved := cycle.settled_drift[i]) is None else abs(moved) for cycle in members for i in head]
         rows.append(
             [
                 f"{at:g}",
                 str(len(members)),
                 f"{min(power_on):.2f} to {max(power_on):.2f}",
-                _text(record.fit["repeatability"]["by_temperature"][k], head, factor),
-                _text(chosen["by_temperature"][k], head, factor),
-                _text(chosen["left_by_temperature"][k], head, factor),
-                plain_number(drift, 2),
-                f"{min(cycle['end'] for cycle in members):g}",
+                _text(drawn.fit.repeatability.by_temperature[k], head, factor),
+                _text(chosen.by_temperature[k], head, factor),
+                _text(chosen.left_by_temperature[k], head, factor),
+                _largest(drift, list(range(len(drift))), factor),
+                f"{min(cycle.end for cycle in members):g}",
             ]
         )
     return Table(
@@ -394,5 +395,5 @@ def _tests(record: Calibration, table: WarmupTable) -> Table:
     )
 
 
-def _rounded(values: Array) -> list[float]:
-    return [float(f"{value:.4g}") for value in values.tolist()]
+def _rounded(values: Array) -> list[float | None]:
+    return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]

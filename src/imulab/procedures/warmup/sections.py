@@ -145,11 +145,19 @@ def model_of(record: Calibration) -> Model:
     return part(record, Model, "model")
 
 
-def fit_of(record: Calibration) -> Fit:
-    """Return the section ``fit``; errors as for `model_of`."""
-    return part(record, Fit, "fit")
+def drawn_of(record: Calibration) -> Warmup:
+    """Return the sections of a record whose figures are drawn; errors as for `model_of`.
 
-
-def data_of(record: Calibration) -> Data:
-    """Return the section ``data``; errors as for `model_of`."""
-    return part(record, Data, "data")
+    Raises
+    ------
+    RecordError
+        Its curves do not fit their times, or its rows by temperature the temperatures of its cycles.
+    """
+    found = part(record, Warmup)
+    for number, cycle in enumerate(found.data.cycles):
+        if any(len(row) != len(cycle.time) for row in cycle.curve):
+            raise RecordError(f"data.cycles[{number}].curve: expected {len(cycle.time)} values an axis, as of time")
+    rows, knots = len(found.fit.repeatability.by_temperature), len(found.data.knots)
+    if rows != knots:
+        raise RecordError(f"fit.repeatability.by_temperature: expected {knots} rows, one a temperature, found {rows}")
+    return found
