@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import madeup
-from imulab.device.unit import Unit
+from imulab.device.unit import DeviceUnit
 from imulab.exporters import export
 from imulab.procedures.unit_tables import tables_of
 from imulab.procedures.warmup.choices import MODELS
@@ -68,7 +68,7 @@ def _race(first: Callable[[], object], second: Callable[[], object]) -> float:
 def _through_python() -> list[tuple[str, str, str]]:
     rng = np.random.default_rng(1)
     columns = [rng.uniform(-5000, 5000, SAMPLES) for _ in range(3)]
-    triad = Unit.of(*tables_of(madeup.tumble(1)))
+    triad = DeviceUnit.of(*tables_of(madeup.tumble(1)))
     made = [
         (
             "`Unit.tumble`, order 1, 3 x 1e6 samples, against `numpy.copy`",
@@ -79,7 +79,7 @@ def _through_python() -> list[tuple[str, str, str]]:
     ticks = np.arange(SAMPLES, dtype=np.uint32)
     tick = madeup.SETTLED / SAMPLES  # all of it is compensated
     for model in MODELS:
-        table = Unit.of(*tables_of(madeup.warmup(model, "hold")))
+        table = DeviceUnit.of(*tables_of(madeup.warmup(model, "hold")))
         ratio = _race(
             lambda table=table: table.warmup(20.0, tick, ticks, columns[:2]), lambda: [c.copy() for c in columns[:2]]
         )

@@ -12,7 +12,7 @@ import numpy as np
 import imulab as il
 from imulab.procedures.warmup.cycles import find_power_cycle
 from imulab.procedures.warmup.fit import WarmupFit
-from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, Table, evaluate
+from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable, evaluate
 from imulab.procedures.warmup.simulate import LAWS, warmup_truth
 from imulab.procedures.warmup.table import evaluate_float32, to_int16
 
@@ -40,7 +40,7 @@ def _fit(law: str, seed: int = 1) -> WarmupFit:
     return il.fit_warmup(cycles, settling_time=END)
 
 
-def _error(table: Table | None, temperatures: tuple[float, ...], law: str) -> float:
+def _error(table: WarmupTable | None, temperatures: tuple[float, ...], law: str) -> float:
     """Rms over t < T_M, three gyroscopes and temperatures against the mean curve, deg/h."""
     squares = []
     clock = np.arange(0, 600, 0.5)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from imulab.estimation.estimate import (
+from imulab.estimation.least_squares import (
     bayesian_information,
     chi_square_limit,
     covariance,

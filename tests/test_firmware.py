@@ -14,7 +14,7 @@ from imulab.cli import main
 from imulab.device.array_settings import Fusion
 from imulab.device.methods import METHODS
 from imulab.device.tables import pack
-from imulab.device.unit import ArraySettings, Stream, Unit, array_table
+from imulab.device.unit import ArraySettings, DeviceUnit, Stream, array_table
 from imulab.exporters import export
 from imulab.exporters.c import _header
 from imulab.procedures.unit_tables import tables_of
@@ -107,11 +107,11 @@ def test_tumble_to_the_last_bit(order, c_core, records):
     rng = np.random.default_rng(order)
     tables = tables_of(madeup.tumble(order))
     rows = outputs_of(tables[0], 16 * G, rng)  # at orders above 1 some lie beyond a turning point
-    force, flags = Unit.of(*tables).tumble(list(rows.T))
+    force, flags = DeviceUnit.of(*tables).tumble(list(rows.T))
     assert flags & 1
     assert_same(c_core("double", tables, "tumble", rows), np.column_stack(force))
     rows = outputs_of(tables[0], 2 * G, rng)
-    force, _ = Unit.of(*tables).tumble(list(rows.T))
+    force, _ = DeviceUnit.of(*tables).tumble(list(rows.T))
     assert_near(c_core("float", tables, "tumble", rows), np.column_stack(force), 2e-6 * 2 * G)
 
 
@@ -122,7 +122,7 @@ def test_gyro_to_the_last_bit(sensitive, c_core):
     rows = outputs_of(table, 5.0, rng)  # rad/s, about 300 deg/s
     force = rng.uniform(-2 * G, 2 * G, (MANY, 3))
     force[7, 1] = np.nan
-    rate, _ = Unit.of(table).gyro(list(rows.T), list(force.T) if sensitive else None)
+    rate, _ = DeviceUnit.of(table).gyro(list(rows.T), list(force.T) if sensitive else None)
     name, wide = ("gyro-force", np.hstack([rows, force])) if sensitive else ("gyro", rows)
     assert_same(c_core("double", [table], name, wide), np.column_stack(rate))
     assert_near(c_core("float", [table], name, wide)[8:], np.column_stack(rate)[8:], 2e-6 * 5)
@@ -134,7 +134,7 @@ def test_centrifuge_to_the_last_bit(c_core, records):
     rows = np.hstack([rng.uniform(-100, 100, (MANY, 2)), rng.uniform(-1e-2, 1e-2, (MANY, 2))])
     rows[5] = [np.nan, 1.0, 0.0, 0.0]
     rows[6, 3] = np.inf
-    rate, _ = Unit.of(*tables).centrifuge(list(rows.T[:2]), list(rows.T[2:]))
+    rate, _ = DeviceUnit.of(*tables).centrifuge(list(rows.T[:2]), list(rows.T[2:]))
     assert_same(c_core("double", tables, "centrifuge", rows), np.column_stack(rate))
     assert_near(c_core("float", tables, "centrifuge", rows), np.column_stack(rate), 2e-6 * 1e-2)
 
@@ -147,7 +147,7 @@ def test_warmup_to_the_last_bit(model, rule, c_core):
     ticks = rng.integers(0, int(1.3 * madeup.SETTLED / madeup.TICK), MANY // 4).astype(np.uint32)
     for temperature in (-40.0, -30.0, 21.5, 60.0):
         raw = rng.uniform(-1, 1, (2, len(ticks))) * 1e-3
-        left, covered = Unit.of(*tables).warmup(temperature, madeup.TICK, ticks, list(raw))
+        left, covered = DeviceUnit.of(*tables).warmup(temperature, madeup.TICK, ticks, list(raw))
         assert covered
         rows = ticks.astype(np.float64)[:, None]
         bias = c_core("double", tables, "warmup", rows, temperature, madeup.TICK)

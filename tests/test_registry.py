@@ -8,7 +8,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.cli.options import GivenFiles
-from imulab.device.tables import Field, Table, whole
+from imulab.device.tables import DeviceTable, Field, whole
 from imulab.procedures.options import LAYOUT, measure, read_options
 from imulab.procedures.procedure import Procedure, Section, Task, source_of
 from imulab.procedures.registry import PROCEDURES
@@ -48,7 +48,7 @@ def _tables(record):
         Field("bias", drift),
         Field("turn", np.eye(3)),
     )
-    return (Table("gyro", fields, {"output_unit": "rad/s"}),)
+    return (DeviceTable("gyro", fields, {"output_unit": "rad/s"}),)
 
 
 def _exhibits(record):

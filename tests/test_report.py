@@ -13,7 +13,7 @@ from conftest import table
 from imulab.errors import RecordError
 from imulab.procedures.reports import exhibits_of
 from imulab.report import render_page
-from imulab.report.elements import Exhibits, Figure, Table, format_uncertain
+from imulab.report.elements import Exhibits, Figure, ReportTable, format_uncertain
 from imulab.report.narrow import narrow
 from reference import tumble as reference
 
@@ -107,7 +107,7 @@ def test_a_table_of_attitudes_without_uncertainties_has_a_report(tmp_path):
 
 
 def test_engineering_units_of_the_parameter_table(record):
-    rows = {row[0]: row for item in exhibits_of(record).items if isinstance(item, Table) for row in item.rows}
+    rows = {row[0]: row for item in exhibits_of(record).items if isinstance(item, ReportTable) for row in item.rows}
     mg, ppm = 9.80665e-3, 1e-6
     assert float(rows["bias_x"][1]) == pytest.approx(record.value("bias_x") / mg, abs=1e-3)
     assert float(rows["scale_factor_y"][1]) == pytest.approx((record.value("scale_factor_y") - 1) / ppm, abs=1)
@@ -139,7 +139,7 @@ def test_values_are_written_to_the_second_digit_of_their_uncertainty(value, unce
 
 def test_words_stand_at_the_left():
     rows = [["1", "a.csv", "2.7e-13", "few.csv: " + "too few attitudes " * 5, "–"], ["2", "12.csv", "–", "", "–"]]
-    shown = Table("T", "", ["run", "file", "p", "reason", "none"], rows)
+    shown = ReportTable("T", "", ["run", "file", "p", "reason", "none"], rows)
     page = re.sub(r"<script>.*?</script>", "", render_page("T", "", Exhibits("", [], [shown])), flags=re.DOTALL)
     assert re.findall("<td(.*?)>", page)[:5] == ["", ' class="text"', "", ' class="text"', ""]
 
@@ -175,7 +175,7 @@ def test_nothing_overflows_sideways(record, chromium, tmp_path, widths, dark):
     side |= {"yaxis": {"domain": [0, 1]}, "yaxis2": {"domain": [0, 1], "anchor": "x2"}}
     exhibits = exhibits_of(record)
     pair = Figure("Pair", "", [{"type": "scatter", "x": [1, 2], "y": [1, 2]}], side)
-    wide = Table("Wide", "", [f"a long title {n}" for n in range(12)], [["0.123456789 ± 0.000001"] * 12])
+    wide = ReportTable("Wide", "", [f"a long title {n}" for n in range(12)], [["0.123456789 ± 0.000001"] * 12])
     (tmp_path / "r.html").write_text(
         render_page("T", "S" * 60, replace(exhibits, items=[*exhibits.items, pair, wide])), encoding="utf-8"
     )

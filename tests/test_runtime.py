@@ -12,7 +12,16 @@ import madeup
 from imulab.device import _runtime
 from imulab.device.methods import METHODS
 from imulab.device.tables import pack
-from imulab.device.unit import ALONE, NOT_FINITE, ArraySettings, Stream, Unit, array_stream, array_table, fuse_table
+from imulab.device.unit import (
+    ALONE,
+    NOT_FINITE,
+    ArraySettings,
+    DeviceUnit,
+    Stream,
+    array_stream,
+    array_table,
+    fuse_table,
+)
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.procedures.unit_tables import tables_of
 from imulab.procedures.warmup.choices import MODELS
@@ -201,13 +210,13 @@ def test_a_unit_has_the_sections_of_its_tables_and_no_others():
     accel, gyro = tables_of(madeup.tumble(1, gyro=True))
     columns = [np.zeros(3)] * 3
     with pytest.raises(ValueError, match="the table has no section for this call"):
-        Unit.of(accel).gyro(columns, None)
+        DeviceUnit.of(accel).gyro(columns, None)
     with pytest.raises(ValueError, match="no section"):
-        Unit.of(gyro).tumble(columns)
+        DeviceUnit.of(gyro).tumble(columns)
     with pytest.raises(ValueError, match="no section"):
-        Unit.of(gyro).centrifuge(columns[:2], columns[:2])
+        DeviceUnit.of(gyro).centrifuge(columns[:2], columns[:2])
     with pytest.raises(ValueError, match="no section"):
-        Unit.of(gyro).warmup(20.0, 0.1, np.zeros(3, dtype=np.uint32), columns)
+        DeviceUnit.of(gyro).warmup(20.0, 0.1, np.zeros(3, dtype=np.uint32), columns)
     assert _runtime.has(_runtime.load(pack([accel, gyro], 8))) == 3
 
 
@@ -261,25 +270,25 @@ def test_a_state_of_another_size_or_place_is_refused():
 def test_inputs_are_left_alone():
     table = tables_of(madeup.warmup())[0]
     raw = [np.ones(4), np.ones(4)]
-    out, covered = Unit.of(table).warmup(20.0, 0.1, np.arange(4, dtype=np.uint32), raw)
+    out, covered = DeviceUnit.of(table).warmup(20.0, 0.1, np.arange(4, dtype=np.uint32), raw)
     assert covered
     assert all((column == 1).all() for column in raw)
     assert (out[0] != 1).all()
-    some, _ = Unit.of(table).warmup(20.0, 0.1, np.arange(4, dtype=np.uint32), [None, raw[1]])
+    some, _ = DeviceUnit.of(table).warmup(20.0, 0.1, np.arange(4, dtype=np.uint32), [None, raw[1]])
     assert some[0] is None
     assert same(some[1], out[1])
-    untouched, covered = Unit.of(table).warmup(np.nan, 0.1, np.arange(4, dtype=np.uint32), raw)
+    untouched, covered = DeviceUnit.of(table).warmup(np.nan, 0.1, np.arange(4, dtype=np.uint32), raw)
     assert not covered
     assert same(untouched[0], raw[0])
     with pytest.raises(ValueError, match="an argument or a setting that cannot be"):
-        Unit.of(table).warmup(20.0, 0.0, np.arange(4, dtype=np.uint32), raw)
+        DeviceUnit.of(table).warmup(20.0, 0.0, np.arange(4, dtype=np.uint32), raw)
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_warmup_fills_columns_of_other_units(model):
     """From the bias alone, found by subtracting from zero; a factor of two to some power rounds nothing."""
     rng = np.random.default_rng(9)
-    unit = Unit.of(*tables_of(madeup.warmup(model, "taper")))
+    unit = DeviceUnit.of(*tables_of(madeup.warmup(model, "taper")))
     ticks = np.sort(rng.integers(0, int(1.3 * madeup.SETTLED / madeup.TICK), 5000)).astype(np.uint32)
     raw = list(rng.uniform(-1, 1, (2, 5000)))
     bias, _ = unit.warmup(21.5, madeup.TICK, ticks, [np.zeros(5000), np.zeros(5000)])
@@ -294,7 +303,7 @@ def test_warmup_fills_columns_of_other_units(model):
 
 def test_threads_may_share_a_unit():
     """The interpreter's lock is released; a unit is never written to."""
-    unit = Unit.of(*tables_of(madeup.tumble(4)))
+    unit = DeviceUnit.of(*tables_of(madeup.tumble(4)))
     columns = [np.random.default_rng(i).uniform(-5000, 5000, 200_000) for i in range(3)]
     expected, _ = unit.tumble(columns)
     found = [None] * 4

@@ -104,7 +104,7 @@ def test_the_command_and_the_fleet_take_a_threshold(imulab, tmp_path):
     assert done.returncode == 0, done.stderr
     assert il.load(tmp_path / "out" / "SN1.json").options["threshold"] == held.options["threshold"]
     for arguments, message in (
-        (["--threshold", text], "threshold needs method linearised, found method norm"),
+        (["--threshold", text], "--threshold needs method linearised, found method norm"),
         (["--method", "linearised", "--threshold", "5 ppm"], "--threshold '5 ppm': expected three changes, of scale"),
         (["--method", "linearised", "--threshold", "2 ug,5 ppm,3 arcsec"], "--threshold '2 ug': expected a number, or"),
         (["--method", "linearised", "--threshold", "5 ppm,0 ug,3 arcsec"], "--threshold '5 ppm,0 ug,3 arcsec': exp"),

@@ -8,7 +8,7 @@ import pytest
 from scipy import optimize
 
 import madeup
-from imulab.device.unit import Unit
+from imulab.device.unit import DeviceUnit
 from imulab.procedures.tumble.model import (
     fit_lengths,
     invert,
@@ -64,7 +64,7 @@ def test_the_unit_inverts_the_law_that_was_fitted_to_the_last_bit(order):
         name: 1.0 if name.startswith("scale") else 0.0 for name in record.parameters if name[:4] in ("scal", "bias")
     }
     parameters = {n: replace(p, value=flat.get(n, p.value)) for n, p in record.parameters.items()}
-    unit = Unit.of(*tables_of(replace(record, parameters=parameters)))
+    unit = DeviceUnit.of(*tables_of(replace(record, parameters=parameters)))
     reading = np.random.default_rng(order).uniform(-25.0, 25.0, (20_000, 3))
     k = np.array([[parameters[f"k{j}_{a}"].value for a in "xyz"] for j in range(2, order + 1)]).reshape(order - 1, 3)
     fitted = invert(reading, np.array([parameters[f"misalignment_{p}"].value for p in ("yx", "zx", "zy")]), k).force

@@ -9,7 +9,7 @@ import pytest
 
 import madeup
 from imulab.device.tables import KINDS, pack
-from imulab.device.unit import ArraySettings, Unit, array_table
+from imulab.device.unit import ArraySettings, DeviceUnit, array_table
 from imulab.errors import RecordError
 from imulab.procedures.tumble.device import monotone_range
 from imulab.procedures.unit_tables import tables_of
@@ -117,7 +117,7 @@ def test_a_centrifuge_of_one_axis_leaves_the_other_alone():
     fields = fields_of(tables_of(one)[0])
     assert fields["has"].tolist() == [0, 1]
     assert fields["c2"].tolist() == [0, 0]  # a term that model choice dropped means 0
-    out, _ = Unit.of(*tables_of(one)).centrifuge([np.full(2, 9.8), np.zeros(2)], [np.zeros(2), np.zeros(2)])
+    out, _ = DeviceUnit.of(*tables_of(one)).centrifuge([np.full(2, 9.8), np.zeros(2)], [np.zeros(2), np.zeros(2)])
     assert (out[0] == 0).all()
     assert (out[1] != 0).all()
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from imulab.errors import RecordError
-from imulab.procedures.warmup.model import Table, edge_jumps, evaluate, exit_jump, table_from
+from imulab.procedures.warmup.model import WarmupTable, edge_jumps, evaluate, exit_jump, table_from
 from imulab.procedures.warmup.solve import amplitude_slopes
 from imulab.procedures.warmup.table import evaluate_float32, to_int16
 from reference import warmup as reference
@@ -19,7 +19,7 @@ def a_table(model="interval-cubic", exit_rule="zero", seed=1):
     rows = 7 if model == "interval-cubic" else 8
     size = 2 if model == "exponential" else 4
     c = 300 * HOUR * rng.standard_normal((rows, 3, size))
-    return Table(
+    return WarmupTable(
         model=model,
         temperatures=AT,
         axes=("gyro_x", "gyro_y", "gyro_z"),

@@ -17,7 +17,7 @@ from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Comparison
 from imulab.records.json_text import json_text
-from imulab.report.elements import Table, format_uncertain, plain_number
+from imulab.report.elements import ReportTable, format_uncertain, plain_number
 from imulab.verdict import SENTENCES, Verdict
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
     lines = [verdict_line(record.verdict)]
     lines += [f"{record.procedure} calibration of {serial}", exhibits.headline, ""]
     for item in exhibits.items:
-        if isinstance(item, Table):
+        if isinstance(item, ReportTable):
             mark = [["*" if i == item.highlight else "", *row] for i, row in enumerate(item.rows)]
             chosen = " (* chosen)" if item.highlight is not None else ""
             lines += [f"{item.title}{chosen}", *aligned(["", *item.columns], mark), ""]
@@ -50,7 +50,7 @@ def describe_gyro(record: Calibration, accelerometers: str) -> str:
     """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
     from imulab.procedures.tumble.figures import gyro_headline
 
-    table = next(item for item in exhibits_of(record).items if isinstance(item, Table))
+    table = next(item for item in exhibits_of(record).items if isinstance(item, ReportTable))
     rows = [row for row in table.rows if row[0].startswith("gyro_")]
     serial = record.sensor.get("serial", "unit without serial number")
     return "\n".join(

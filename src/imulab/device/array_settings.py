@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.device.methods import METHODS
-from imulab.device.tables import Field, Table
+from imulab.device.tables import DeviceTable, Field
 from imulab.errors import OptionError, RecordError, listed
 from imulab.recording import Array
 
@@ -106,7 +106,7 @@ class ArraySettings:
     quiet_time: float = 1.0
 
 
-def array_table(settings: ArraySettings) -> Table:
+def array_table(settings: ArraySettings) -> DeviceTable:
     """Return the table of an array's settings.
 
     Raises
@@ -167,7 +167,7 @@ def array_table(settings: ArraySettings) -> Table:
     fields = [Field(name, np.array(value, dtype=np.int64)) for name, value in words.items()]
     fields += [Field(name, np.array(value, dtype=np.float64)) for name, value in numbers.items()]
     fields += [Field(name, values, pointed=True) for name, values in pointed.items()]
-    return Table("array", tuple(fields), {"elements": n, "axes": axes, "method": s.method})
+    return DeviceTable("array", tuple(fields), {"elements": n, "axes": axes, "method": s.method})
 
 
 def _shaped(values: Any, shape: tuple[int, ...], name: str) -> Array | None:

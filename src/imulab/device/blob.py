@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from imulab.device.tables import KINDS, TEXT, Table, pack
-from imulab.device.unit import Unit
+from imulab.device.tables import KINDS, TEXT, DeviceTable, pack
+from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
 from imulab.printable import first_hidden
 from imulab.records.calibration import BLOB_MAGIC, Calibration, plain_values
@@ -79,7 +79,7 @@ class Blob:
     text: Mapping[str, Any]
 
 
-def make_blob(records: Sequence[Calibration], tables: Sequence[Table]) -> bytes:
+def make_blob(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> bytes:
     """Return the blob of these tables, float numbers, with what the desk needs to apply it.
 
     Raises
@@ -121,7 +121,7 @@ def load_blob(path: str | Path) -> Blob:
     except OSError as error:
         raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        Unit(data)
+        DeviceUnit(data)
     except RecordError as error:
         raise RecordError(f"{path}: not a blob that can be used: {error}") from None
     text = next((payload for kind, payload in _sections(data) if kind == TEXT), None)

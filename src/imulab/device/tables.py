@@ -43,7 +43,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Table:
+class DeviceTable:
     """The members of one section's struct (``il_tumble`` ...), in order, and what the desk knows about its columns."""
 
     kind: str
@@ -65,7 +65,7 @@ class Table:
         return b"".join(parts)
 
 
-def pack(tables: Sequence[Table], width: int, text: Mapping[str, Any] | None = None) -> bytes:
+def pack(tables: Sequence[DeviceTable], width: int, text: Mapping[str, Any] | None = None) -> bytes:
     """Return a blob of these sections; `width` is 8 on the desk and 4 for a unit.
 
     Raises
@@ -120,7 +120,7 @@ def nonzero(scale: Array) -> Array:
     return scale
 
 
-def field_of(table: Table, name: str) -> NDArray[Any]:
+def field_of(table: DeviceTable, name: str) -> NDArray[Any]:
     """Return the values of a table's field."""
     (values,) = [field.values for field in table.fields if field.name == name]
     return np.asarray(values)

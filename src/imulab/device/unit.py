@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from imulab.device import _runtime
 from imulab.device.array_settings import ArraySettings, array_table
-from imulab.device.tables import Table, pack
+from imulab.device.tables import DeviceTable, pack
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.recording import Array
 
@@ -26,7 +26,7 @@ NOT_FINITE, GATED, STUCK, JUMPED, EXCLUDED, QUIET, BEYOND, ALONE = (1 << bit for
 _STATE = b"imulab.stream 1\n"
 
 
-class Unit:
+class DeviceUnit:
     """The tables of one unit in the C core.
 
     Parameters
@@ -47,7 +47,7 @@ class Unit:
             raise RecordError(str(error)) from None
 
     @classmethod
-    def of(cls, *tables: Table) -> Unit:
+    def of(cls, *tables: DeviceTable) -> DeviceUnit:
         """Return the unit of these tables, in double."""
         return cls(pack(tables, 8))
 
@@ -99,7 +99,7 @@ def _columns(columns: Sequence[Array]) -> tuple[Array, ...]:
 
 
 @dataclass(frozen=True)
-class Fused:
+class FusedBlock:
     """Fused samples: `rate` (m, axes); `flags` (m, axes, elements) uint8 and `weights` (m, axes, elements) if asked."""
 
     rate: Array
@@ -165,7 +165,7 @@ class Stream:
 
     def process(
         self, readings: Array, *, flags: bool = True, weights: bool = False, still: NDArray[np.bool_] | None = None
-    ) -> Fused:
+    ) -> FusedBlock:
         """Fuse the next samples.
 
         Parameters
@@ -193,7 +193,7 @@ class Stream:
         if quiet is not None and quiet.shape != (len(block),):
             raise DataError(f"expected still of shape ({len(block)},), found {quiet.shape}")
         _runtime.array_block(self._unit, self._state, block, quiet, rate, out_flags, out_weights)
-        return Fused(rate, out_flags, out_weights)
+        return FusedBlock(rate, out_flags, out_weights)
 
     def state(self) -> bytes:
         """Return settings and state as bytes, to go on with later by `from_state`, also in another process."""
@@ -235,7 +235,7 @@ def array_stream(method: str = "robust", elements: int = 0, axes: int = 1, **set
     return Stream(ArraySettings(method, elements, axes, **settings))
 
 
-def fuse_table(table: Table, readings: Array) -> Array:
+def fuse_table(table: DeviceTable, readings: Array) -> Array:
     """Return the rates (m, axes) of readings (m, axes * elements) fused from the start by an array's table."""
     unit = _runtime.load(pack([table], 8))
     rate = np.empty((len(readings), table.columns["axes"]))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from imulab.atomic_write import replacing
 from imulab.device.blob import make_blob
-from imulab.device.tables import KINDS, Field, Table
+from imulab.device.tables import KINDS, DeviceTable, Field
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.printable import printable
@@ -95,12 +95,12 @@ def _firmware(name: str) -> str:
     return (files("imulab.exporters") / "firmware" / name).read_text(encoding="utf-8")
 
 
-def _most_elements(tables: Sequence[Table]) -> int:
+def _most_elements(tables: Sequence[DeviceTable]) -> int:
     """Gyros per axis that the exported header has room for: its default, or what the unit has."""
     return max([_ELEMENTS, *(int(table.columns["elements"]) for table in tables if table.kind == "array")])
 
 
-def _header(tables: Sequence[Table]) -> str:
+def _header(tables: Sequence[DeviceTable]) -> str:
     """imulab.h, with room for the unit's array, so that no -D is needed."""
     text, default = _source("imulab.h"), f"#define IL_ARRAY_ELEMENTS {_ELEMENTS}\n"
     assert default in text
@@ -128,7 +128,7 @@ def _harmless(text: str) -> str:
     return text
 
 
-def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
+def _unit_h(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> str:
     kinds = {table.kind: table for table in tables}
     lines = [
         f"/* The numbers of {_who(records)}. */",
@@ -151,7 +151,7 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
     return "\n".join(lines)
 
 
-def _unit_c(records: Sequence[Calibration], tables: Sequence[Table]) -> str:
+def _unit_c(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> str:
     lines = [f"/* The numbers of {_who(records)}; made from the records"]
     lines += [f" *   {record.procedure} {_harmless(record.created)} SHA-256 {_digest(record)}" for record in records]
     lines += [
@@ -169,7 +169,7 @@ def _digest(record: Calibration) -> str:
     return str(record.to_dict()["content_sha256"])
 
 
-def _definition(table: Table) -> list[str]:
+def _definition(table: DeviceTable) -> list[str]:
     """The struct of one table, after the arrays that it points to."""
     pointed = [field for field in table.fields if field.pointed and field.values is not None]
     lines = [f"static const il_real {table.kind}_{field.name}[] = {{{_numbers(field.values)}}};" for field in pointed]
@@ -201,7 +201,7 @@ def _numbers(values: NDArray[Any] | None) -> str:
     return ", ".join(_number(float(value)) for value in np.asarray(values).reshape(-1))
 
 
-def _golden_h(tables: Sequence[Table], blob: bytes) -> str:
+def _golden_h(tables: Sequence[DeviceTable], blob: bytes) -> str:
     lines = [
         "/* Inputs, and what the desk made of them; for selftest.c only. */",
         "#ifndef GOLDEN_H",
@@ -218,7 +218,7 @@ def _golden_h(tables: Sequence[Table], blob: bytes) -> str:
     return "\n".join(lines)
 
 
-def _golden_vectors(table: Table) -> dict[str, Any]:
+def _golden_vectors(table: DeviceTable) -> dict[str, Any]:
     """Names, after ``golden_<kind>_``, and values of inputs and what the desk makes of them; an empty name counts."""
     known = section(table.kind)
     assert known is not None
@@ -241,7 +241,7 @@ def _nested(value: NDArray[Any]) -> str:
     return "{\n" + ",\n".join("    " + _nested(row) for row in value) + "}"
 
 
-def _readme(records: Sequence[Calibration], tables: Sequence[Table], blob_size: int) -> str:
+def _readme(records: Sequence[Calibration], tables: Sequence[DeviceTable], blob_size: int) -> str:
     from jinja2 import Environment, StrictUndefined
 
     # The output is Markdown and C, not HTML: nothing is escaped.

@@ -76,7 +76,7 @@ class Accelerometers:
 
 
 @dataclass(frozen=True)
-class Unit:
+class UnitModel:
     """The triads of one unit, and the record they come from."""
 
     record: Calibration
@@ -94,7 +94,7 @@ class Unit:
         ]
 
 
-def one_unit(records: Sequence[Calibration], target: str) -> Unit:
+def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
     """Return the triads of the one tumble record among the records.
 
     Raises
@@ -115,7 +115,7 @@ def one_unit(records: Sequence[Calibration], target: str) -> Unit:
         raise OptionError(f"{target}: expected one tumble record, found {len(records)}")
     (record,) = records
     try:
-        return Unit(record, _accelerometers(record), _gyroscopes(record))
+        return UnitModel(record, _accelerometers(record), _gyroscopes(record))
     except RecordError as error:
         raise RecordError(f"{target}: {error}") from None
 
@@ -166,7 +166,7 @@ def _to_si(unit: str, si: str) -> tuple[float, str]:
     return conversion_factor(unit, si), si
 
 
-def refuse_raw(unit: Unit, target: str) -> None:
+def refuse_raw(unit: UnitModel, target: str) -> None:
     """Refuse a record of outputs in counts or volts.
 
     Raises
@@ -198,7 +198,7 @@ def inverse_gain(held: Accelerometers) -> Callable[[Array], Array]:
 
 
 def held_accelerometers(
-    unit: Unit, correction: Callable[[Accelerometers], Callable[[Array], Any]], *, misalignment: bool
+    unit: UnitModel, correction: Callable[[Accelerometers], Callable[[Array], Any]], *, misalignment: bool
 ) -> tuple[Accelerometers, float, list[str]]:
     """Return the linear model that a target should hold: the record's own, or one fitted anew where more is left out.
 

@@ -11,7 +11,7 @@ from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
     AXES,
-    Unit,
+    UnitModel,
     accel_terms,
     held_accelerometers,
     inverse_gain,
@@ -85,7 +85,7 @@ def _value(column: Any, coefficient: str, name: str, file: str) -> float | None:
     return float(value)
 
 
-def bias_lines(unit: Unit) -> list[str]:
+def bias_lines(unit: UnitModel) -> list[str]:
     """Return the constant biases as comments, in the units of the outputs."""
     lines = ["constant bias has no key here, the program estimates it; as measured:"]
     triads = [("accelerometers", unit.accel), ("gyroscopes", unit.gyro)]
@@ -96,7 +96,7 @@ def bias_lines(unit: Unit) -> list[str]:
     return lines
 
 
-def unit_lines(unit: Unit) -> list[str]:
+def unit_lines(unit: UnitModel) -> list[str]:
     """Return comments that warn of outputs that are not in SI."""
     lines = []
     for name, triad in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
@@ -105,7 +105,7 @@ def unit_lines(unit: Unit) -> list[str]:
     return lines
 
 
-def without_nonlinearity(unit: Unit, target: str, options: ExportOptions) -> tuple[Unit, list[str]]:
+def without_nonlinearity(unit: UnitModel, target: str, options: ExportOptions) -> tuple[UnitModel, list[str]]:
     """Return the unit as a target with a full matrix and a bias holds it, and the comment on what is left out."""
     accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
     lost = settle_losses(target, (accel_terms(unit.accel, misalignment=False), error), how=how, options=options)

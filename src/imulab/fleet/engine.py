@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from imulab._version import VERSION
 from imulab.errors import OptionError, listed
 from imulab.fleet import processes
-from imulab.fleet.manifest import Unit
+from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.work import Job, Outcome, work
 
 ENGINES = ("local", "dask")
@@ -34,10 +34,10 @@ class WorkersLostError(Exception):
 class Engine(Protocol):
     """Something that works on units."""
 
-    def run(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
+    def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
         """Work on the units, and give each outcome as it comes; raises WorkersLostError."""
 
-    def run_alone(self, unit: Unit, job: Job) -> Iterator[Outcome]:
+    def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
         """Work on one unit with nothing beside it, in a process that may end."""
 
 
@@ -47,17 +47,17 @@ class LocalEngine:
     def __init__(self, workers: int) -> None:
         self.workers = workers
 
-    def run(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
+    def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
         """Work on the units in several processes."""
         workers = min(self.workers, max(len(units), 1))
         return (work(unit, job) for unit in units) if workers == 1 else _local(units, job, workers)
 
-    def run_alone(self, unit: Unit, job: Job) -> Iterator[Outcome]:
+    def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
         """Work on one unit in a process of its own."""
         return _local([unit], job, 1)
 
 
-def _local(units: Sequence[Unit], job: Job, workers: int) -> Iterator[Outcome]:
+def _local(units: Sequence[FleetUnit], job: Job, workers: int) -> Iterator[Outcome]:
     try:
         yield from processes.run(work, ((unit, job) for unit in units), workers)
     except processes.ProcessLostError as error:
@@ -71,7 +71,7 @@ class DaskEngine:
         self._client = client
         self._name = name
 
-    def run(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
+    def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
         """Work on the units on the cluster, and see to it that a lost cluster is noticed."""
         results: queue.SimpleQueue[Outcome | BaseException | None] = queue.SimpleQueue()
 
@@ -99,7 +99,7 @@ class DaskEngine:
                 raise WorkersLostError(str(result)) from None
             yield result
 
-    def _outcomes(self, units: Sequence[Unit], job: Job) -> Iterator[Outcome]:
+    def _outcomes(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
         """Give each outcome as it comes; the scheduler has a few units for each thread."""
         from distributed import as_completed
 
@@ -111,7 +111,7 @@ class DaskEngine:
             yield outcome
             running.update(list(islice(waiting, 1)))  # type: ignore[no-untyped-call]
 
-    def run_alone(self, unit: Unit, job: Job) -> Iterator[Outcome]:
+    def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
         """Work on one unit."""
         return self.run([unit], job)
 

@@ -12,7 +12,7 @@ import numpy as np
 from imulab.fleet import panels as small
 from imulab.fleet.display import display_of
 from imulab.fleet.reporttables import number
-from imulab.fleet.statistics import Change, ParameterStatistics, change_limit
+from imulab.fleet.statistics import FleetChange, ParameterStatistics, change_limit
 from imulab.report import panels as grid
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import BAD, GOOD, QUIET, Figure
@@ -202,7 +202,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
     )
 
 
-def change_figure(title: str, changes: Sequence[Change]) -> Figure | None:
+def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
     """Draw every change since the last calibration in its standard uncertainties, a column for each parameter."""
     usable = [change for change in changes if change.deviations is not None and not change.same_files]
     if not usable:

@@ -20,7 +20,7 @@ _RESERVED = {"con", "prn", "aux", "nul", *(f"{name}{digit}" for name in ("com", 
 
 
 @dataclass(frozen=True)
-class Unit:
+class FleetUnit:
     """One row: the unit, the procedure, its files and the texts of its options, as the manifest has them."""
 
     serial: str
@@ -35,7 +35,7 @@ class FleetManifest:
 
     name: str
     base: str
-    units: tuple[Unit, ...]
+    units: tuple[FleetUnit, ...]
 
 
 def load_fleet(path: str) -> FleetManifest:
@@ -67,7 +67,7 @@ def load_fleet(path: str) -> FleetManifest:
     rows = _parquet(data, path) if data.startswith(b"PAR1") else _csv(data, path)
     titles = rows[0][1]
     _check_columns(titles, path)
-    units: list[Unit] = []
+    units: list[FleetUnit] = []
     seen: dict[str, tuple[str, str]] = {}
     for place, cells in rows[1:]:
         unit = _unit(place, dict(zip(titles, cells, strict=True)))
@@ -135,7 +135,7 @@ def _check_columns(titles: Sequence[str], name: str) -> None:
             raise OptionError(f"{name}: column {title} appears twice")
 
 
-def _unit(place: str, cells: Mapping[str, str]) -> Unit:
+def _unit(place: str, cells: Mapping[str, str]) -> FleetUnit:
     serial, procedure = cells["serial"], cells["procedure"]
     _check_serial(serial, place)
     if procedure not in PROCEDURES:
@@ -158,7 +158,7 @@ def _unit(place: str, cells: Mapping[str, str]) -> Unit:
         task.values(options, "column {}")
     except OptionError as error:
         raise OptionError(f"{place}: {error}") from None
-    return Unit(serial, procedure, files, dict(sorted(options.items())))
+    return FleetUnit(serial, procedure, files, dict(sorted(options.items())))
 
 
 def _check_serial(serial: str, place: str) -> None:

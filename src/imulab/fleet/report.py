@@ -13,7 +13,7 @@ from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
 from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_state, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
-    Change,
+    FleetChange,
     ParameterStatistics,
     change_limit,
     changes_since,
@@ -24,7 +24,7 @@ from imulab.fleet.store import Store
 from imulab.fleet.work import Summary
 from imulab.procedures.registry import PROCEDURES
 from imulab.report import render_page
-from imulab.report.elements import Exhibits, Figure, Table
+from imulab.report.elements import Exhibits, Figure, ReportTable
 
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
@@ -84,7 +84,9 @@ def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tup
     return fleet_exhibits(state, statistics, changes), found
 
 
-def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics], changes: Sequence[Change]) -> Exhibits:
+def fleet_exhibits(
+    state: FleetState, statistics: Sequence[ParameterStatistics], changes: Sequence[FleetChange]
+) -> Exhibits:
     """Return what the report shows."""
     out = {serial for item in statistics for serial, o in zip(item.serials, item.outliers, strict=True) if o}
     capable = [item for item in statistics if item.capability is not None]
@@ -112,7 +114,7 @@ def fleet_exhibits(state: FleetState, statistics: Sequence[ParameterStatistics],
         facts.append(("changed since last", str(len(moved))))
     if moved:
         said.append(f"{_named(sorted(moved))} changed since the last calibration")
-    items: list[Figure | Table | None] = [reporttables.failure_table(state.failures)]
+    items: list[Figure | ReportTable | None] = [reporttables.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = PROCEDURES[procedure].line_title
         mine = [item for item in statistics if item.procedure == procedure]

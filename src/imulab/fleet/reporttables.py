@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from imulab.fleet.display import display_of
-from imulab.fleet.statistics import Change, ParameterStatistics, change_limit
+from imulab.fleet.statistics import FleetChange, ParameterStatistics, change_limit
 from imulab.fleet.table import Row
-from imulab.report.elements import Table, format_uncertain, plain_number
+from imulab.report.elements import ReportTable, format_uncertain, plain_number
 
 _MOST_ROWS = 40
 
@@ -20,7 +20,7 @@ def number(value: float, digits: int = 4) -> str:
     return plain_number(value, digits) if math.isfinite(value) else "–"
 
 
-def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Table:
+def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> ReportTable:
     """Return one line for each parameter: where it lies, how it spreads, what stands out, drifts, and is capable of."""
     rows = []
     for item in statistics:
@@ -56,7 +56,7 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Tabl
             ]
         )
     titles = ["parameter", "unit", "units", "median", "robust σ", "σ", "typical u", "stand out", "drift per day"]
-    return Table(
+    return ReportTable(
         f"{title}: every parameter",
         "Robust σ is 1.4826 times the median distance from the median; where σ is much larger, single units stand out. "
         "Where the typical standard uncertainty u is not well below σ, the spread is the calibration's, not the "
@@ -74,7 +74,7 @@ def _places(scale: float) -> int:
     return min(max(0, 2 - math.floor(math.log10(scale))), 9)
 
 
-def outlier_table(statistics: Sequence[ParameterStatistics]) -> Table | None:
+def outlier_table(statistics: Sequence[ParameterStatistics]) -> ReportTable | None:
     """List the units that stand out, furthest first."""
     rows = []
     for item in statistics:
@@ -90,7 +90,7 @@ def outlier_table(statistics: Sequence[ParameterStatistics]) -> Table | None:
         return None
     rows.sort(key=lambda row: -row[0])
     more = f" The first {_MOST_ROWS} of {len(rows)}." if len(rows) > _MOST_ROWS else ""
-    return Table(
+    return ReportTable(
         "Units that stand out",
         "Robust z: distance from the median in robust standard deviations." + more,
         ["serial", "parameter", "value", "u", "unit", "robust z"],
@@ -98,7 +98,7 @@ def outlier_table(statistics: Sequence[ParameterStatistics]) -> Table | None:
     )
 
 
-def change_table(changes: Sequence[Change]) -> Table | None:
+def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
     """List the largest changes since the last calibration."""
     if not changes:
         return None
@@ -119,7 +119,7 @@ def change_table(changes: Sequence[Change]) -> Table | None:
             ]
         )  # fmt: skip
     again = sum(change.same_files for change in changes)
-    return Table(
+    return ReportTable(
         "Largest changes since the last calibration",
         f"{len(changes)} parameters have an earlier value; the first {len(rows)} by their change in normal "
         "deviations, with the uncertainties of both calibrations."
@@ -129,12 +129,12 @@ def change_table(changes: Sequence[Change]) -> Table | None:
     )
 
 
-def failure_table(failures: Sequence[Row]) -> Table | None:
+def failure_table(failures: Sequence[Row]) -> ReportTable | None:
     """List the units that failed."""
     if not failures:
         return None
     more = f" The first {_MOST_ROWS} of {len(failures)}." if len(failures) > _MOST_ROWS else ""
-    return Table(
+    return ReportTable(
         "Units that failed",
         "They have no record; the next run tries them again." + more,
         ["serial", "file", "reason"],

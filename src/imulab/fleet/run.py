@@ -15,7 +15,7 @@ from imulab.atomic_write import real_path, write_text
 from imulab.errors import OptionError
 from imulab.fleet.engine import Engine, WorkersLostError, open_engine
 from imulab.fleet.history import History, open_history
-from imulab.fleet.manifest import FleetManifest, Unit, load_fleet
+from imulab.fleet.manifest import FleetManifest, FleetUnit, load_fleet
 from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
@@ -327,7 +327,7 @@ def fleet_state(folder: str) -> FleetState:
     return FleetState(folder, fleet, tuple(_row(store, unit) for unit in fleet.units), at_work=store.at_work())
 
 
-def _row(store: Store, unit: Unit) -> Row:
+def _row(store: Store, unit: FleetUnit) -> Row:
     reason = store.reason(unit.serial)
     if reason is not None:
         return Row(unit, FAILED, reason, None)

@@ -96,7 +96,7 @@ class ParameterStatistics:
 
 
 @dataclass(frozen=True)
-class Change:
+class FleetChange:
     """A parameter of a unit against its last calibration.
 
     Attributes
@@ -266,7 +266,7 @@ def capability(values: Array, serials: Sequence[str], limits: Limits) -> Capabil
     return Capability(limits, cpk, at_least, beyond)
 
 
-def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past]]) -> list[Change]:
+def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past]]) -> list[FleetChange]:
     """Return what changed in every unit since the last calibration of the same procedure before its present one."""
     changes = []
     for summary in summaries:
@@ -280,7 +280,7 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
                 continue
             u, z = _compared(new, summary.freedom, old, last.freedom)
             changes.append(
-                Change(
+                FleetChange(
                     summary.serial, summary.procedure, name, new.unit, last.when, old.value, new.value, u, z, same
                 )
             )  # fmt: skip

@@ -22,7 +22,7 @@ from typing import Any
 
 from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
-from imulab.fleet.manifest import FleetManifest, Unit
+from imulab.fleet.manifest import FleetManifest, FleetUnit
 from imulab.procedures.loading import load_sealed
 from imulab.records.calibration import Calibration
 
@@ -169,7 +169,7 @@ class Store:
         except OSError:
             return set()
 
-    def fail(self, unit: Unit, reason: str) -> None:
+    def fail(self, unit: FleetUnit, reason: str) -> None:
         """Write why a unit failed; a record of other files or options that it has is put aside."""
         write_text(self.failure(unit.serial), json.dumps({**asdict(unit), "reason": reason}, ensure_ascii=False))
         record = self.record(unit.serial)
@@ -186,7 +186,7 @@ class Store:
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
-    def made_for(self, unit: Unit) -> tuple[Calibration, str] | None:
+    def made_for(self, unit: FleetUnit) -> tuple[Calibration, str] | None:
         """Return the unit's record and its hash if it is whole and was made from files and options of this name.
 
         That the files still hold the same is for the caller to see.
@@ -215,7 +215,7 @@ class Store:
         try:
             content = json.loads((self.hidden / "manifest.json").read_text(encoding="utf-8"))
             units = tuple(
-                Unit(item["serial"], item["procedure"], tuple(item["files"]), dict(item["options"]))
+                FleetUnit(item["serial"], item["procedure"], tuple(item["files"]), dict(item["options"]))
                 for item in content["units"]
             )
             return FleetManifest(content["name"], content["base"], units)
@@ -223,7 +223,7 @@ class Store:
             raise OptionError(f"{self.folder}: expected a folder that 'imulab fleet run' has written to") from None
 
 
-def asked_of(unit: Unit) -> dict[str, Any]:
+def asked_of(unit: FleetUnit) -> dict[str, Any]:
     """Return what identifies the work on a unit, as its record keeps it."""
     return {"procedure": unit.procedure, "files": list(unit.files), "options": dict(unit.options)}
 

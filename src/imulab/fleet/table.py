@@ -11,7 +11,7 @@ from typing import Any
 
 from imulab.atomic_write import real_path, replacing
 from imulab.errors import OptionError
-from imulab.fleet.manifest import Unit
+from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.work import Summary
 from imulab.writers import check_writable
 
@@ -22,7 +22,7 @@ HEAD = ("serial", "procedure", "status", "reason", "warnings", "date", "created"
 class Row:
     """One unit: ``done``, ``failed`` or ``missing``, with its reason or the summary of its record."""
 
-    unit: Unit
+    unit: FleetUnit
     status: str
     reason: str
     summary: Summary | None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from imulab.atomic_write import write_text
 from imulab.errors import ImulabError
-from imulab.fleet.manifest import Unit
+from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.sources import UnitFiles
 from imulab.fleet.store import MOST_ATTEMPTS, Store, asked_of
 from imulab.procedures.run import run_task
@@ -67,7 +67,7 @@ class Outcome:
     text: str | None = field(default=None, repr=False)
 
 
-def work(unit: Unit, job: Job) -> Outcome:
+def work(unit: FleetUnit, job: Job) -> Outcome:
     """Make the record of one unit, unless it is there already and was made from the same files and options."""
     if job.folder is None:
         return _fit(unit, job, None)
@@ -88,7 +88,7 @@ def work(unit: Unit, job: Job) -> Outcome:
         return outcome
 
 
-def _fit(unit: Unit, job: Job, store: Store | None) -> Outcome:
+def _fit(unit: FleetUnit, job: Job, store: Store | None) -> Outcome:
     try:
         with UnitFiles(job.base) as files:
             if store is not None:
@@ -109,7 +109,7 @@ def _fit(unit: Unit, job: Job, store: Store | None) -> Outcome:
         return Outcome(unit.serial, FAILED, _one_line(f"{type(error).__name__}: {error} (a fault of imulab)"))
 
 
-def make_record(unit: Unit, files: UnitFiles) -> Calibration:
+def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
     """Fit a unit as the single command does, and add what it was made from."""
     record = run_task(unit.procedure, unit.files, unit.options, files, label="column {}")
     others = [serial for serial in files.serials if serial != unit.serial]

@@ -9,7 +9,7 @@ from hashlib import sha256
 from typing import Any
 
 from imulab.device.blob import Blob
-from imulab.device.unit import Unit
+from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, RecordError
 from imulab.procedures.procedure import Section
 from imulab.procedures.registry import procedure_of, section
@@ -39,7 +39,7 @@ class Loaded:
         Whether it is applied to a recording that it corrected before.
     """
 
-    unit: Unit
+    unit: DeviceUnit
     sections: tuple[tuple[Section, Mapping[str, Any]], ...]
     name: str
     holds: tuple[str, ...]
@@ -77,14 +77,14 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         if not chain:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         holds = (sha256(record.data).hexdigest(), *map(str, record.text.get("records", ())))
-        return Loaded(Unit(record.data), chain, name or record.name, holds, again)
+        return Loaded(DeviceUnit(record.data), chain, name or record.name, holds, again)
     made_by = procedure_of(record)
     if made_by.not_applied:
         raise RecordError(f"a {record.procedure} record cannot be applied: {made_by.not_applied}")
     tables = tables_of(record)
     called = name or f"{record.procedure} {record.sensor.get('serial', '')}".rstrip()
     chain = tuple((made_by.section(table.kind), {**table.columns, **columns}) for table in tables)
-    return Loaded(Unit.of(*tables), chain, called, (record.sealed()[0],), again)
+    return Loaded(DeviceUnit.of(*tables), chain, called, (record.sealed()[0],), again)
 
 
 def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: bool = False) -> Recording:

@@ -17,8 +17,8 @@ from imulab.procedures.options import Option
 if TYPE_CHECKING:
     import numpy as np
 
-    from imulab.device.tables import Table
-    from imulab.device.unit import Unit
+    from imulab.device.tables import DeviceTable
+    from imulab.device.unit import DeviceUnit
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
@@ -109,8 +109,8 @@ class Section:
     """
 
     kind: str
-    golden: Callable[[Table, np.random.Generator], dict[str, Any]]
-    apply: Callable[[Unit, Mapping[str, Any], Recording], Recording] | None = None
+    golden: Callable[[DeviceTable, np.random.Generator], dict[str, Any]]
+    apply: Callable[[DeviceUnit, Mapping[str, Any], Recording], Recording] | None = None
     triad: str | None = None
     unchanged: Callable[[Mapping[str, Any], Recording], str | None] | None = None
     remarks: Callable[[Mapping[str, Any], Recording], list[str]] | None = None
@@ -167,7 +167,7 @@ class Procedure:
     task: Task
     check: Callable[[Calibration], None]
     exhibits: Callable[[Calibration], Exhibits]
-    tables: Callable[..., tuple[Table, ...]]
+    tables: Callable[..., tuple[DeviceTable, ...]]
     sections: tuple[Section, ...]
     fuses: bool = False
     elsewhere: str | None = None

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from imulab.device.array_settings import Fusion
-from imulab.device.tables import Table
+from imulab.device.tables import DeviceTable
 from imulab.errors import RecordError
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
 
 
-def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table, ...]:
+def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
     """Return the tables of a record, in the order in which they are applied.
 
     An array fuses by `fusion`; by what its record carries where that is None.
@@ -25,7 +25,7 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table,
     return made_by.tables(record, fusion) if made_by.fuses else made_by.tables(record)
 
 
-def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[Table]:
+def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[DeviceTable]:
     """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
 
     Raises

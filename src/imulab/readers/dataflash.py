@@ -16,7 +16,7 @@ import numpy as np
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
-from imulab.readers.streams import Piece, Stream, on_one_clock
+from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Array, Recording
 
 MAGIC = b"\xa3\x95\x80"
@@ -218,7 +218,7 @@ def _version(contents: _Contents, form: _Format, records: logs.Records, kind: in
 
 def _choose(
     contents: _Contents, selection: Selection, name: str
-) -> tuple[list[Stream], dict[int, list[tuple[int, int | None, tuple[str, ...]]]]]:
+) -> tuple[list[LoggedStream], dict[int, list[tuple[int, int | None, tuple[str, ...]]]]]:
     """Return the streams, and for each message type its stream, instance and fields."""
     if selection.topic not in (None, "IMU", "ACC", "GYR"):
         raise OptionError(f"{name}: topic {selection.topic!r}; of a DataFlash log these can be read: IMU ACC GYR")
@@ -256,19 +256,19 @@ def _choose(
     form = contents.formats[kind]
     if topic == "GYR":
         sources[kind] = [(0, number, _FIELDS["GYR"])]
-        return [Stream("gyroscope", _GYRO)], sources
+        return [LoggedStream("gyroscope", _GYRO)], sources
     if topic == "IMU":
         # "Temp" in old logs
         warm = tuple(key for key in ("T", "Temp") if key in form.fields and form.fields[key].kind[0] != "S")[:1]
         sources[kind] = [(0, number, (*_FIELDS["IMU"], *warm))]
         units = {**_ACCEL, **_GYRO, **({"temperature": "degC"} if warm else {})}
-        return [Stream("accelerometer", units)], sources
+        return [LoggedStream("accelerometer", units)], sources
     sources[kind] = [(0, number, _FIELDS["ACC"])]
-    streams = [Stream("accelerometer", _ACCEL)]
+    streams = [LoggedStream("accelerometer", _ACCEL)]
     if ("GYR", instance) in there:
         kind, number = there["GYR", instance]
         sources[kind] = [(1, number, _FIELDS["GYR"])]
-        streams.append(Stream("gyroscope", _GYRO))
+        streams.append(LoggedStream("gyroscope", _GYRO))
     return streams, sources
 
 

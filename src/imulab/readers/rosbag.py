@@ -20,7 +20,7 @@ from imulab.readers import logs
 from imulab.readers.rosfiles import Container, Topic, open_container
 from imulab.readers.rosfolder import files_of
 from imulab.readers.selection import Selection
-from imulab.readers.streams import Piece, Stream, on_one_clock
+from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Array, Recording
 
 _IMU, _TEMPERATURE = "sensor_msgs/Imu", "sensor_msgs/Temperature"
@@ -54,13 +54,13 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     there, pieces = _reported(_pieces(files, slots, name), name, chosen[0])
     if len(chosen) == 2:
         taken = [slice(0, 3), slice(3, 6)]
-        streams = [Stream("accelerometer", _ACCEL), Stream("gyroscope", _GYRO)]
+        streams = [LoggedStream("accelerometer", _ACCEL), LoggedStream("gyroscope", _GYRO)]
     else:
         if not any(there):
             raise ReadError(f"{name}: {chosen[0]} reports neither specific force nor rate (covariance -1 or nan)")
         taken = [slice(0 if there[0] else 3, 6 if there[1] else 3)]
         streams = [
-            Stream(
+            LoggedStream(
                 "accelerometer" if there[0] else "gyroscope",
                 {**(_ACCEL if there[0] else {}), **(_GYRO if there[1] else {})},
             )
@@ -72,7 +72,7 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
         ]
     if warm is not None:
         taken.append(slice(0, 1))
-        streams.append(Stream("temperature", {"temperature": "degC"}, slow=True))
+        streams.append(LoggedStream("temperature", {"temperature": "degC"}, slow=True))
     yield from on_one_clock(
         streams,
         (Piece(p.stream, p.ticks, p.values[:, taken[p.stream]]) for p in pieces),

@@ -27,7 +27,7 @@ _MUCH = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class LoggedStream:
     """The columns of one stream, what to call it, and whether its values are slow enough to bridge any gap."""
 
     what: str
@@ -47,7 +47,7 @@ class Piece:
 class _Buffer:
     """Samples of a stream that are not used up yet."""
 
-    def __init__(self, stream: Stream) -> None:
+    def __init__(self, stream: LoggedStream) -> None:
         self.stream = stream
         self.ticks: Ticks = np.empty(0, dtype=np.int64)
         self.values: Array = np.empty((0, len(stream.units)))
@@ -82,7 +82,7 @@ class _Buffer:
 
 
 def on_one_clock(
-    streams: Sequence[Stream],
+    streams: Sequence[LoggedStream],
     pieces: Iterable[Piece],
     *,
     name: str,

@@ -16,7 +16,7 @@ import numpy as np
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
-from imulab.readers.streams import Piece, Stream, on_one_clock
+from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Recording
 
 MAGIC = b"ULog\x01\x12\x35"
@@ -154,7 +154,7 @@ def _define(contents: _Contents, kind: str, payload: bytes, name: str) -> None:
 
 def _choose(
     contents: _Contents, selection: Selection, name: str
-) -> tuple[list[Stream], dict[int, tuple[int, str, dict[str, _Field]]]]:
+) -> tuple[list[LoggedStream], dict[int, tuple[int, str, dict[str, _Field]]]]:
     """Return the streams, and for each subscription its stream, its topic and where its fields are."""
     topic = selection.topic
     if topic is not None and topic not in _TOPICS:
@@ -196,7 +196,7 @@ def _choose(
     several = [f"{title} {number}" for title, number in sorted(there) if title in wanted]
     if len(several) > len(chosen):
         contents.notes.append(f"instance {instance} of {', '.join(several)}")
-    streams: list[Stream] = []
+    streams: list[LoggedStream] = []
     sources: dict[int, tuple[int, str, dict[str, _Field]]] = {}
     for title in chosen:
         number = there[title, instance]
@@ -209,11 +209,11 @@ def _choose(
         sources[number] = (len(streams), title, fields)
         if title == "sensor_accel":
             warm = {"temperature": "degC"} if "temperature" in fields else {}
-            streams.append(Stream("accelerometer", {**_ACCEL, **warm}))
+            streams.append(LoggedStream("accelerometer", {**_ACCEL, **warm}))
         elif title == "sensor_gyro":
-            streams.append(Stream("gyroscope", _GYRO))
+            streams.append(LoggedStream("gyroscope", _GYRO))
         else:
-            streams += [Stream("accelerometer", _ACCEL), Stream("gyroscope", _GYRO)]
+            streams += [LoggedStream("accelerometer", _ACCEL), LoggedStream("gyroscope", _GYRO)]
             contents.notes.append("sensor_combined holds outputs that PX4 has already corrected")
     return streams, sources
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import RecordError
-from imulab.estimation.estimate import chi_square_probability, coverage_factor
+from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 

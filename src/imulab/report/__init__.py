@@ -13,7 +13,7 @@ from importlib.resources import files
 from typing import Any
 
 from imulab.records.calibration import Calibration
-from imulab.report.elements import Exhibits, Figure, Table
+from imulab.report.elements import Exhibits, Figure, ReportTable
 from imulab.report.narrow import narrow
 from imulab.verdict import SENTENCES, Verdict
 
@@ -61,7 +61,7 @@ def render_page(
     )
 
 
-def _column_kinds(table: Table) -> list[str]:
+def _column_kinds(table: ReportTable) -> list[str]:
     """Return ``unit`` or ``text`` for the columns that hold no number; the first stands at the left anyway."""
     found = [""] * len(table.columns)
     for number, title in enumerate(table.columns[1:], start=1):

@@ -27,7 +27,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """A table: column titles, rows of text, how to read it, the row to highlight, and what it shows."""
 
     title: str
@@ -54,7 +54,7 @@ class Exhibits:
 
     headline: str
     facts: list[tuple[str, str]]
-    items: list[Figure | Table]
+    items: list[Figure | ReportTable]
 
 
 def plain_number(value: float, digits: int) -> str:

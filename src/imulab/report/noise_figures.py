@@ -12,7 +12,7 @@ from imulab._version import VERSION
 from imulab.recording import Array, Recording
 from imulab.report import panels, render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, Table, format_uncertain, plain_number
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
 from imulab.verdict import Note, verdict_of
 
 _HOUR = 3600.0
@@ -55,8 +55,8 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
     known = [f"{row[0]} {row[2]} ± {row[3]} {row[4]}" for row in white if row[2] != "not determined"]
     more = f" and {len(known) - _MOST_NAMED} more columns in the table" if len(known) > _MOST_NAMED else ""
     lost = f"; not determined for {len(white) - len(known)} of {len(white)} columns" if len(known) < len(white) else ""
-    items: list[Figure | Table] = [
-        Table(
+    items: list[Figure | ReportTable] = [
+        ReportTable(
             "Noise coefficients",
             "Value and standard uncertainty u. Angle (velocity) random walk: the white noise of the rate (specific "
             "force). Bias instability: the level of 1/f noise, below which no averaging helps. Rate (acceleration) "

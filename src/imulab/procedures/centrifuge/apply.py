@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.unit import Unit
+from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.procedures.centrifuge.sections import highest_force
 from imulab.recording import Array, Recording
@@ -19,7 +19,7 @@ _BEYOND = 1.001
 """The highest level is not exceeded by its own rounding."""
 
 
-def apply_centrifuge(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+def apply_centrifuge(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
     """Return the recording with ``K(a) (a_x cos theta + a_y sin theta)`` subtracted from `dtg_x` and `dtg_y`.
 
     ``a = hypot(a_x, a_y)`` of the level specific force; units are kept, the rest is unchanged, NaN passes.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import OptionError, listed
-from imulab.estimation.estimate import chi_square_limit, chi_square_probability
+from imulab.estimation.least_squares import chi_square_limit, chi_square_probability
 from imulab.estimation.order_blend import blend
 from imulab.procedures.centrifuge.choices import CURVES
 from imulab.recording import Array

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.tables import Field, Table, field_of
-from imulab.device.unit import Unit
+from imulab.device.tables import DeviceTable, Field, field_of
+from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
 from imulab.procedures.centrifuge.sections import highest_force
 from imulab.recording import Array
@@ -17,7 +17,7 @@ _CURVE_UNITS = {"K0": "rad/s/(m/s^2)", "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2", "
 _VECTORS = 64
 
 
-def tables_of(record: Calibration) -> tuple[Table, ...]:
+def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the table of a centrifuge record.
 
     Raises
@@ -45,7 +45,7 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
         )
 
     highest = highest_force(record)
-    table = Table(
+    table = DeviceTable(
         "centrifuge",
         (
             Field("has", np.array([axis in axes for axis in "xy"], dtype=np.int64)),
@@ -59,12 +59,12 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
     return (table,)
 
 
-def golden(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return rates under specific forces up to the highest level, and what is left of them."""
     force = rng.uniform(-1, 1, (_VECTORS, 2)) * float(field_of(table, "highest")) / np.sqrt(2)
     rate = rng.uniform(-1, 1, (_VECTORS, 2)) * 0.01  # rad/s
     rate[1, 0] = np.nan
-    out, _ = Unit.of(table).centrifuge(list(force.T), list(rate.T))
+    out, _ = DeviceUnit.of(table).centrifuge(list(force.T), list(rate.T))
     expected = np.column_stack([column for column in out if column is not None])
     scale = float(np.nanmax(np.abs(np.concatenate([rate, expected]))))
     return {"": _VECTORS, "scale": scale, "force": force, "rate": rate, "expected": expected}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import RecordError
-from imulab.estimation.estimate import coverage_factor
+from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.centrifuge.model import curve
 from imulab.procedures.centrifuge.sections import Centrifuge, centrifuge_of, force_of, level_of
 from imulab.procedures.centrifuge.tables import (
@@ -22,7 +22,7 @@ from imulab.procedures.centrifuge.tables import (
 )
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, format_uncertain
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, format_uncertain
 from imulab.units import STANDARD_GRAVITY, from_si
 
 _POINTS = 121
@@ -43,7 +43,7 @@ def exhibits(record: Calibration) -> Exhibits:
     sets, r = prefixes(record), centrifuge_of(record)
     if not sets or not all(numbers(record, prefix) for prefix in sets):
         raise RecordError("the record lacks x_K0, or the K of any level")
-    items: list[Figure | Table] = [_zeta(record, sets)]
+    items: list[Figure | ReportTable] = [_zeta(record, sets)]
     if any(f"{p}direction" in record.parameters for p in sets):
         items.append(_polar(record, [p for p in sets if f"{p}direction" in record.parameters]))
     items += [_repeatability(record, r, sets), *_spectra(r)]

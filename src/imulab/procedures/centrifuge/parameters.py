@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imulab.estimation.estimate import chi_square_probability, coverage_factor
+from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.procedures.centrifuge.curve import CurveFit, fit_curve
 from imulab.procedures.centrifuge.levels import Level, Levels, as_vector
 from imulab.procedures.centrifuge.manifest import Manifest

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError
-from imulab.estimation.estimate import coverage_factor
+from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.centrifuge.cells import Cells
 from imulab.procedures.centrifuge.model import EARTH_RATE
-from imulab.procedures.centrifuge.regress import LINE, ROOM, Complex, Solution, basis, refine, scatter, solve
+from imulab.procedures.centrifuge.regress import LINE, ROOM, Complex, Regression, basis, refine, scatter, solve
 from imulab.procedures.centrifuge.spectra import (
     FAINT,
     PEAK,
@@ -52,7 +52,7 @@ class Rates:
         What a user should know.
     """
 
-    solution: Solution
+    solution: Regression
     table_rate: float
     table_uncertainty: float | None
     origin: str
@@ -148,7 +148,7 @@ def _mismatch(expected: float, found: float, place: str) -> DataError:
     )
 
 
-def _check_units(solution: Solution, noise: Complex, place: str) -> list[str]:
+def _check_units(solution: Regression, noise: Complex, place: str) -> list[str]:
     """Check Earth rate for a size that it cannot have, and the gyroscope's size and direction against the FOG's."""
     line = solution.line(ROOM)
     fog, earth = line[-1], float(abs(line[-1]))
@@ -178,14 +178,14 @@ def _check_units(solution: Solution, noise: Complex, place: str) -> list[str]:
     return warnings
 
 
-def _noise(cells: Cells, solution: Solution, row: int) -> tuple[Complex, float]:
+def _noise(cells: Cells, solution: Regression, row: int) -> tuple[Complex, float]:
     """Noise of a line by its scatter over blocks, or by the residuals where the run is too short, and its freedom."""
     least = 2 * np.pi / max(abs(cells.net_rate), 1e-9) if row == ROOM else 0.0
     found = scatter(cells, solution, row, least=min(least, cells.duration / 3))
     return (residual_noise(cells, solution), 1e9) if found is None else (found.noise, found.freedom)
 
 
-def residual_noise(cells: Cells, solution: Solution) -> Complex:
+def residual_noise(cells: Cells, solution: Regression) -> Complex:
     """Return the covariance of a sample's residuals: that of white noise, shape (k, k)."""
     columns = cells.moments.shape[1] - len(cells.offset)
     P = basis(cells, solution.middle, solution.half, solution.table_shift, solution.net_shift) @ solution.coefficients
@@ -197,7 +197,7 @@ def residual_noise(cells: Cells, solution: Solution) -> Complex:
     return noise
 
 
-def _significant(solution: Solution, row: int, channel: int, noise: Complex) -> bool:
+def _significant(solution: Regression, row: int, channel: int, noise: Complex) -> bool:
     size = abs(solution.line(row)[channel])
     power = 2 * solution.gain(row) * float(noise[channel, channel].real)
     return bool(size > FAINT and size**2 > _SIGNIFICANT * power)

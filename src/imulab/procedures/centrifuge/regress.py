@@ -39,7 +39,7 @@ _STEPS = 30
 
 
 @dataclass(frozen=True)
-class Solution:
+class Regression:
     """Lines of all channels of a run.
 
     Attributes
@@ -95,7 +95,7 @@ def basis(cells: Cells, middle: float, half: float, table_shift: float, net_shif
     return P
 
 
-def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> Solution:
+def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> Regression:
     """Regress all channels at the cells' rates plus the given shifts."""
     middle, half = _span(cells)
     P = basis(cells, middle, half, table_shift, net_shift)
@@ -103,7 +103,7 @@ def solve(cells: Cells, table_shift: float = 0.0, net_shift: float = 0.0) -> Sol
     kept = _independent(normal)
     inverse = np.zeros((SIZE, SIZE))
     inverse[np.ix_(kept, kept)] = _inverse(normal[np.ix_(kept, kept)])
-    return Solution(inverse @ right, inverse, table_shift, net_shift, middle, half, kept)
+    return Regression(inverse @ right, inverse, table_shift, net_shift, middle, half, kept)
 
 
 def _span(cells: Cells) -> tuple[float, float]:
@@ -226,7 +226,7 @@ class Scatter:
 
 
 def scatter(
-    cells: Cells, solution: Solution, row: int = LINE, *, least: float = 0.0, blocks: int = _BLOCKS
+    cells: Cells, solution: Regression, row: int = LINE, *, least: float = 0.0, blocks: int = _BLOCKS
 ) -> Scatter | None:
     """Return the scatter of a line over blocks of at least `least` seconds; None with fewer than three of them.
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.estimate import chi_square_limit, excess_variance
+from imulab.estimation.least_squares import chi_square_limit, excess_variance
 from imulab.recording import Array
 
 _LEVEL = 0.05

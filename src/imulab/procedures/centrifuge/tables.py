@@ -6,7 +6,7 @@ import numpy as np
 
 from imulab.procedures.centrifuge.sections import CycleRow, Error, Fit, Level, Line, Run
 from imulab.records.calibration import Calibration
-from imulab.report.elements import Table, format_uncertain, plain_number
+from imulab.report.elements import ReportTable, format_uncertain, plain_number
 from imulab.units import STANDARD_GRAVITY, from_si
 
 PER_G = float(from_si(STANDARD_GRAVITY, "deg/h"))
@@ -31,7 +31,7 @@ _BUDGET = {
 }
 
 
-def parameters_table(record: Calibration, fit: Fit) -> Table:
+def parameters_table(record: Calibration, fit: Fit) -> ReportTable:
     """Return every parameter with its uncertainty and interval."""
     rows = []
     for name, parameter in record.parameters.items():
@@ -41,7 +41,7 @@ def parameters_table(record: Calibration, fit: Fit) -> Table:
         ends = " to ".join(format_uncertain(value + sign * fit.coverage_factor_95[name] * u, u)[0] for sign in (-1, 1))
         nu = fit.degrees_of_freedom[name]
         rows.append([name, *format_uncertain(value, u), ends, unit, "many" if nu > 999 else f"{nu:.0f}"])
-    return Table(
+    return ReportTable(
         title="Parameters",
         caption="K_i: drift per specific force at level i; zeta_i = K_i/K_1 − 1; K(a) = K0 (1 + c1 a + c2 a²), a "
         "term that is absent is 0; "
@@ -51,7 +51,7 @@ def parameters_table(record: Calibration, fit: Fit) -> Table:
     )
 
 
-def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> Table:
+def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> ReportTable:
     """Return K and zeta at each level."""
     columns = ["level", "specific force, g", "runs"]
     for prefix in sets:
@@ -73,10 +73,12 @@ def level_table(record: Calibration, levels: list[Level], sets: list[str]) -> Ta
                 else format_uncertain(100 * zeta.value, 100 * (zeta.standard_uncertainty or 0.0))
             )
         rows.append(row)
-    return Table("K and zeta at each level", "u: standard uncertainty. All zeta share the error of K_1.", columns, rows)
+    return ReportTable(
+        "K and zeta at each level", "u: standard uncertainty. All zeta share the error of K_1.", columns, rows
+    )
 
 
-def curve_table(fit: Fit, sets: list[str]) -> Table:
+def curve_table(fit: Fit, sets: list[str]) -> ReportTable:
     """Return the models of the curve that were tried."""
     rows = []
     for prefix in sets:
@@ -86,7 +88,7 @@ def curve_table(fit: Fit, sets: list[str]) -> Table:
             [axis, each.model, str(each.coefficients), f"{each.chi_square:.2f}", "chosen" * each.chosen]
             for each in found.tried
         ]
-    return Table(
+    return ReportTable(
         "Terms of the curve",
         "Weighted fits to the K_i. A term is taken where it lowers chi-square by more than its 5 % point; a term that "
         "was not taken is 0, with the uncertainty of all these models together.",
@@ -95,7 +97,7 @@ def curve_table(fit: Fit, sets: list[str]) -> Table:
     )
 
 
-def cycle_tables(cycles: list[CycleRow]) -> list[Table]:
+def cycle_tables(cycles: list[CycleRow]) -> list[ReportTable]:
     """Return zeta of each power cycle by itself, where there are several; older records do not hold it."""
     if len(cycles) < 2:
         return []
@@ -113,7 +115,7 @@ def cycle_tables(cycles: list[CycleRow]) -> list[Table]:
             ]
             rows.append([str(cycle.power_cycle), key.replace("_", " "), *cells])
     return [
-        Table(
+        ReportTable(
             "zeta of each power cycle, %",
             "Each K_i against K_1 of the same power cycle, ± its standard uncertainty.",
             ["power cycle", "axis", *names],
@@ -122,7 +124,7 @@ def cycle_tables(cycles: list[CycleRow]) -> list[Table]:
     ]
 
 
-def budget_table(fit: Fit) -> Table:
+def budget_table(fit: Fit) -> ReportTable:
     """Return the error budget."""
     rows = []
     for entry in fit.error_budget:
@@ -131,7 +133,7 @@ def budget_table(fit: Fit) -> Table:
             [entry.error, "yes" if entry.bounded else "no", *_sized(entry, factor), unit, _share(entry.effect),
              "–" if entry.removed is None else _share(entry.removed), entry.basis]
         )  # fmt: skip
-    return Table(
+    return ReportTable(
         "Error budget (X axis)",
         "Effect on K at the highest level: what is left, and what subtraction or combination removed. Bounded: by "
         "these data; where not, value and effect are those of the size named.",
@@ -161,7 +163,7 @@ def _share(value: float) -> str:
     return "< 0.0001 %" if percent < 1e-4 else f"{plain_number(percent, 2)} %"
 
 
-def run_table(runs: list[Run]) -> Table:
+def run_table(runs: list[Run]) -> ReportTable:
     """Return what was measured in each run; a column that says the same of all runs goes to the caption."""
     axes = [axis for axis in "xy" if any(run.line(axis) is not None for run in runs)]
     origins = list(dict.fromkeys(run.table_rate_from for run in runs if run.role == "loaded"))
@@ -192,7 +194,7 @@ def run_table(runs: list[Run]) -> Table:
         "Drift: what X and Y show at the table rate, less what the FOG shows there (rotation), with its standard "
         f"uncertainty u. Sense −1: both rates reversed.{source}"
     )
-    return Table("Runs", caption, columns, rows)
+    return ReportTable("Runs", caption, columns, rows)
 
 
 def _line(entry: Line) -> tuple[str, str]:

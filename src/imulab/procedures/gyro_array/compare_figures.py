@@ -12,7 +12,7 @@ from imulab.procedures.gyro_array.model import unit_of_angle
 from imulab.procedures.gyro_array.sections import ComparisonRecord, comparison_of
 from imulab.procedures.gyro_array.traces import DASHES, MARGIN, allan_trace, axis, log_axis, of_axis
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, Table, plain_number
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, plain_number
 
 _MOST_NAMED = 4
 _PALETTE = {
@@ -57,7 +57,7 @@ def exhibits_of_comparison(record: Calibration) -> Exhibits:
         ("truth", "column" if model.truth.startswith("column") else "still unit"),
         ("calibrated", "yes" if model.calibrated else "no"),
     ]
-    items: list[Figure | Table] = [_methods_table(held, a) for a in range(len(model.axes))]
+    items: list[Figure | ReportTable] = [_methods_table(held, a) for a in range(len(model.axes))]
     for a in range(len(model.axes)):
         items += [_allan_methods(held, a), _angles(held, a)]
         if data.health.known:
@@ -79,7 +79,7 @@ def _that_works(broken: list[str]) -> str:
     return f" that works ({named} did not)"
 
 
-def _methods_table(record: ComparisonRecord, a: int) -> Table:
+def _methods_table(record: ComparisonRecord, a: int) -> ReportTable:
     data, model = record.data, record.model
     unit = model.units[a]
     angle, factor = unit_of_angle(unit)
@@ -97,7 +97,7 @@ def _methods_table(record: ComparisonRecord, a: int) -> Table:
             row.over_limit, row.bandwidth, *([row.split_half] if halves else []),
         ]  # fmt: skip
         rows.append([method, *("–" if v is None else plain_number(v, 3) for v in values)])
-    return Table(
+    return ReportTable(
         title=f"Methods{of_axis(model.axes[a])}",
         caption=f"Rates in {unit}, angles in {angle}. Rate error (standard deviation with the mean removed) and angle "
         "error against the truth; reduction of noise against the mean single gyro that works; noise from sample to "

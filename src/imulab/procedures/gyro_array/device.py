@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imulab.device.array_settings import ArraySettings, Fusion, array_table, fusion_of
-from imulab.device.tables import Table
+from imulab.device.tables import DeviceTable
 from imulab.device.unit import fuse_table
 from imulab.errors import RecordError
 from imulab.procedures.gyro_array.model import check_calibration
@@ -18,7 +18,7 @@ from imulab.records.calibration import Calibration
 _SAMPLES = 300
 
 
-def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table, ...]:
+def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
     """Return the table of an array: its elements' biases, alignment and noise; readings in rad/s.
 
     It fuses by `fusion`, by what the record carries if not given.
@@ -56,10 +56,14 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Table,
         rate=float(held.fit.sample_rate.value),
     )
     table = array_table(settings)
-    return (Table(table.kind, table.fields, {**table.columns, **by.to_dict(), "unit": "rad/s", "rate": settings.rate}),)
+    return (
+        DeviceTable(
+            table.kind, table.fields, {**table.columns, **by.to_dict(), "unit": "rad/s", "rate": settings.rate}
+        ),
+    )
 
 
-def golden(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """A slow turn seen by all gyros, with noise, one spike and a gap."""
     elements, axes = table.columns["elements"], table.columns["axes"]
     turn = 0.2 * np.sin(np.linspace(0, 6, _SAMPLES))[:, None, None]

@@ -11,7 +11,7 @@ from imulab.procedures.gyro_array.compare_figures import exhibits_of_comparison
 from imulab.procedures.gyro_array.sections import ArrayRecord, PerGyro, array_of, model_of
 from imulab.procedures.gyro_array.traces import MARGIN, allan_trace, log_axis, of_axis
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, LEGEND, Exhibits, Figure, Table, format_uncertain, plain_number
+from imulab.report.elements import BAD, GOOD, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
 from imulab.units import from_si
 
 _ELEMENT_SHADES = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#2e4057", "#d081a5", "#6f7f3f")
@@ -36,7 +36,7 @@ def _calibration(record: ArrayRecord) -> Exhibits:
         (f"limit at {tau:g} s", f"{plain_number(limit, 3)} deg/s"),
         ("alignment", "from motion" if model.aligned else "not measured"),
     ]
-    items: list[Figure | Table] = [_elements_table(record)]
+    items: list[Figure | ReportTable] = [_elements_table(record)]
     if model.aligned and len(model.axes) == 3:
         items.append(_matrix_table(record))
     items += [_allan_elements(record, a) for a in range(len(model.axes))]
@@ -55,7 +55,7 @@ def _deg(value: float) -> float:
     return float(from_si(value, "deg/s"))
 
 
-def _elements_table(record: ArrayRecord) -> Table:
+def _elements_table(record: ArrayRecord) -> ReportTable:
     rows = []
     one = len(record.model.axes) == 1
     for element in record.elements:
@@ -72,7 +72,7 @@ def _elements_table(record: ArrayRecord) -> Table:
                 ]
             )
     scaled = one and record.model.aligned
-    return Table(
+    return ReportTable(
         title="Elements",
         caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth rate "
         "too) included. Angle random walk (ARW), bias instability and rate random walk (RRW) are read from the Allan "
@@ -98,7 +98,7 @@ def _text(found: PerGyro, a: int, factor: float) -> str:
     return " ± ".join(format_uncertain(value, None if math.isnan(u) else u))
 
 
-def _matrix_table(record: ArrayRecord) -> Table:
+def _matrix_table(record: ArrayRecord) -> ReportTable:
     rows = []
     for element in record.elements:
         if element.matrix is None or element.residual is None:
@@ -106,7 +106,7 @@ def _matrix_table(record: ArrayRecord) -> Table:
         cells = ["  ".join(f"{value:+.4f}" for value in row) for row in element.matrix.value]
         worst = 1e6 * np.max(element.matrix.standard_uncertainty)
         rows.append([element.name, *cells, f"{worst:.0f}", plain_number(_deg(element.residual.values.max()), 3)])
-    return Table(
+    return ReportTable(
         title="Alignment",
         caption=f"Rate = matrix (reading − bias); rows of the matrix are x, y, z. Gauge: {record.model.gauge}. u: "
         "largest standard uncertainty of an entry. A residual far above the noise means errors that a matrix cannot "

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.unit import Unit
+from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, UnitError
 from imulab.procedures.tumble.device import tables_of
 from imulab.procedures.tumble.model import AXES
@@ -21,7 +21,7 @@ _ACCEL = tuple(f"accel_{axis}" for axis in AXES)
 _GYRO = tuple(f"gyro_{axis}" for axis in AXES)
 
 
-def apply_tumble(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
     """Return the recording with accel_* as specific force, m/s^2, in the body frame of the record's gauge.
 
     NaN stays in what it touches; an output that lies beyond a turning point of the polynomial becomes NaN.
@@ -37,7 +37,7 @@ def apply_tumble(unit: Unit, columns: Mapping[str, Any], recording: Recording) -
     return recording.with_columns(dict(zip(_ACCEL, force, strict=True)), dict.fromkeys(_ACCEL, "m/s^2"))
 
 
-def apply_gyro(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+def apply_gyro(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
     """Return the recording with gyro_* as body rate, in their unit if that is one of rate, else in rad/s.
 
     accel_* are the specific force (already corrected), which the g-sensitivity needs.
@@ -99,7 +99,7 @@ def specific_force(record: Calibration, output: Array) -> Array:
     RecordError
         The record lacks a parameter, or has one that cannot be.
     """
-    force, _ = Unit.of(tables_of(record)[0]).tumble(list(output.T))
+    force, _ = DeviceUnit.of(tables_of(record)[0]).tumble(list(output.T))
     return np.column_stack(force)
 
 

@@ -11,7 +11,7 @@ from itertools import permutations, product
 import numpy as np
 
 from imulab.errors import DataError
-from imulab.estimation.estimate import median
+from imulab.estimation.least_squares import median
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.rotation import frame_rotations
 from imulab.recording import Array

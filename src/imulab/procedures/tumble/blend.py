@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.estimation.estimate import Fit, covariance, huber_inflation
+from imulab.estimation.least_squares import Fit, covariance, huber_inflation
 from imulab.estimation.order_blend import blend
 from imulab.procedures.tumble.model import fit_lengths, norm_and_jacobian, parameter_count
 from imulab.procedures.tumble.orders import OrderChoice

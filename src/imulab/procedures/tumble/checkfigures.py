@@ -16,7 +16,7 @@ from imulab.procedures.tumble.prior import FALSE_ALARM
 from imulab.records.calibration import Calibration
 from imulab.report import render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
-from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, Table
+from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, ReportTable
 from imulab.verdict import Bad, Note, verdict_of
 
 _BEYOND = 2.0
@@ -175,7 +175,7 @@ def _figure(check: Check, attitudes: Attitudes) -> Figure:
     )
 
 
-def _table(check: Check, attitudes: Attitudes) -> Table:
+def _table(check: Check, attitudes: Attitudes) -> ReportTable:
     rows = []
     beyond = _beyond(check)
     for i, value in enumerate(check.residuals.tolist()):
@@ -184,7 +184,7 @@ def _table(check: Check, attitudes: Attitudes) -> Table:
             own = float(check.standard_uncertainty[i])
             u, ratio = small_g(own), f"{value / own:+.1f}"
         rows.append([attitudes.label(i), small_g(value), u, ratio, "beyond" if beyond[i] else ""])
-    return Table(
+    return ReportTable(
         "Attitudes",
         "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all attitudes "
         f"together, with what their errors share; it fails where p is below {100 * FALSE_ALARM:g} %.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from imulab.errors import DataError, RecordError
-from imulab.estimation.estimate import median
+from imulab.estimation.least_squares import median
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import GAUGE, parameter_names

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imulab.errors import OptionError, RecordError
-from imulab.estimation.estimate import chi_square_probability, median
+from imulab.estimation.least_squares import chi_square_probability, median
 from imulab.gravity import Gravity, local_gravity
 from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes

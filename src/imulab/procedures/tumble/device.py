@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.tables import Field, Table, field_of, nonzero, values_of, whole
-from imulab.device.unit import Unit
+from imulab.device.tables import DeviceTable, Field, field_of, nonzero, values_of, whole
+from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.sections import model_of
@@ -21,7 +21,7 @@ _CROSSED = 256
 _VECTORS = 64
 
 
-def tables_of(record: Calibration) -> tuple[Table, ...]:
+def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the tables of a tumble record: accelerometers, and gyroscopes where it has them.
 
     Raises
@@ -43,7 +43,7 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
     ends = np.array([monotone_range(nonlinearity[:, axis]) for axis in range(3)])
     largest = float(np.finfo(np.float32).max)
     crossed = "k_xy" in record.parameters
-    table = Table(
+    table = DeviceTable(
         "tumble",
         (
             Field("order", whole(max(order, 1) + _CROSSED * crossed)),
@@ -60,7 +60,7 @@ def tables_of(record: Calibration) -> tuple[Table, ...]:
     return (table, *_gyro(record)) if "gyro_bias_x" in record.parameters else (table,)
 
 
-def _gyro(record: Calibration) -> tuple[Table, ...]:
+def _gyro(record: Calibration) -> tuple[DeviceTable, ...]:
     scale = np.array([record.value(f"gyro_scale_factor_{axis}") for axis in _AXES])
     misalignment = np.eye(3)
     for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
@@ -75,7 +75,7 @@ def _gyro(record: Calibration) -> tuple[Table, ...]:
     if sensitive:
         g = [[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES]
         fields.append(Field("sensitivity", np.array(g)))
-    return (Table("gyro", tuple(fields), {"output_unit": model_of(record).gyro_output_unit}),)
+    return (DeviceTable("gyro", tuple(fields), {"output_unit": model_of(record).gyro_output_unit}),)
 
 
 def monotone_range(nonlinearity: Array) -> tuple[float, float]:
@@ -92,20 +92,20 @@ def monotone_range(nonlinearity: Array) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
-def golden_accelerometers(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return outputs within 2 g, or as far as the polynomials rise, and their specific forces."""
     reach = 0.9 * np.minimum(2 * STANDARD_GRAVITY, np.minimum(-field_of(table, "low"), field_of(table, "high")))
     output = (rng.uniform(-1, 1, (_VECTORS, 3)) * reach + field_of(table, "bias")) / field_of(table, "gain")
     output[1, 1] = np.nan
-    force, _ = Unit.of(table).tumble(list(output.T))
+    force, _ = DeviceUnit.of(table).tumble(list(output.T))
     return {"": _VECTORS, "scale": 2 * STANDARD_GRAVITY, "output": output, "force": np.column_stack(force)}
 
 
-def golden_gyroscopes(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return outputs under a specific force, and their rates."""
     rates = rng.uniform(-5, 5, (_VECTORS, 3))  # rad/s, about 300 deg/s
     force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (_VECTORS, 3))
     output = (rates + field_of(table, "bias")) / field_of(table, "gain")
     output[1, 2] = np.nan
-    rate, _ = Unit.of(table).gyro(list(output.T), list(force.T))
+    rate, _ = DeviceUnit.of(table).gyro(list(output.T), list(force.T))
     return {"": _VECTORS, "scale": 5.0, "output": output, "force": force, "rate": np.column_stack(rate)}

@@ -23,7 +23,7 @@ from imulab.procedures.tumble.sphere import sphere_figure
 from imulab.procedures.tumble.tables import orders_table, parameters_table, propagated_table, shares_table
 from imulab.records.calibration import Calibration
 from imulab.report.bulk import bulk, edge_marks, edge_note
-from imulab.report.elements import ALARM, BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, Table, plain_number
+from imulab.report.elements import ALARM, BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
 from imulab.units import from_si
 
 
@@ -43,7 +43,7 @@ def exhibits(record: Calibration) -> Exhibits:
         ("worst u(scale factor)", f"{plain_number(worst, 2)} ppm" if worst is not None else "not stated"),
         ("condition number", plain_number(fit.condition_number, 3)),
     ]
-    items: list[Figure | Table] = [_residuals(record), parameters_table(record)]
+    items: list[Figure | ReportTable] = [_residuals(record), parameters_table(record)]
     if fit.monte_carlo is not None:
         items.append(propagated_table(record, fit.monte_carlo))
     if fit.prior is not None:

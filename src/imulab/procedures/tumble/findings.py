@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.estimate import coverage_factor
+from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended
 from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, parameter_count

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import DataError, ObservabilityError, OptionError
-from imulab.estimation.estimate import (
+from imulab.estimation.least_squares import (
     Observability,
     covariance,
     huber_inflation,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
-from imulab.estimation.estimate import Observability, covariance, observability
+from imulab.estimation.least_squares import Observability, covariance, observability
 from imulab.estimation.rows import leave_out
 from imulab.procedures.tumble.apply import output_factor, specific_force
 from imulab.procedures.tumble.attitudes import Attitudes

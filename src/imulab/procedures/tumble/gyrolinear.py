@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.estimation.estimate import f_test
+from imulab.estimation.least_squares import f_test
 from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, Segments, carried
 from imulab.procedures.tumble.rotation import weighted_turns
 from imulab.recording import Array

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.estimate import coverage_factor
+from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.tumble.gyro import PAIRS, GyroFit, gyro_names
 from imulab.procedures.tumble.gyroclock import CRYSTAL, Clock
 from imulab.procedures.tumble.gyrolinear import Nonlinearity

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
-from imulab.estimation.estimate import f_test
+from imulab.estimation.least_squares import f_test
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.recording import Array
 

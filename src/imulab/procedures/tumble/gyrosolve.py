@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
-from imulab.estimation.estimate import Fit, covariance, f_test, least_squares
+from imulab.estimation.least_squares import Fit, covariance, f_test, least_squares
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.gyrorest import Rest, at_rest, find_holds
 from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, Segments, find_turns, model, start_scale

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imulab.errors import DataError
-from imulab.estimation.estimate import leverage, plausible_excess
+from imulab.estimation.least_squares import leverage, plausible_excess
 from imulab.procedures.tumble.model import norm_and_jacobian
 from imulab.procedures.tumble.solve import (
     REWEIGHTING_PASSES,

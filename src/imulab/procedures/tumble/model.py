@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.estimation.estimate import Fit, least_squares
+from imulab.estimation.least_squares import Fit, least_squares
 from imulab.procedures.tumble import _model
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Motion
 from imulab.recording import Array

@@ -13,7 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imulab.estimation.estimate import Observability, bayesian_information, covariance, f_test, leverage, observability
+from imulab.estimation.least_squares import (
+    Observability,
+    bayesian_information,
+    covariance,
+    f_test,
+    leverage,
+    observability,
+)
 from imulab.procedures.tumble.advice import sphere_points
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import norm_and_jacobian, parameter_count

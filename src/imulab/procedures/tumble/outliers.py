@@ -19,7 +19,7 @@ from math import comb, lgamma, log
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.estimate import chi_square_limit
+from imulab.estimation.least_squares import chi_square_limit
 from imulab.procedures.tumble.solve import Problem, Solution, evaluate
 from imulab.recording import Array
 

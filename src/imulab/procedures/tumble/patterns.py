@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.estimation.estimate import f_test
+from imulab.estimation.least_squares import f_test
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import AXES, CROSS_TERMS, MISALIGNMENTS

@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 
 from imulab.errors import ObservabilityError, OptionError, listed
-from imulab.estimation.estimate import observability
+from imulab.estimation.least_squares import observability
 from imulab.procedures.tumble.advice import sphere_points
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import parameter_count, parameter_names

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import RecordError
-from imulab.estimation.estimate import chi_square_probability, plausible_excess
+from imulab.estimation.least_squares import chi_square_probability, plausible_excess
 from imulab.gravity import Gravity
 from imulab.procedures.tumble.checks import check_prior
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names

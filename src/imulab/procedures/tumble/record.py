@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.estimate import Observability, chi_square_probability, coverage_factor, leverage
+from imulab.estimation.least_squares import Observability, chi_square_probability, coverage_factor, leverage
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import shake_warnings

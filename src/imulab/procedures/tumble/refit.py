@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from imulab.estimation.estimate import covariance, least_squares, leverage, observability, plausible_excess
+from imulab.estimation.least_squares import covariance, least_squares, leverage, observability, plausible_excess
 from imulab.procedures.tumble.model import gravity_slope, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.sections import data_of, model_of
 from imulab.recording import Array

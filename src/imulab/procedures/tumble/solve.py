@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.estimate import (
+from imulab.estimation.least_squares import (
     Fit,
     huber_weights,
     leverage,

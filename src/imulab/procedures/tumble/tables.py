@@ -5,7 +5,7 @@ from __future__ import annotations
 from imulab.procedures.tumble.engineering import engineering_rows, micro_g, propagated_rows
 from imulab.procedures.tumble.sections import Prior, Trials, fit_of, model_of
 from imulab.records.calibration import Calibration
-from imulab.report.elements import Table, format_uncertain, plain_number
+from imulab.report.elements import ReportTable, format_uncertain, plain_number
 
 _AGREE = 10.0
 """Per cent by which the widths of two kinds of intervals may differ before it matters."""
@@ -27,7 +27,7 @@ def _basis(record: Calibration) -> str:
     )
 
 
-def parameters_table(record: Calibration) -> Table:
+def parameters_table(record: Calibration) -> ReportTable:
     """Return the parameters with their uncertainties."""
     fit, model = fit_of(record), model_of(record)
     factors = {False: fit.coverage_factor_95, True: None if fit.gyro is None else fit.gyro.coverage_factor_95}
@@ -52,7 +52,7 @@ def parameters_table(record: Calibration) -> Table:
         turned = (
             f" Gyroscopes: M = S (T ω + b + G f), Student's t with {fit.gyro.degrees_of_freedom} degrees of freedom."
         )
-    return Table(
+    return ReportTable(
         title="Parameters",
         caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {model.gauge}.{turned}",
         columns=[
@@ -67,11 +67,11 @@ def parameters_table(record: Calibration) -> Table:
     )
 
 
-def propagated_table(record: Calibration, trials: Trials) -> Table:
+def propagated_table(record: Calibration, trials: Trials) -> ReportTable:
     """Return the intervals by propagation of distributions beside the linear ones."""
     rows = propagated_rows(record, trials)
     failed = f", {trials.failed} more did not converge" if trials.failed else ""
-    return Table(
+    return ReportTable(
         title="Monte Carlo",
         message=_agreement(rows),
         caption=f"95 % intervals of {trials.trials} trials (JCGM 101{failed}) beside the linear ones. A ratio far "
@@ -95,10 +95,10 @@ def _agreement(rows: list[list[str]]) -> str:
     )
 
 
-def shares_table(prior: Prior) -> Table:
+def shares_table(prior: Prior) -> ReportTable:
     """Return what each parameter owes to the prior."""
     rows = [[name, f"{100 * share:.0f} %", f"{100 * (1 - share):.0f} %"] for name, share in prior.shares.items()]
-    return Table(
+    return ReportTable(
         title="Prior and data",
         caption=f"Where the knowledge of each parameter comes from: the prior (a record of {prior.created}) or "
         "these attitudes; variance now over that of the prior with what it aged since.",
@@ -107,7 +107,7 @@ def shares_table(prior: Prior) -> Table:
     )
 
 
-def orders_table(record: Calibration) -> Table:
+def orders_table(record: Calibration) -> ReportTable:
     """Return what the choice of the order rests on."""
     fit, chosen = fit_of(record), model_of(record).order
     rows, highlight = [], None
@@ -128,7 +128,7 @@ def orders_table(record: Calibration) -> Table:
             ]
         )
     huber = " Rms of all attitudes, a down-weighted one by its weight." if fit.loss == "huber" else ""
-    return Table(
+    return ReportTable(
         title="Choice of the order",
         caption="A higher order fits closer (rms) whether it is right or not. It is taken only if it also predicts "
         "attitudes it has not seen better (leave-one-out), by more than the error of that comparison, if the F-test "

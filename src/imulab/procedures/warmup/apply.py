@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.device.unit import Unit
+from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, UnitError
 from imulab.procedures.warmup.poweron import LATEST_START, check_clock, check_start, power_on_temperature
 from imulab.recording import Array, Recording, check_time
@@ -20,7 +20,7 @@ _LAST_TICK = 2**32 - 1
 _PIECE = 32768  # samples at a time: their ticks stay in the cache
 
 
-def apply_warmup(unit: Unit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+def apply_warmup(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
     """Return the recording with ``output - Z(t; T)`` in those axes of the record that it has, their units kept.
 
     `t` is the column time, counted from power-on; `T` is ``power_on_temperature`` of the head of the file. Without it,

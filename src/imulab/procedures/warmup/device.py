@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.tables import Field, Table, field_of, whole
-from imulab.device.unit import Unit
+from imulab.device.tables import DeviceTable, Field, field_of, whole
+from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
 from imulab.procedures.warmup.choices import EXITS, MODELS
 from imulab.procedures.warmup.model import record_table
@@ -20,12 +20,12 @@ _COLDEST, _HOTTEST, _HAIR = -273.15, 1000.0, 1e-3
 _TICK = 0.01  # s
 
 
-def tables_of(record: Calibration) -> tuple[Table, ...]:
+def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the table of a warm-up record; errors as for `record_table` and `warmup_table`."""
     return (warmup_table(record_table(record).to_section()),)
 
 
-def warmup_table(table: Mapping[str, Any]) -> Table:
+def warmup_table(table: Mapping[str, Any]) -> DeviceTable:
     """Return the warm-up table of a record's section ``table``.
 
     Raises
@@ -70,7 +70,7 @@ def warmup_table(table: Mapping[str, Any]) -> Table:
         Field("slope", slopes, pointed=True),
     )
     ends = [float(temperatures[0]), float(temperatures[-1])]
-    return Table(
+    return DeviceTable(
         "warmup",
         fields,
         {"axes": axes, "units": list(table["units"]), "range": ends, "end": _end(table), "exit": table["exit"]},
@@ -108,14 +108,14 @@ def _end(table: Mapping[str, Any]) -> float:
     return float(table["settling_time"]) + (float(table["taper_time"]) if table["exit"] == "taper" else 0.0)
 
 
-def golden(table: Table, rng: np.random.Generator) -> dict[str, Any]:
+def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return power-on temperatures at, between and beyond the knots, times, and the biases there."""
     knots, axes = field_of(table, "temperature"), int(field_of(table, "axes"))
     between = knots[:-1] + np.diff(knots) * rng.uniform(0.1, 0.9, len(knots) - 1)
     starts = np.concatenate([knots, between, [knots[0] - 1, knots[-1] + 1, np.nan]])
     end = float(field_of(table, "settling_time") + field_of(table, "taper_time")) * 1.1 / _TICK
     ticks = np.unique(np.concatenate([[0, 1], np.linspace(0, end, 30)])).astype(np.uint32)
-    unit = Unit.of(table)
+    unit = DeviceUnit.of(table)
     bias = np.empty((len(starts), len(ticks), axes))
     for place, start in zip(bias, starts, strict=True):
         left, _ = unit.warmup(float(start), _TICK, ticks, [np.zeros(len(ticks))] * axes)

@@ -8,12 +8,11 @@ import numpy as np
 
 from imulab.procedures.warmup.engineering import engineering_unit
 from imulab.procedures.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
-from imulab.procedures.warmup.model import Table as WarmupTable
-from imulab.procedures.warmup.model import evaluate, record_table
+from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
 from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, Table, plain_number
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
 
 _POINTS = 121
 _LOST = "in noise"
@@ -43,7 +42,7 @@ def exhibits(record: Calibration) -> Exhibits:
         ("settling time T_M", f"{table.settling_time:g} s"),
         ("power cycles", str(fit.cycles)),
     ]
-    items: list[Figure | Table] = []
+    items: list[Figure | ReportTable] = []
     for kind, index in kinds.items():
         items.append(_models(record, table, kind, index))
     if fit.repeatability.unit is not None:
@@ -107,7 +106,7 @@ def _text(values: list[float | None] | None, index: list[int], factor: float, un
     return f"{plain_number(value, 2)}{unit}" if value > 0 else _LOST
 
 
-def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Table:
+def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
     label, factor = engineering_unit(table.units[index[0]])
     rows, highlight = [], None
     fit = drawn_of(record).fit
@@ -129,7 +128,7 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
         )
     floor = _text(fit.repeatability.cycle, index, factor, f" {label}")
     what = "unit" if model_of(record).pool == "type" else "cycle"
-    return Table(
+    return ReportTable(
         title=f"Models compared, {kind}, {label}",
         caption="Root mean square over all axes and the time t after power-on up to T_M, from which the unit is "
         "settled and nothing is subtracted; white noise taken off. Z is what the table subtracts. Columns: the cycles "
@@ -142,7 +141,7 @@ def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     )
 
 
-def _units(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]) -> Table:
+def _units(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]) -> ReportTable:
     """Whether one table for the type is enough, axis by axis."""
     found = fit.repeatability
     rows = []
@@ -155,7 +154,7 @@ def _units(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: lis
                 verdict = "each unit" if unit > cycle + 2 * uncertainty else "one per type"
             shown = [_text(values, [i], factor) for values in (units, found.cycle)]
             rows.append([table.axes[i], *shown, verdict, label])
-    return Table(
+    return ReportTable(
         title=f"Spread between {fit.units} units",
         caption="Root mean square deviation of a unit's curve from that of the type, beside that of a cycle from its "
         "unit. Where units differ clearly more than their cycles do (by two standard uncertainties of the latter), a "
@@ -364,7 +363,7 @@ def _over_temperature(table: WarmupTable) -> Figure:
     )
 
 
-def _tests(record: Calibration, table: WarmupTable) -> Table:
+def _tests(record: Calibration, table: WarmupTable) -> ReportTable:
     label, factor = engineering_unit(table.units[0])
     head = next(iter(_kinds(table).values()))
     drawn = drawn_of(record)
@@ -386,7 +385,7 @@ def _tests(record: Calibration, table: WarmupTable) -> Table:
                 f"{min(cycle.end for cycle in members):g}",
             ]
         )
-    return Table(
+    return ReportTable(
         title=f"The test, by temperature ({label})",
         caption="Repeatability, what is left, and what is left where this temperature was kept out of the fit; largest "
         "change of the settled part from T_M to its end; end of the shortest cycle.",

@@ -22,7 +22,7 @@ from imulab.procedures.warmup.judge import (
     repeatability,
     worst_between,
 )
-from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, Table
+from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
 from imulab.recording import Array, Recording
@@ -53,7 +53,7 @@ class WarmupFit:
     """
 
     calibration: Calibration
-    table: Table
+    table: WarmupTable
     models: tuple[Judged, ...]
     repeatability: Repeatability
     curves: Curves

@@ -8,8 +8,8 @@ import numpy as np
 
 from imulab.errors import DataError
 from imulab.procedures.warmup.curves import Curves
-from imulab.procedures.warmup.model import Table, edge_jumps, exit_jump
-from imulab.procedures.warmup.solve import Solution, coefficients_of, find_scales, fitted_noise, solve, statistics
+from imulab.procedures.warmup.model import WarmupTable, edge_jumps, exit_jump
+from imulab.procedures.warmup.solve import CurveSolution, coefficients_of, find_scales, fitted_noise, solve, statistics
 from imulab.recording import Array
 
 CANDIDATES = (("interval-cubic", 0), ("knot-cubic", 0), ("knot-log-cubic", 1), ("exponential", 2), ("exponential", 3))
@@ -43,7 +43,7 @@ class Judged:
 
     model: str
     count: int
-    solution: Solution | None
+    solution: CurveSolution | None
     training: Array
     left_cycle: Array | None
     left_temperature: Array | None
@@ -59,7 +59,7 @@ class Judged:
         return f"{self.model} ({self.count})" if self.model == "exponential" else self.model
 
     @property
-    def table(self) -> Table:
+    def table(self) -> WarmupTable:
         """The fitted table."""
         if self.solution is None:
             raise DataError("there is no table of no model")

@@ -27,7 +27,7 @@ SOURCE_TEMPERATURES = (-40.0, -30.0, -20.0, -10.0, 0.0, 40.0, 50.0, 60.0)
 
 
 @dataclass(frozen=True)
-class Table:
+class WarmupTable:
     """The warm-up table of one unit, or of one type.
 
     Attributes
@@ -122,12 +122,12 @@ class Table:
         turns = s * (1 - s) ** 2 * self.slopes[row] - s * s * (1 - s) * self.slopes[row + 1]
         return np.asarray(ends + width * turns)
 
-    def with_rules(self, rule: str, taper_time: float, beyond: str, tolerance: float) -> Table:
+    def with_rules(self, rule: str, taper_time: float, beyond: str, tolerance: float) -> WarmupTable:
         """Return the table with another exit rule, and another rule and tolerance beyond its temperatures."""
         return replace(self, exit=rule, taper_time=taper_time, beyond=beyond, tolerance=tolerance)
 
 
-def evaluate(table: Table, time: Array, temperature: float) -> Array | None:
+def evaluate(table: WarmupTable, time: Array, temperature: float) -> Array | None:
     """Return Z at times since power-on, shape (n,), for a power-on temperature: shape (axes, n), units of the table.
 
     None outside the table or where the temperature is not a number. NaN in time gives NaN; times before power-on count
@@ -166,7 +166,7 @@ def basis(model: str, time: Array, settling_time: float, scales: Sequence[float]
     return np.stack([np.ones_like(u), u, u * u, u * u * u], axis=-1)
 
 
-def table_from(section: Mapping[str, Any]) -> Table:
+def table_from(section: Mapping[str, Any]) -> WarmupTable:
     """Return the table of a record's section ``table``.
 
     Raises
@@ -176,7 +176,7 @@ def table_from(section: Mapping[str, Any]) -> Table:
     """
     try:
         model = str(section["model"])
-        table = Table(
+        table = WarmupTable(
             model=model,
             temperatures=np.array(section["temperatures"], dtype=np.float64),
             axes=tuple(map(str, section["axes"])),
@@ -199,7 +199,7 @@ def table_from(section: Mapping[str, Any]) -> Table:
     return table
 
 
-def check_table(table: Table) -> None:
+def check_table(table: WarmupTable) -> None:
     """Check that a table can be evaluated.
 
     Raises
@@ -253,7 +253,7 @@ def check_table(table: Table) -> None:
             raise RecordError(f"table: {error}") from None
 
 
-def edge_jumps(table: Table, times: Array) -> Array:
+def edge_jumps(table: WarmupTable, times: Array) -> Array:
     """Return the largest jump of |Z| over `times` at each inner edge of temperature, shape (edges, axes).
 
     Only ``interval-cubic`` jumps; the other models are continuous.
@@ -265,14 +265,14 @@ def edge_jumps(table: Table, times: Array) -> Array:
     return jumps
 
 
-def exit_jump(table: Table) -> Array:
+def exit_jump(table: WarmupTable) -> Array:
     """Return Z(T_M) at each interval or knot, shape (r, axes): what is dropped at T_M under exit ``zero``."""
     last = basis(table.model, np.array(table.settling_time), table.settling_time, table.scales)
     found: Array = table.coefficients @ last
     return found
 
 
-def record_table(record: Calibration) -> Table:
+def record_table(record: Calibration) -> WarmupTable:
     """Return the table of a warm-up record.
 
     Raises

@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.procedures.warmup.curves import Curves
 from imulab.procedures.warmup.judge import Judged, Repeatability, Worst
-from imulab.procedures.warmup.model import Table, evaluate, exit_jump
+from imulab.procedures.warmup.model import WarmupTable, evaluate, exit_jump
 from imulab.procedures.warmup.quality import expectations, quality_warnings
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -22,7 +22,7 @@ def make_record(
     curves: Curves,
     rows: list[Judged],
     chosen: Judged,
-    table: Table,
+    table: WarmupTable,
     spread: Repeatability,
     covariance: Array | None,
     settled: bool,
@@ -165,7 +165,7 @@ def _data(curves: Curves) -> dict[str, Any]:
     return {"cycles": cycles}
 
 
-def misfit(curves: Curves, table: Table) -> dict[str, Any]:
+def misfit(curves: Curves, table: WarmupTable) -> dict[str, Any]:
     """Return what the model cannot follow of the mean curves: rms over the temperatures in each bin of time.
 
     White noise is taken off. To be added to the variance of a curve from ``coefficient_covariance``, which holds what

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.procedures.warmup.curves import Curves, Index
-from imulab.procedures.warmup.model import Table, basis
+from imulab.procedures.warmup.model import WarmupTable, basis
 from imulab.recording import Array
 
 Mask = NDArray[np.bool_]
@@ -94,7 +94,7 @@ def membership(curves: Curves, knots: Index) -> Array:
 
 
 @dataclass(frozen=True)
-class Solution:
+class CurveSolution:
     """A fitted table, and what its uncertainty needs.
 
     Attributes
@@ -107,14 +107,14 @@ class Solution:
         Weight of each cycle, shape (c,).
     """
 
-    table: Table
+    table: WarmupTable
     scales: tuple[float, ...]
     weights: Array
 
 
 def solve(
     curves: Curves, model: str, scales: Sequence[float], sums: Statistics, weights: Array, knots: Index | None = None
-) -> Solution:
+) -> CurveSolution:
     """Fit a table to the cycles with positive weight, on all calibration temperatures or on some.
 
     Parameters
@@ -139,7 +139,7 @@ def solve(
         c, slopes = _amplitudes(curves, sums, used, kept, scales)
     else:
         c = _knots(sums, hats(curves, kept), used)
-    table = Table(
+    table = WarmupTable(
         model=model,
         temperatures=curves.temperatures[kept],
         axes=curves.axes,
@@ -150,7 +150,7 @@ def solve(
         time_constants=tuple(map(float, scales)) if model == "exponential" else (),
         slopes=slopes,
     )
-    return Solution(table, tuple(map(float, scales)), used)
+    return CurveSolution(table, tuple(map(float, scales)), used)
 
 
 def _intervals(sums: Statistics, share: Array) -> Array:
@@ -269,7 +269,7 @@ def find_scales(
     return tuple(np.exp(np.sort(found.x)).tolist())
 
 
-def coefficients_of(curves: Curves, table: Table) -> Array:
+def coefficients_of(curves: Curves, table: WarmupTable) -> Array:
     """Return the coefficients that the unit would use in each cycle, shape (c, axes, p).
 
     A power-on temperature beyond the table (a recording at -41 for a table from -40) counts as its end.
@@ -279,7 +279,7 @@ def coefficients_of(curves: Curves, table: Table) -> Array:
     return np.stack([row for row in rows if row is not None])
 
 
-def fitted_noise(curves: Curves, solution: Solution, sums: Statistics) -> Array:
+def fitted_noise(curves: Curves, solution: CurveSolution, sums: Statistics) -> Array:
     """Return the mean square that white noise leaves in the cycles of a fit, shape (c, axes).
 
     Less than in cycles that the fit has not seen, since the fit follows some of the noise: with y = X theta for a cycle
@@ -344,7 +344,7 @@ def _sum(sums: Statistics, chosen: Mask) -> tuple[Array, Array]:
     return sums.normal[chosen].sum(axis=0), sums.moment[chosen].sum(axis=0)
 
 
-def coefficient_covariance(curves: Curves, solution: Solution, sums: Statistics, cluster: Index) -> Array | None:
+def coefficient_covariance(curves: Curves, solution: CurveSolution, sums: Statistics, cluster: Index) -> Array | None:
     """Return the covariance of each interval's or knot's coefficients, shape (r, axes, p, p), from repeatability.
 
     ``V = G [sum_c (h h') x (N S N)] G'`` with G the inverse normal matrix, N a cluster's own and S the covariance of

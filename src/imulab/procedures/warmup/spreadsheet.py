@@ -12,7 +12,7 @@ import numpy as np
 
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
 from imulab.procedures.warmup.choices import MODELS
-from imulab.procedures.warmup.model import Table, check_table, record_table
+from imulab.procedures.warmup.model import WarmupTable, check_table, record_table
 from imulab.procedures.warmup.solve import amplitude_slopes
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import conversion_factor, parse_unit
@@ -78,7 +78,7 @@ def _titles(model: str, size: int, per_second: bool = False) -> list[str]:
     return [*places, "axis", "unit", *terms]
 
 
-def read_table(path: str | Path) -> tuple[Table, str | None]:
+def read_table(path: str | Path) -> tuple[WarmupTable, str | None]:
     """Read a table from CSV as `write_table` makes it in either form, and the serial number in its head.
 
     The unit of a row may be any of its kind (deg/h for a rate); it is converted. Slopes of exponential amplitudes
@@ -113,7 +113,7 @@ def read_table(path: str | Path) -> tuple[Table, str | None]:
     return table, settings.get("serial")
 
 
-def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]]) -> Table:
+def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]]) -> WarmupTable:
     model = settings.get("model", "")
     if model not in MODELS:
         raise ReadError(f"{path}: '# model: {model}': expected one of {listed(MODELS, model)}")
@@ -167,7 +167,7 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     slopes = None
     if model == "exponential" and len(temperatures) > 1:
         slopes = amplitude_slopes(temperatures, values, constants)
-    return Table(
+    return WarmupTable(
         model=model,
         temperatures=temperatures,
         axes=tuple(units),
@@ -209,7 +209,7 @@ def _value(place: str, text: str) -> float:
     return value
 
 
-def record_of_table(read: tuple[Table, str | None], file: str) -> Calibration:
+def record_of_table(read: tuple[WarmupTable, str | None], file: str) -> Calibration:
     """Return a record that holds a table made by hand: it says nothing of its errors."""
     from hashlib import sha256
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import OptionError
-from imulab.procedures.warmup.model import Table
+from imulab.procedures.warmup.model import WarmupTable
 from imulab.recording import Array
 
 FORMS = ("power", "bernstein")
@@ -46,14 +46,14 @@ class Int16Table:
         The same for the slopes of exponential amplitudes.
     """
 
-    table: Table
+    table: WarmupTable
     form: str
     values: NDArray[np.int16]
     scale: Array
     slopes: NDArray[np.int16] | None = None
     slope_scale: Array | None = None
 
-    def expand(self) -> Table:
+    def expand(self) -> WarmupTable:
         """Return the table that the integers stand for, in double precision."""
         coefficients = self.values * self.scale[:, None]
         if self.form == "bernstein" and not self.table.time_constants:
@@ -64,7 +64,7 @@ class Int16Table:
         return replace(self.table, coefficients=coefficients, slopes=slopes)
 
 
-def to_int16(table: Table, form: str = "bernstein") -> Int16Table:
+def to_int16(table: WarmupTable, form: str = "bernstein") -> Int16Table:
     """Round a table to 16-bit integers.
 
     Raises
@@ -89,7 +89,7 @@ def _round(values: Array) -> tuple[NDArray[np.int16], Array]:
     return np.rint(values / scale[:, None]).astype(np.int16), scale
 
 
-def evaluate_float32(table: Table, time: Array, temperature: float) -> NDArray[np.float32] | None:
+def evaluate_float32(table: WarmupTable, time: Array, temperature: float) -> NDArray[np.float32] | None:
     """Return Z before T_M in single precision throughout, shape (axes, n), as a unit without doubles computes it.
 
     Coefficients, power-on temperature and every step are float32; `time` is counted in integer ticks, so that the time
