@@ -54,7 +54,7 @@ def _tables(record):
 def _exhibits(record):
     rows = [[name, f"{record.value(name):.3f}"] for name in NAMES]
     return elements.Exhibits(
-        "What drifts at rest.", [("samples", "1000")], [elements.Table("Drift", "", ["", ""], rows)]
+        "What drifts at rest.", [("samples", "1000")], [elements.ReportTable("Drift", "", ["", ""], rows)]
     )
 
 

@@ -1,4 +1,4 @@
-"""What code reads of a warm-up record, with types; its table is `imulab.procedures.warmup.model.Table`."""
+"""What code reads of a warm-up record, with types; its table is `imulab.procedures.warmup.model.WarmupTable`."""
 
 from __future__ import annotations
 
