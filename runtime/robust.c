@@ -43,7 +43,7 @@ static il_real mean_variance(const il_array *a, const il_array_axis *s) {
 static void trust(const il_array *a, const il_array_axis *s, il_sample *p) {
     il_real least = il_larger(a->weight_floor * p->mean_variance, IL_TINY);
     for (int32_t i = 0; i < a->elements; i++) {
-        p->trust[i] = il_larger(il_drawn(s->variance[i], il_pull(a, s->seen[i]), p->mean_variance * s->ratio[i]), least);
+        p->trust[i] = il_larger(il_shrunk(s->variance[i], il_pull(a, s->seen[i]), p->mean_variance * s->ratio[i]), least);
     }
 }
 
@@ -138,8 +138,8 @@ static void residuals(const il_array *a, const il_array_axis *s, const il_sample
 }
 
 /* Biases, variances and means of a second take in the sample; learns[] says whose. */
-static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, il_sample *p, int32_t pupils) {
-    il_real m = (il_real)pupils, squares = IL_C(0.0), gain = IL_C(0.0);
+static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, il_sample *p, int32_t learners) {
+    il_real m = (il_real)learners, squares = IL_C(0.0), gain = IL_C(0.0);
     il_real e[IL_ARRAY_ELEMENTS], f[IL_ARRAY_ELEMENTS];
     residuals(a, s, p, p->r, m, p->rate, e);
     const int moves = explain(a, s, p->rate, p);
@@ -168,7 +168,7 @@ static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s,
         const il_real drift = (il_sum(a->elements, s->bias) - before) / m;
         for (int32_t i = 0; i < a->elements; i++) s->bias[i] -= p->learns[i] ? drift : IL_C(0.0);
     }
-    if (pupils < 3) return;
+    if (learners < 3) return;
     squares /= m * (m - IL_C(1.0));
     il_real hat = m / (m - IL_C(2.0));
     for (int32_t i = 0; i < a->elements; i++) {
@@ -213,7 +213,7 @@ static void teach_fresh(const il_array *a, il_array_axis *s, const il_sample *p)
 
 /* The long way, for samples in which something is wrong or new. */
 static il_real look_closely(const il_array *a, const il_robust_terms *t, il_array_axis *s, const il_real *z, il_sample *p) {
-    int32_t pupils = 0;
+    int32_t learners = 0;
     p->learnt = il_most_seen(a, s);
     p->mean_variance = mean_variance(a, s);
     trust(a, s, p);
@@ -228,10 +228,10 @@ static il_real look_closely(const il_array *a, const il_robust_terms *t, il_arra
     p->rate = IL_C(0.0);
     for (int32_t i = 0; i < a->elements; i++) {
         p->rate += p->used[i] ? s->weight[i] * p->r[i] : IL_C(0.0);
-        pupils += p->learns[i];
+        learners += p->learns[i];
     }
     if (used < a->elements) teach_fresh(a, s, p);
-    if (pupils >= 2) learn(a, t, s, p, pupils);
+    if (learners >= 2) learn(a, t, s, p, learners);
     il_robust_pass(t, s, p->rate);
     return p->rate;
 }

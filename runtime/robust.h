@@ -40,7 +40,7 @@ typedef struct {
     il_real change;        /* smallest change of a reading, */
     il_real squares, total; /* sums of squared residuals and of weights, */
     il_real top;           /* largest weight, */
-    il_real outside, bent; /* by how much a squared residual is beyond the gate, and beyond full teaching */
+    il_real outside, strained; /* by how much a squared residual is beyond the gate, and beyond full teaching */
     il_real r_still[IL_ARRAY_ROOM]; /* r less what moves with the rate */
     uint32_t learnt;       /* residuals of the most experienced gyro */
     int moves;             /* r_still is not r */
@@ -89,13 +89,13 @@ static inline il_real il_remembered(const il_array *a, uint32_t seen) {
     return count * a->memory > IL_C(1.0) ? IL_C(1.0) / a->memory : count;
 }
 
-/* How far a variance is drawn to the mean of all. */
+/* How far a variance is shrunk towards the mean of all. */
 static inline il_real il_pull(const il_array *a, uint32_t seen) {
     const il_real prior = a->weight != NULL ? IL_CALIBRATED : IL_OWN;
     return prior / (prior + il_remembered(a, seen));
 }
 
-static inline il_real il_drawn(il_real variance, il_real pull, il_real usual) {
+static inline il_real il_shrunk(il_real variance, il_real pull, il_real usual) {
     return variance + pull * (usual - variance);
 }
 

@@ -6,7 +6,7 @@
  */
 #include "robust.h"
 
-/* Gains, and how far variances are drawn to the mean, with one residual more than so far. */
+/* Gains, and how far variances are shrunk towards the mean, with one residual more than so far. */
 static void experience(const il_array *a, const il_array_axis *s, il_sample *p) {
     const int32_t n = a->elements;
     uint32_t seen = il_counted(s->seen[0], s->clean);
@@ -57,11 +57,11 @@ static void compare(int32_t n, il_real gate, il_real floor, const il_real *restr
     const il_real middle = p->middle, usual = p->mean_variance;
     il_real squares[2] = {IL_C(0.0), IL_C(0.0)}, total[2] = {IL_C(0.0), IL_C(0.0)}, rate[2] = {IL_C(0.0), IL_C(0.0)};
     il_real top[2] = {IL_C(0.0), IL_C(0.0)}, outside[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
-    il_real bent[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
+    il_real strained[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
     for (int32_t i = 0; i < n; i += 2) {
         for (int32_t j = 0; j < 2; j++) {
             il_real e = r[i + j] - middle, square = e * e;
-            il_real v = il_larger(il_drawn(variance[i + j], pull[i + j], usual * ratio[i + j]), floor), w = IL_C(1.0) / v;
+            il_real v = il_larger(il_shrunk(variance[i + j], pull[i + j], usual * ratio[i + j]), floor), w = IL_C(1.0) / v;
             trusted[i + j] = v;
             weight[i + j] = w;
             squares[j] += square;
@@ -69,7 +69,7 @@ static void compare(int32_t n, il_real gate, il_real floor, const il_real *restr
             rate[j] += w * r[i + j];
             top[j] = il_larger(w, top[j]);
             outside[j] = il_larger(square - gate * v, outside[j]);
-            bent[j] = il_larger(IL_C(1.25) * square - IL_MOST * IL_MOST * il_larger(v, usual), bent[j]);
+            strained[j] = il_larger(IL_C(1.25) * square - IL_MOST * IL_MOST * il_larger(v, usual), strained[j]);
         }
     }
     p->squares = squares[0] + squares[1];
@@ -77,7 +77,7 @@ static void compare(int32_t n, il_real gate, il_real floor, const il_real *restr
     p->rate = (rate[0] + rate[1]) / p->total;
     p->top = il_larger(top[0], top[1]);
     p->outside = il_larger(outside[0], outside[1]);
-    p->bent = il_larger(bent[0], bent[1]);
+    p->strained = il_larger(strained[0], strained[1]);
 }
 
 /* Hold the largest weight to the cap. */
@@ -98,9 +98,10 @@ static void hold(const il_array *a, const il_array_axis *s, il_real *weight, il_
 }
 
 /* Biases, variances, means of a second. Returns by how much one of these is beyond what shows that none has jumped. */
-static il_real teach(int32_t n, const il_robust_terms *restrict t, const il_sample *restrict p, const il_real *restrict r,
-                     const il_real *restrict still, il_real centre, const il_real *restrict gain, const il_real *restrict trusted, il_real *restrict bias,
-                     il_real *restrict variance, il_real *restrict fast) {
+static il_real update(int32_t n, const il_robust_terms *restrict t, const il_sample *restrict p, const il_real *restrict r,
+                     const il_real *restrict still, il_real centre, const il_real *restrict gain,
+                     const il_real *restrict trusted, il_real *restrict bias, il_real *restrict variance,
+                     il_real *restrict fast) {
     const il_real middle = p->middle, rate = p->rate, level = t->cross * p->squares, hat = t->hat, keep = t->keep;
     const il_real recent = t->recent, jump = t->jump;
     il_real sum[2] = {IL_C(0.0), IL_C(0.0)}, far[2] = {-(il_real)INFINITY, -(il_real)INFINITY};
@@ -119,7 +120,7 @@ static il_real teach(int32_t n, const il_robust_terms *restrict t, const il_samp
 }
 
 /* Whether no residual is beyond full teaching; exactly, where the margin of `compare` leaves it open. */
-static int straight(int32_t n, const il_sample *p, const il_real *r) {
+static int all_teach_in_full(int32_t n, const il_sample *p, const il_real *r) {
     int all = 1;
     for (int32_t i = 0; i < n; i++) {
         const il_real e = r[i] - p->rate;
@@ -147,9 +148,9 @@ int il_robust_all_well(const il_array *a, const il_robust_terms *t, il_array_axi
     if (p->top > a->weight_cap * p->total) hold(a, s, s->weight, p);
     const il_real apart = p->middle - p->rate, room = IL_C(2.0) * t->gate * p->mean_variance - p->squares;
     if (!(p->outside <= room * t->share)) return 0;
-    if (p->bent + IL_C(5.0) * apart * apart > IL_C(0.0) && !straight(n, p, p->r)) return 0;
+    if (p->strained + IL_C(5.0) * apart * apart > IL_C(0.0) && !all_teach_in_full(n, p, p->r)) return 0;
     p->moves = il_robust_move(a, s, p->rate, p);
-    return !p->moves || straight(n, p, p->r_still);
+    return !p->moves || all_teach_in_full(n, p, p->r_still);
 }
 
 /* Whether the means of a second are so near to each other that none can have jumped: half of the limit of a jump, because
@@ -180,7 +181,7 @@ int il_robust_learn_well(const il_array *a, const il_robust_terms *t, il_array_a
         il_robust_learn_motion(a, s, p, f);
     }
     /* The median of the means of a second is no further from 0 than sqrt(2) times their root mean square. */
-    const il_real doubt = teach(n, t, p, p->r, still, centre, p->gain, p->trust, s->bias, s->variance, s->fast);
+    const il_real doubt = update(n, t, p, p->r, still, centre, p->gain, p->trust, s->bias, s->variance, s->fast);
     if (unlike) {
         const il_real drift = (il_sum(n, s->bias) - before) * t->share;
         for (int32_t i = 0; i < n; i++) s->bias[i] -= drift;

@@ -39,7 +39,7 @@ void il_tumble_solve(int32_t order, const il_real (*k)[3], const il_real a[3], i
 }
 
 /* The same for a unit, whose polynomials have limits. */
-static unsigned unbent(const il_tumble *t, const il_real a[3], il_real s[3]) {
+static unsigned within_range(const il_tumble *t, const il_real a[3], il_real s[3]) {
     il_real slope[3];
     unsigned flags = 0;
     il_tumble_solve(t->order, t->nonlinearity, a, s, slope);
@@ -60,7 +60,7 @@ static unsigned crossed(const il_tumble *t, const il_real a[3], il_real s[3]) {
     for (int k = 0; k < CROSS_STEPS && flags == 0; k++) {
         const il_real last[3] = {s[0], s[1], s[2]};
         for (int i = 0; i < 3; i++) rest[i] = a[i] - t->cross[i] * last[i] * last[(i + 1) % 3];
-        flags = unbent(t, rest, s);
+        flags = within_range(t, rest, s);
         step = size = IL_C(0.0);
         for (int i = 0; i < 3; i++) {
             step += il_fabs(s[i] - last[i]);
@@ -81,7 +81,7 @@ static inline unsigned tumble_sample(const il_tumble *t, il_real mx, il_real my,
     if (t->has_cross || t->order > 1) {
         const il_real a[3] = {x, y, z};
         il_real s[3];
-        flags |= t->has_cross ? crossed(t, a, s) : unbent(t, a, s);
+        flags |= t->has_cross ? crossed(t, a, s) : within_range(t, a, s);
         x = s[0];
         y = s[1];
         z = s[2];

@@ -19,7 +19,7 @@ static il_tumble golden_tumble(int order) {
 }
 
 /* A triad without errors but for one coefficient of the polynomial, the same on every axis. */
-static il_tumble bent(int order, il_real k, il_real low, il_real high) {
+static il_tumble polynomial(int order, il_real k, il_real low, il_real high) {
     il_tumble t;
     memset(&t, 0, sizeof t);
     t.order = order;
@@ -128,7 +128,7 @@ static void what_is_not_a_number_stays_where_it_reaches(void) {
 static void outputs_beyond_a_turning_point_have_no_force(void) {
     /* s - s^3 / 300 turns at s = 10, where it is 20/3 */
     const il_real top = REAL(20.0) / REAL(3.0);
-    const il_tumble t = bent(3, REAL(-1.0) / REAL(300.0), -top, top);
+    const il_tumble t = polynomial(3, REAL(-1.0) / REAL(300.0), -top, top);
     static const il_real share[] = {REAL(0.5), REAL(0.9), REAL(0.99), REAL(0.999), REAL(1.001), REAL(2), REAL(1e6)};
     for (size_t i = 0; i < LENGTH(share); i++) {
         for (int sign = -1; sign <= 1; sign += 2) {
@@ -141,8 +141,8 @@ static void outputs_beyond_a_turning_point_have_no_force(void) {
         }
     }
     /* Settings whose limits promise more than the polynomial has: said, never looped for. */
-    const il_tumble wrong[] = {bent(2, REAL(1), REAL(-1e30), REAL(1e30)), bent(3, REAL(-1), REAL(-1e30), REAL(1e30)),
-                               bent(5, REAL(-1), REAL(-1e30), REAL(1e30))};
+    const il_tumble wrong[] = {polynomial(2, REAL(1), REAL(-1e30), REAL(1e30)), polynomial(3, REAL(-1), REAL(-1e30), REAL(1e30)),
+                               polynomial(5, REAL(-1), REAL(-1e30), REAL(1e30))};
     for (size_t i = 0; i < LENGTH(wrong); i++) {
         for (int k = -400; k <= 400; k++) {
             const il_real a = REAL(k) / REAL(16), output[3] = {a, REAL(0), REAL(0)};
@@ -188,7 +188,7 @@ static void second_order_is_solved_in_closed_form(void) {
     for (int i = 0; i < 3; i++) CHECK(isnan(found[i]) && isnan(slopes[i]));
     il_tumble_solve(2, bends, beyond, found, slopes);
     for (int i = 0; i < 3; i++) CHECK(isnan(found[i]) && isnan(slopes[i]));
-    const il_tumble t = bent(2, k2, REAL(-1e30), top);
+    const il_tumble t = polynomial(2, k2, REAL(-1e30), top);
     il_real force[3];
     const il_real at_top[3] = {top, REAL(0), REAL(0)}, none[3] = {NAN_REAL, REAL(0), REAL(0)}, below[3] = {REAL(31.99), REAL(0), REAL(0)};
     CHECK(il_tumble_apply(&t, at_top, force) == (unsigned)IL_BEYOND && isnan(force[0]));
