@@ -76,7 +76,7 @@ def test_a_unit_among_equal_ones_stands_out_by_the_mean_distance():
 def test_few_units_of_a_procedure_have_a_table_and_no_distribution():
     items = line_statistics([summary(str(i), float(i)) for i in range(3)], {})
     state = FleetState("d", FleetManifest("m.csv", ".", ()), ())
-    assert [type(item).__name__ for item in fleet_exhibits(state, items, []).items] == ["Table"]
+    assert [type(item).__name__ for item in fleet_exhibits(state, items, []).items] == ["ReportTable"]
     more = line_statistics([summary(str(i), float(i)) for i in range(4)], {})
     found = [type(item).__name__ for item in fleet_exhibits(state, more, []).items]
     assert found == ["Figure", "Table", "Figure"]
