@@ -262,18 +262,11 @@ def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
     return {"value": value, "standard_uncertainty": uncertainty, "unit": unit}
 
 
-def _record(
-    still: Recording,
-    moving: Recording | None,
-    elements: Elements,
-    rest: _AtRest,
-    aligned: Alignment | None,
-    covariance: Array,
-    averaging_time: float,
-    differences: int,
-    warnings: list[str],
-) -> Calibration:
-    axes, n = len(elements.axes), elements.count
+def _elements(
+    elements: Elements, rest: _AtRest, aligned: Alignment | None
+) -> tuple[list[dict[str, Any]], dict[str, Parameter]]:
+    """The record's entry for each element, and the parameters in them."""
+    axes = len(elements.axes)
     spread = np.array([[c.coefficients.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
     one = axes == 1
 
@@ -283,7 +276,7 @@ def _record(
 
     listed = []
     parameters: dict[str, Parameter] = {}
-    for i in range(n):
+    for i in range(elements.count):
         entry: dict[str, Any] = {
             "name": elements.names[0][i] if one else str(i + 1),
             "bias": _with_unit(scalar(rest.bias[:, i]), scalar(spread[:, i]), "rad/s"),
@@ -307,10 +300,23 @@ def _record(
         for name in COEFFICIENTS:
             entry[name] = dicts[0][name] if one else _over_axes([found[name] for found in dicts])
         listed.append(entry)
-    fixed = [fixed_weights(matrix) for matrix in covariance]
+    return listed, parameters
+
+
+def _record(
+    still: Recording,
+    moving: Recording | None,
+    elements: Elements,
+    rest: _AtRest,
+    aligned: Alignment | None,
+    covariance: Array,
+    averaging_time: float,
+    differences: int,
+    warnings: list[str],
+) -> Calibration:
+    listed, parameters = _elements(elements, rest, aligned)
     sigma = np.sqrt(np.einsum("aii->ai", covariance))
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    uncertainty = (1 - correlation**2) / math.sqrt(differences)
     shared = _shared(correlation)
     if shared > _SHARED:
         warnings = [
@@ -325,7 +331,7 @@ def _record(
         covariance=Covariance((), ()),
         model={
             "kind": "calibration",
-            "elements": n,
+            "elements": elements.count,
             "axes": list(elements.axes),
             "aligned": aligned is not None,
             "gauge": aligned.gauge if aligned is not None else None,
@@ -353,18 +359,26 @@ def _record(
         warnings=tuple(warnings),
         sections={
             "elements": listed,
-            "correlation": {
-                "averaging_time": {"value": averaging_time, "unit": "s"},
-                "axes": list(elements.axes),
-                "matrix": correlation.tolist(),
-                "standard_uncertainty": uncertainty.tolist(),
-                "covariance": covariance.tolist(),
-                "unit": "(rad/s)^2",
-                "weights": [weights.tolist() for weights, _ in fixed],
-                "limit": [{"value": limit, "unit": "rad/s"} for _, limit in fixed],
-            },
+            "correlation": _correlation(elements, covariance, correlation, averaging_time, differences),
         },
     )
+
+
+def _correlation(
+    elements: Elements, covariance: Array, correlation: Array, averaging_time: float, differences: int
+) -> dict[str, Any]:
+    """The record's section on common noise, with the fixed weights that follow from it."""
+    fixed = [fixed_weights(matrix) for matrix in covariance]
+    return {
+        "averaging_time": {"value": averaging_time, "unit": "s"},
+        "axes": list(elements.axes),
+        "matrix": correlation.tolist(),
+        "standard_uncertainty": ((1 - correlation**2) / math.sqrt(differences)).tolist(),
+        "covariance": covariance.tolist(),
+        "unit": "(rad/s)^2",
+        "weights": [weights.tolist() for weights, _ in fixed],
+        "limit": [{"value": limit, "unit": "rad/s"} for _, limit in fixed],
+    }
 
 
 def _over_axes(found: list[dict[str, Any]]) -> dict[str, Any]:
