@@ -39,7 +39,6 @@ def make_record(
     """Turn the estimates, the error budget and what it found into the record."""
     method = str(options["method"])
     sigma = np.sqrt(np.maximum(np.diagonal(estimates.covariance), 0.0))
-    repeated = levels.repeatability
     model: dict[str, Any] = {
         "equation": "drift = K(a) (a_x cos direction + a_y sin direction), K(a) = K0 (1 + c1 a + c2 a^2)",
         "radius": {"value": manifest.radius, "unit": "m", "from": "manifest"},
@@ -58,40 +57,7 @@ def make_record(
         },
         covariance=Covariance(estimates.names, tuple(map(tuple, estimates.covariance.tolist()))),
         model=model,
-        fit={
-            "method": method,
-            "noise": _noise_text(runs),
-            "coverage_factor_95": dict(zip(estimates.names, estimates.coverage.tolist(), strict=True)),
-            "degrees_of_freedom": dict(zip(estimates.names, estimates.freedom.tolist(), strict=True)),
-            "curves": {
-                prefix.rstrip("_"): {
-                    "model": fitted.model,
-                    "chi_square": fitted.chi_square,
-                    "degrees_of_freedom": fitted.freedom,
-                    "probability": fitted.probability,
-                    "standard_uncertainty_given_model": {
-                        name.removeprefix(prefix): float(u)
-                        for name, u in zip(estimates.names, estimates.given, strict=True)
-                        if name in (f"{prefix}K0", f"{prefix}c1", f"{prefix}c2")
-                    },
-                    "tried": [
-                        {"model": name, "coefficients": count, "chi_square": chi_square, "chosen": chosen}
-                        for name, count, chi_square, chosen in fitted.tried
-                    ],
-                }
-                for prefix, fitted in estimates.curves.items()
-            },
-            "direction_probability": {prefix.rstrip("_"): p for prefix, p in estimates.turning.items()},
-            "repeatability": {
-                "relative_standard_deviation": float(np.sqrt(repeated.cycle)),
-                "direction": _value(np.sqrt(repeated.turn), "rad"),
-                "within_power_cycle": float(np.sqrt(repeated.run)),
-                "chi_square": repeated.chi_square,
-                "degrees_of_freedom": repeated.freedom,
-            },
-            "power_cycles": power_cycles(levels, method),
-            "error_budget": [dict(entry) for entry in budget],
-        },
+        fit=_fit(runs, levels, estimates, budget, method),
         options=dict(options),
         data={"spectra": _spectra(runs, levels), "statics": [_static(static) for static in statics]},
         sensor=dict(manifest.sensor),
@@ -99,6 +65,51 @@ def make_record(
         warnings=(*found, *_warnings(manifest, runs, levels, estimates, method)),
         sections={"levels": _levels(levels, estimates), "runs": _runs(manifest, statics, runs, levels, method)},
     )
+
+
+def _fit(
+    runs: Sequence[LoadedRun],
+    levels: Levels,
+    estimates: Estimates,
+    budget: Sequence[Mapping[str, Any]],
+    method: str,
+) -> dict[str, Any]:
+    """How the parameters were found, and how well the lines agree with them."""
+    repeated = levels.repeatability
+    return {
+        "method": method,
+        "noise": _noise_text(runs),
+        "coverage_factor_95": dict(zip(estimates.names, estimates.coverage.tolist(), strict=True)),
+        "degrees_of_freedom": dict(zip(estimates.names, estimates.freedom.tolist(), strict=True)),
+        "curves": {
+            prefix.rstrip("_"): {
+                "model": fitted.model,
+                "chi_square": fitted.chi_square,
+                "degrees_of_freedom": fitted.freedom,
+                "probability": fitted.probability,
+                "standard_uncertainty_given_model": {
+                    name.removeprefix(prefix): float(u)
+                    for name, u in zip(estimates.names, estimates.given, strict=True)
+                    if name in (f"{prefix}K0", f"{prefix}c1", f"{prefix}c2")
+                },
+                "tried": [
+                    {"model": name, "coefficients": count, "chi_square": chi_square, "chosen": chosen}
+                    for name, count, chi_square, chosen in fitted.tried
+                ],
+            }
+            for prefix, fitted in estimates.curves.items()
+        },
+        "direction_probability": {prefix.rstrip("_"): p for prefix, p in estimates.turning.items()},
+        "repeatability": {
+            "relative_standard_deviation": float(np.sqrt(repeated.cycle)),
+            "direction": _value(np.sqrt(repeated.turn), "rad"),
+            "within_power_cycle": float(np.sqrt(repeated.run)),
+            "chi_square": repeated.chi_square,
+            "degrees_of_freedom": repeated.freedom,
+        },
+        "power_cycles": power_cycles(levels, method),
+        "error_budget": [dict(entry) for entry in budget],
+    }
 
 
 def _value(number: float, unit: str) -> dict[str, Any]:
