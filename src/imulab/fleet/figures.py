@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from imulab.fleet import panels as small
-from imulab.fleet.display import display_of
+from imulab.fleet.display import Display, display_of
 from imulab.fleet.reporttables import number
-from imulab.fleet.statistics import FleetChange, ParameterStatistics, change_limit
+from imulab.fleet.statistics import Drift, FleetChange, ParameterStatistics, change_limit
+from imulab.recording import Array
 from imulab.report import panels as grid
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import BAD, GOOD, QUIET, Figure
@@ -73,20 +74,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
         )
         out = item.outliers & inside
         if out.any():
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "x": grid.plain(values[out]),
-                    "y": [0] * int(out.sum()),
-                    "text": [s for s, o in zip(item.serials, out, strict=True) if o],
-                    "marker": {"color": BAD, "size": 9, "symbol": "diamond"},
-                    "cliponaxis": False,
-                    "xaxis": x,
-                    "yaxis": y,
-                    "hovertemplate": "%{text}: %{x}<extra></extra>",
-                }
-            )
+            traces.append(_diamonds(item.serials, values, out, x, y))
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
         if far is not None:
             far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
@@ -113,6 +101,22 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
         if standing
         else "No unit stands out.",
     )
+
+
+def _diamonds(serials: Sequence[str], values: Array, out: np.ndarray, x: str, y: str) -> dict[str, Any]:
+    """Mark the units that stand out, at the foot of a histogram."""
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": grid.plain(values[out]),
+        "y": [0] * int(out.sum()),
+        "text": [s for s, o in zip(serials, out, strict=True) if o],
+        "marker": {"color": BAD, "size": 9, "symbol": "diamond"},
+        "cliponaxis": False,
+        "xaxis": x,
+        "yaxis": y,
+        "hovertemplate": "%{text}: %{x}<extra></extra>",
+    }
 
 
 def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Figure]:
@@ -157,22 +161,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
                     }
                 )
         if item.drift is not None:
-            ends = np.array(
-                [item.drift.value_at_start, item.drift.value_at_start + item.drift.per_day * item.drift.days]
-            )
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "x": [small.date(item.drift.start), small.date(item.drift.start + item.drift.days)],
-                    "y": grid.plain(np.asarray(shown.of(ends))),
-                    "line": {"color": BAD if item.drift.significant else QUIET, "width": 2,
-                             "dash": "dash" if item.drift.significant else "solid"},
-                    "xaxis": x,
-                    "yaxis": y,
-                    "hoverinfo": "skip",
-                }
-            )  # fmt: skip
+            traces.append(_drift_line(item.drift, shown, x, y))
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
         layout[grid.axis_key(x)] |= small.date_axis(places) if dated else {"nticks": 5}
         far = bulk(values)
@@ -200,6 +189,25 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
         if dated
         else "",
     )
+
+
+def _drift_line(drift: Drift, shown: Display, x: str, y: str) -> dict[str, Any]:
+    """Draw the fitted drift from the first date to the last."""
+    ends = np.array([drift.value_at_start, drift.value_at_start + drift.per_day * drift.days])
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": [small.date(drift.start), small.date(drift.start + drift.days)],
+        "y": grid.plain(np.asarray(shown.of(ends))),
+        "line": {
+            "color": BAD if drift.significant else QUIET,
+            "width": 2,
+            "dash": "dash" if drift.significant else "solid",
+        },
+        "xaxis": x,
+        "yaxis": y,
+        "hoverinfo": "skip",
+    }
 
 
 def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
@@ -256,37 +264,42 @@ def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
         "means a rig or a type that changed; one that is wider than the others, uncertainties stated too small. Red "
         "diamonds lie outside the band." + edge_note(0 if far is None else int(far.beyond.sum())),
         traces,
-        {
-            "xaxis": {
-                "tickvals": list(range(len(names))),
-                "ticktext": names,
-                "tickangle": -35,
-                "range": [-0.6, len(names) - 0.4],
-                "zeroline": False,
-                "showgrid": False,
-            },
-            "yaxis": {
-                "title": {"text": "change, normal deviations"},
-                "gridcolor": "#e6eaed",
-                "zerolinecolor": QUIET,
-                **scale,
-            },
-            "shapes": [
-                {
-                    "type": "rect",
-                    "xref": "paper",
-                    "x0": 0,
-                    "x1": 1,
-                    "y0": -limit,
-                    "y1": limit,
-                    "fillcolor": "#e6f1f4",
-                    "line": {"width": 0},
-                    "layer": "below",
-                }
-            ],
-            "showlegend": False,
-            "margin": {"l": 70, "r": 20, "t": 20, "b": 110},
-        },
+        _change_layout(names, limit, scale),
         height=430,
         message=f"{many} of {len(every)} changes {'is' if many == 1 else 'are'} outside the band of ±{limit:.2g}.",
     )
+
+
+def _change_layout(names: Sequence[str], limit: float, scale: dict[str, Any]) -> dict[str, Any]:
+    """Lay out a column for each parameter, over the band of what chance explains."""
+    return {
+        "xaxis": {
+            "tickvals": list(range(len(names))),
+            "ticktext": names,
+            "tickangle": -35,
+            "range": [-0.6, len(names) - 0.4],
+            "zeroline": False,
+            "showgrid": False,
+        },
+        "yaxis": {
+            "title": {"text": "change, normal deviations"},
+            "gridcolor": "#e6eaed",
+            "zerolinecolor": QUIET,
+            **scale,
+        },
+        "shapes": [
+            {
+                "type": "rect",
+                "xref": "paper",
+                "x0": 0,
+                "x1": 1,
+                "y0": -limit,
+                "y1": limit,
+                "fillcolor": "#e6f1f4",
+                "line": {"width": 0},
+                "layer": "below",
+            }
+        ],
+        "showlegend": False,
+        "margin": {"l": 70, "r": 20, "t": 20, "b": 110},
+    }
