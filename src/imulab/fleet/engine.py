@@ -91,7 +91,7 @@ class DaskEngine:
             except queue.Empty:
                 watch.look()
                 continue
-            watch.heard()
+            watch.forget_losses()
             if result is None:
                 return
             if isinstance(result, BaseException):
@@ -124,7 +124,7 @@ class _Watch:
         self._name = name
         self._since: dict[str, float] = {}
 
-    def heard(self) -> None:
+    def forget_losses(self) -> None:
         self._since.clear()
 
     def look(self, *, end: bool = False) -> None:

@@ -204,7 +204,7 @@ class UnitFiles:
         self.inputs[name] = self.sha256(name)
         for number, block in enumerate(read_blocks(self.path(name), known, name=name, **part)):
             if not number:
-                self.heard(block)
+                self.remember_head(block)
             yield block
 
     def beside(self, name: str, file: str) -> str:
@@ -224,7 +224,7 @@ class UnitFiles:
         recording = read(self.path(name), known, name=name, **part)
         if recording.source is not None:
             self.inputs[name] = recording.source.sha256
-        self.heard(recording)
+        self.remember_head(recording)
         return recording
 
     def record(self, name: str) -> Calibration:
@@ -240,7 +240,7 @@ class UnitFiles:
         self.inputs[name] = hashlib.sha256(data).hexdigest()
         return loads(data, name)
 
-    def heard(self, recording: Recording) -> None:
+    def remember_head(self, recording: Recording) -> None:
         """Remember what the head of a recording says of unit and date."""
         serial = recording.metadata.get("serial")
         if serial and serial not in self.serials:
