@@ -79,7 +79,7 @@ def test_few_units_of_a_procedure_have_a_table_and_no_distribution():
     assert [type(item).__name__ for item in fleet_exhibits(state, items, []).items] == ["ReportTable"]
     more = line_statistics([summary(str(i), float(i)) for i in range(4)], {})
     found = [type(item).__name__ for item in fleet_exhibits(state, more, []).items]
-    assert found == ["Figure", "Table", "Figure"]
+    assert found == ["Figure", "ReportTable", "Figure"]
 
 
 def test_one_unit_is_shown_to_its_uncertainty_and_has_no_spread():
