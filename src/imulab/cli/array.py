@@ -21,11 +21,11 @@ from imulab.cli.options import (
     Window,
     check_outputs,
     chosen,
-    heard,
     progress_bar,
     quantity,
     warn,
     whole_number,
+    with_notes,
 )
 from imulab.errors import OptionError
 from imulab.procedures.gyro_array.task import OPTIONS
@@ -231,7 +231,7 @@ def fuse(
         still=None if still is None else interval(still, "--still"),
     )
     fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
-    blocks = (fused_recording(part) for part in fuser.fuse(heard(read_blocks(file, layout, **reading))))
+    blocks = (fused_recording(part) for part in fuser.fuse(with_notes(read_blocks(file, layout, **reading))))
     if output:
         write(blocks, output)
     else:

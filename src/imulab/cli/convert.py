@@ -17,7 +17,7 @@ from imulab.cli.options import (
     Window,
     check_outputs,
     chosen,
-    heard,
+    with_notes,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def convert(
     from imulab.readers import read_blocks
 
     check_outputs([output], [name for name in (file, layout) if name])
-    write_out(heard(read_blocks(file, layout, **chosen(topic, instance, window, element))), output)
+    write_out(with_notes(read_blocks(file, layout, **chosen(topic, instance, window, element))), output)
 
 
 def write_out(blocks: Iterable[Recording], output: str | None) -> None:

@@ -46,7 +46,7 @@ _LARGEST_RECORD = 1 << 26
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
-def heard(
+def with_notes(
     blocks: Iterable[Recording], *, notes: bool = True, tell: Callable[[str, str], object] | None = None
 ) -> Iterator[Recording]:
     """Pass blocks on, and say on standard error what the reader did to the data, each thing once.
@@ -70,7 +70,7 @@ def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recor
     from imulab.readers import read
 
     recording = read(file, layout, **part)
-    list(heard([recording], notes=False, tell=hold))
+    list(with_notes([recording], notes=False, tell=hold))
     return recording
 
 
@@ -91,7 +91,7 @@ class GivenFiles:
         """Read a recording in blocks, and warn where it was cut."""
         from imulab.readers import read_blocks
 
-        return heard(read_blocks(name, layout, **part), notes=False, tell=hold)
+        return with_notes(read_blocks(name, layout, **part), notes=False, tell=hold)
 
     def path(self, name: str) -> Path:
         """Return the path of a file."""

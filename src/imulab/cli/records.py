@@ -22,12 +22,12 @@ from imulab.cli.options import (
     Window,
     check_outputs,
     chosen,
-    heard,
     is_json,
     naming,
     note,
     quantity,
     warn,
+    with_notes,
 )
 from imulab.errors import ImulabError, OptionError, RecordError
 
@@ -94,7 +94,7 @@ def apply(
                     latest_start=start,
                 )
             )
-    blocks = heard(read_blocks(file, layout, **part), notes=False)
+    blocks = with_notes(read_blocks(file, layout, **part), notes=False)
     if temperature_column and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
