@@ -26,31 +26,8 @@ def sphere_figure(record: Calibration) -> Figure:
     for upper, axes in ((True, ("x", "y")), (False, ("x2", "y2"))):
         traces += _graticule(axes)
         chosen = up if upper else ~up
-        x, y = _equal_area(u[chosen], upper)
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "x": x.tolist(),
-                "y": y.tolist(),
-                "xaxis": axes[0],
-                "yaxis": axes[1],
-                "showlegend": False,
-                "marker": {
-                    "size": 12,
-                    "color": residual[chosen].tolist(),
-                    "cmin": -limit,
-                    "cmax": limit,
-                    "colorscale": [[0, GOOD], [0.5, "#f4efe6"], [1, BAD]],
-                    "line": {"color": INK, "width": 1},
-                    "showscale": upper,
-                    "colorbar": {"title": {"text": "|f| − g, µg"}, "thickness": 12},
-                },
-                "text": [label for label, c in zip(data.label, chosen.tolist(), strict=True) if c],
-                "customdata": u[chosen].round(3).tolist(),
-                "hovertemplate": "%{text}<br>up (%{customdata[0]}, %{customdata[1]}, %{customdata[2]})<extra></extra>",
-            }
-        )
+        labels = [label for label, c in zip(data.label, chosen.tolist(), strict=True) if c]
+        traces.append(_hemisphere(u[chosen], residual[chosen], labels, limit, axes, upper=upper))
     hidden = {"visible": False, "range": [-1.25, 1.25], "fixedrange": True}
     return Figure(
         title="Attitudes on the sphere",
@@ -77,6 +54,35 @@ def sphere_figure(record: Calibration) -> Figure:
         },
         height=420,
     )
+
+
+def _hemisphere(
+    up: Array, residual: Array, labels: list[str], limit: float, axes: tuple[str, str], *, upper: bool
+) -> dict[str, Any]:
+    """Return the attitudes of one hemisphere as points, coloured by residual from -limit to limit, µg."""
+    x, y = _equal_area(up, upper)
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": x.tolist(),
+        "y": y.tolist(),
+        "xaxis": axes[0],
+        "yaxis": axes[1],
+        "showlegend": False,
+        "marker": {
+            "size": 12,
+            "color": residual.tolist(),
+            "cmin": -limit,
+            "cmax": limit,
+            "colorscale": [[0, GOOD], [0.5, "#f4efe6"], [1, BAD]],
+            "line": {"color": INK, "width": 1},
+            "showscale": upper,
+            "colorbar": {"title": {"text": "|f| − g, µg"}, "thickness": 12},
+        },
+        "text": labels,
+        "customdata": up.round(3).tolist(),
+        "hovertemplate": "%{text}<br>up (%{customdata[0]}, %{customdata[1]}, %{customdata[2]})<extra></extra>",
+    }
 
 
 def _equal_area(u: Array, upper: bool) -> tuple[Array, Array]:
