@@ -128,31 +128,8 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
     per_second = model in _CUBIC and titles == _titles(model, size, True)
     if titles != expected and not per_second:
         raise ReadError(f"{path}: line {number}: expected the titles {','.join(expected)}, found {','.join(titles)}")
-    units: dict[str, str] = {}
-    found: dict[tuple[float, ...], dict[str, list[float]]] = {}
-    for number, cells in rows[1:]:
-        place = f"{path}: line {number}"
-        if len(cells) != lead + 2 + size:
-            raise ReadError(f"{place}: expected {lead + 2 + size} fields, found {len(cells)}")
-        at = tuple(_value(place, cell) for cell in cells[:lead])
-        axis, unit = cells[lead : lead + 2]
-        try:
-            known = parse_unit(unit)
-            si = _SI.get(known.quantity, known.symbol)
-            factor = conversion_factor(unit, si)
-        except UnitError as error:
-            raise ReadError(f"{place}: {error}") from None
-        if units.setdefault(axis, si) != si:
-            raise ReadError(f"{place}: {axis} in {unit}, but in {units[axis]} above")
-        block = found.setdefault(at, {})
-        if axis in block:
-            raise ReadError(f"{place}: {axis} at {' to '.join(f'{t:g}' for t in at)} degC appears twice")
-        block[axis] = [_value(place, cell) * factor for cell in cells[lead + 2 :]]
+    units, found = _read_rows(path, rows[1:], lead, size)
     order = sorted(found)
-    for at in order:
-        missing = [axis for axis in units if axis not in found[at]]
-        if missing:
-            raise ReadError(f"{path}: no row for {missing[0]} at {' to '.join(f'{t:g}' for t in at)} degC")
     if interval:
         for left, right in pairwise(order):
             if left[1] != right[0]:
@@ -182,6 +159,37 @@ def _table(path: str, settings: dict[str, str], rows: list[tuple[int, list[str]]
         time_constants=constants,
         slopes=slopes,
     )
+
+
+def _read_rows(
+    path: str, rows: list[tuple[int, list[str]]], lead: int, size: int
+) -> tuple[dict[str, str], dict[tuple[float, ...], dict[str, list[float]]]]:
+    """Return the SI unit of each axis, and the coefficients in SI of each interval or knot and axis."""
+    units: dict[str, str] = {}
+    found: dict[tuple[float, ...], dict[str, list[float]]] = {}
+    for number, cells in rows:
+        place = f"{path}: line {number}"
+        if len(cells) != lead + 2 + size:
+            raise ReadError(f"{place}: expected {lead + 2 + size} fields, found {len(cells)}")
+        at = tuple(_value(place, cell) for cell in cells[:lead])
+        axis, unit = cells[lead : lead + 2]
+        try:
+            known = parse_unit(unit)
+            si = _SI.get(known.quantity, known.symbol)
+            factor = conversion_factor(unit, si)
+        except UnitError as error:
+            raise ReadError(f"{place}: {error}") from None
+        if units.setdefault(axis, si) != si:
+            raise ReadError(f"{place}: {axis} in {unit}, but in {units[axis]} above")
+        block = found.setdefault(at, {})
+        if axis in block:
+            raise ReadError(f"{place}: {axis} at {' to '.join(f'{t:g}' for t in at)} degC appears twice")
+        block[axis] = [_value(place, cell) * factor for cell in cells[lead + 2 :]]
+    for at in sorted(found):
+        missing = [axis for axis in units if axis not in found[at]]
+        if missing:
+            raise ReadError(f"{path}: no row for {missing[0]} at {' to '.join(f'{t:g}' for t in at)} degC")
+    return units, found
 
 
 def _seconds(path: str, settings: dict[str, str], key: str) -> list[float]:
