@@ -13,6 +13,7 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.compare import Check
 from imulab.procedures.tumble.engineering import micro_g, small_g
 from imulab.procedures.tumble.prior import FALSE_ALARM
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report import render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
@@ -111,19 +112,7 @@ def _figure(check: Check, attitudes: Attitudes) -> Figure:
     number = list(range(1, len(attitudes) + 1))
     residual = np.array([micro_g(value) for value in check.residuals.tolist()])
     beyond = _beyond(check)
-    trace: dict[str, Any] = {
-        "type": "scatter",
-        "mode": "markers",
-        "x": number,
-        "y": residual.tolist(),
-        "marker": {
-            "size": 9,
-            "color": [BAD if mark else GOOD for mark in beyond.tolist()],
-            "symbol": ["diamond" if mark else "circle" for mark in beyond.tolist()],
-        },
-        "text": [attitudes.label(i) for i in range(len(attitudes))],
-        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
-    }
+    trace = _points(attitudes, residual, beyond)
     room, bars = 0.0, " The record states no uncertainties."
     if check.standard_uncertainty is not None:
         half = [_BEYOND * micro_g(value) for value in check.standard_uncertainty.tolist()]
@@ -173,6 +162,23 @@ def _figure(check: Check, attitudes: Attitudes) -> Figure:
             ],
         },
     )
+
+
+def _points(attitudes: Attitudes, residual: Array, beyond: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the residual of each attitude, µg, as a point, marked where it is beyond."""
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": list(range(1, len(attitudes) + 1)),
+        "y": residual.tolist(),
+        "marker": {
+            "size": 9,
+            "color": [BAD if mark else GOOD for mark in beyond.tolist()],
+            "symbol": ["diamond" if mark else "circle" for mark in beyond.tolist()],
+        },
+        "text": [attitudes.label(i) for i in range(len(attitudes))],
+        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
+    }
 
 
 def _table(check: Check, attitudes: Attitudes) -> ReportTable:
