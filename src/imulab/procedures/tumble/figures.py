@@ -100,23 +100,6 @@ def _residuals(record: Calibration) -> Figure:
     sigma = data.standard_uncertainty
     excess = fit_of(record).excess.value
     bars = None if sigma is None else [micro_g(float(np.hypot(value, excess))) for value in sigma]
-    colours = [BAD if weight < ALARM else GOOD for weight in data.down_weight]
-    shapes = ["diamond" if weight < ALARM else "circle" for weight in data.down_weight]
-    marker = {"color": colours, "size": 8, "symbol": shapes}
-    trace: dict[str, Any] = {
-        "type": "scatter",
-        "mode": "markers",
-        "x": number,
-        "y": after,
-        "marker": marker,
-        "xaxis": "x",
-        "yaxis": "y",
-        "text": data.label,
-        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
-        "name": "after",
-    }
-    if bars is not None:
-        trace["error_y"] = {"type": "data", "array": bars, "thickness": 1, "width": 2, "color": QUIET}
     before = [micro_g(value) / 1e3 for value in data.residual_before]
     usual = np.array(data.down_weight) >= ALARM
     bad = len(number) - int(usual.sum())
@@ -145,7 +128,7 @@ def _residuals(record: Calibration) -> Figure:
                 "hovertemplate": "attitude %{x}<br>%{y:.2f} mg<extra></extra>",
                 "name": "before",
             },
-            trace,
+            _calibrated_points(data, after, bars),
             *marks,
         ],
         layout={
@@ -158,6 +141,28 @@ def _residuals(record: Calibration) -> Figure:
         },
         height=460,
     )
+
+
+def _calibrated_points(data: HeldAttitudes, after: list[float], bars: list[float] | None) -> dict[str, Any]:
+    """Return the residual of each attitude after calibration, µg, as a point, marked where it is held back."""
+    colours = [BAD if weight < ALARM else GOOD for weight in data.down_weight]
+    shapes = ["diamond" if weight < ALARM else "circle" for weight in data.down_weight]
+    marker = {"color": colours, "size": 8, "symbol": shapes}
+    trace: dict[str, Any] = {
+        "type": "scatter",
+        "mode": "markers",
+        "x": list(range(1, len(after) + 1)),
+        "y": after,
+        "marker": marker,
+        "xaxis": "x",
+        "yaxis": "y",
+        "text": data.label,
+        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
+        "name": "after",
+    }
+    if bars is not None:
+        trace["error_y"] = {"type": "data", "array": bars, "thickness": 1, "width": 2, "color": QUIET}
+    return trace
 
 
 def _trace(trace: Trace, data: HeldAttitudes) -> Figure:
