@@ -129,13 +129,7 @@ def find_attitudes(
             f"attitudes with a window of {window:g} s"
         )
     variance = _window_variance(blocks, width)
-    finite = variance[np.isfinite(variance) & (variance > 0)]
-    quietest = float(np.quantile(finite, 0.05)) if finite.size else 0.0
-    # No step within a part is smaller than the smallest of all, which costs a sort: often too small to matter already.
-    resolution = _resolutions(recording, names, _A_PART)
-    if float((resolution**2).sum()) / 12 > quietest:
-        resolution = _resolutions(recording, names)
-    quiet = max(quietest, float((resolution**2).sum()) / 12)
+    quiet, resolution = _quietest(variance, recording, names)
     whole = len(blocks.mean) * blocks.duration
     trim = int(np.ceil(min(settling, whole) / blocks.duration))
     fewest = max(2, int(np.ceil(min(shortest, 2 * whole) / blocks.duration)))
@@ -150,15 +144,7 @@ def find_attitudes(
         left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
     check_clipping(recording, names, stretches)
     held = _Held.of(recording, names, pieces, blocks)
-    moments, freedom, share = _statistics(held)
-    noise = np.sqrt(np.median(held.scatter, axis=0))
-    if (noise < resolution / 2).any():
-        resolution = _resolutions(recording, names)
-    # Noise below half a step of the output does not average its rounding away.
-    rounding = np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
-    covariance = _pooled(moments[:, :3, :3], freedom, share)
-    for matrices in (moments, covariance):
-        matrices[:, range(3), range(3)] += rounding
+    covariance, motion = _covariance_and_motion(held, recording, names, resolution)
     first = np.unique(pieces.attitude, return_index=True)[1]
     last = np.append(first[1:], len(pieces.start)) - 1
     return Attitudes(
@@ -173,13 +159,40 @@ def find_attitudes(
         trace=trace,
         pieces=stretches,
         swing=np.ptp(blocks.mean, axis=0),
-        motion=_motion(held, moments, freedom, share),
+        motion=motion,
         notes=(
             *_corrected_notes(recording),
             *left_out.notes(_at_rest(stretches, len(time))),
             *_notes(blocks, variance),
         ),
     )
+
+
+def _quietest(variance: Array, recording: Recording, names: list[str]) -> tuple[float, Array]:
+    """Return the variance of the quietest windows, no smaller than that of rounding, and the step of each output."""
+    finite = variance[np.isfinite(variance) & (variance > 0)]
+    quietest = float(np.quantile(finite, 0.05)) if finite.size else 0.0
+    # No step within a part is smaller than the smallest of all, which costs a sort: often too small to matter already.
+    resolution = _resolutions(recording, names, _A_PART)
+    if float((resolution**2).sum()) / 12 > quietest:
+        resolution = _resolutions(recording, names)
+    return max(quietest, float((resolution**2).sum()) / 12), resolution
+
+
+def _covariance_and_motion(
+    held: _Held, recording: Recording, names: list[str], resolution: Array
+) -> tuple[Array, Motion | None]:
+    """Return the covariance of each mean, with that of rounding, and the motion in the attitudes."""
+    moments, freedom, share = _statistics(held)
+    noise = np.sqrt(np.median(held.scatter, axis=0))
+    if (noise < resolution / 2).any():
+        resolution = _resolutions(recording, names)
+    # Noise below half a step of the output does not average its rounding away.
+    rounding = np.where(noise < resolution / 2, resolution**2 / 12, 0.0)
+    covariance = _pooled(moments[:, :3, :3], freedom, share)
+    for matrices in (moments, covariance):
+        matrices[:, range(3), range(3)] += rounding
+    return covariance, _motion(held, moments, freedom, share)
 
 
 def _table(recording: Recording, sensor: str, names: list[str], unit: str, temperature: float | None) -> Attitudes:
