@@ -145,16 +145,7 @@ def fit_gyro(
     OptionError
         `sensitivity`, `clock` or `clock_of` has a value that cannot be.
     """
-    if record.procedure != "tumble":
-        raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
-    if sensitivity not in SENSITIVITIES:
-        raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
-    if clock_of not in CLOCKS:
-        raise OptionError(f"clock of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
-    if not 0 <= clock < 1:
-        raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
-    if attitudes.trace is None:
-        raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
+    _check_request(record, attitudes, sensitivity, clock, clock_of)
     unit = recording.triad_unit("gyro")
     check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
     left_out = leave_out(recording, [f"gyro_{axis}" for axis in "xyz"])
@@ -167,19 +158,7 @@ def fit_gyro(
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
     case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)
     found = solve_turns(case, time, sensitivity)
-    even, said = evened(time), []
-    if even is not None:
-        # Only the turns can tell stamps that jitter from samples that do.
-        other = solve_turns(case, even[0], sensitivity)
-        if other.typical_miss < _EVENER * found.typical_miss:
-            said = [
-                Note(
-                    f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
-                    f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
-                    f"{np.degrees(found.typical_miss):.2g} deg (median)"
-                )
-            ]
-            time, found = even[0], other
+    time, found, said = _with_even_stamps(case, time, sensitivity, found)
     apart = attitudes.recording is not recording
     comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
     if clock_of == "accel":
@@ -205,15 +184,7 @@ def fit_gyro(
     miss, size = np.linalg.norm(residual.reshape(-1, 3), axis=1), found.theta.size
     # Each turn fixes two angles: how far about its own direction it went, gravity cannot see.
     freedom = max(2 * len(miss) - size, 1)
-    seen = observability(jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
-    if seen.rank < size:
-        confused = " ".join(seen.confused(gyro_names()[:size]))
-        raise ObservabilityError(f"{recording.name}: {len(miss)} turns cannot separate {confused}")
-    if not found.converged:
-        raise DataError(
-            f"{recording.name}: the fit of the gyroscopes does not converge on these {len(miss)} turns "
-            f"(condition number {seen.condition:.0f}); use more turns, about more directions"
-        )
+    seen = _observability_of_turns(found, freedom, recording.name)
     directions = direction_covariance(record, attitudes, means, case.force)
     zero = None if fit_bias else found.rest.zero_uncertainty
     shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
@@ -227,6 +198,51 @@ def fit_gyro(
     if linearity is not None:
         notes += linearity.notes()
     return _result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes))
+
+
+def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, clock: float, clock_of: str) -> None:
+    """Refuse a record, attitudes or options that no gyroscopes can be fitted with."""
+    if record.procedure != "tumble":
+        raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
+    if sensitivity not in SENSITIVITIES:
+        raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
+    if clock_of not in CLOCKS:
+        raise OptionError(f"clock of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
+    if not 0 <= clock < 1:
+        raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
+    if attitudes.trace is None:
+        raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
+
+
+def _with_even_stamps(case: Case, time: Array, sensitivity: str, found: Solved) -> tuple[Array, Solved, list[Note]]:
+    """Return time, solution and a note with evened time stamps, where the turns miss clearly less with them."""
+    even = evened(time)
+    if even is not None:
+        # Only the turns can tell stamps that jitter from samples that do.
+        other = solve_turns(case, even[0], sensitivity)
+        if other.typical_miss < _EVENER * found.typical_miss:
+            said = Note(
+                f"gyro: the time stamps jitter by {1e3 * even[1]:.2g} ms rms: replaced by even ones, with which "
+                f"the turns miss by {np.degrees(other.typical_miss):.2g} deg instead of "
+                f"{np.degrees(found.typical_miss):.2g} deg (median)"
+            )
+            return even[0], other, [said]
+    return time, found, []
+
+
+def _observability_of_turns(found: Solved, freedom: int, name: str) -> Observability:
+    """Return what the turns determine; refuse those that cannot separate the parameters or do not converge."""
+    residual, size, turns = found.residual, found.theta.size, len(found.residual) // 3
+    seen = observability(found.jacobian, np.full(len(residual), freedom / max(float(residual @ residual), 1e-30)))
+    if seen.rank < size:
+        confused = " ".join(seen.confused(gyro_names()[:size]))
+        raise ObservabilityError(f"{name}: {turns} turns cannot separate {confused}")
+    if not found.converged:
+        raise DataError(
+            f"{name}: the fit of the gyroscopes does not converge on these {turns} turns "
+            f"(condition number {seen.condition:.0f}); use more turns, about more directions"
+        )
+    return seen
 
 
 def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:
