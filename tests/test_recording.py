@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imulab.columns import parse_column_title
 from imulab.errors import DataError, UnitError
-from imulab.recording import Recording, check_finite, check_time, parse_column_title
+from imulab.recording import Recording, check_finite, check_time
 
 # The vocabulary of native files and the quantities that its columns may hold.
 ALLOWED = {
@@ -236,11 +237,12 @@ def test_a_polars_frame_becomes_a_recording():
 @given(values=st.lists(st.floats(allow_nan=False), min_size=1, max_size=20))
 def test_a_frame_and_back_is_the_same_recording(values):
     before = make(time=np.arange(len(values)), accel_x=values, pressure=values)
-    after = Recording.from_frame(before.to_frame())
-    assert list(after.columns) == list(before.columns)
-    assert dict(after.units) == dict(before.units)
-    for name, column in before.columns.items():
-        assert after.column(name).tobytes() == column.tobytes()
+    for library in ("pandas", "polars"):
+        after = Recording.from_frame(before.to_frame(library))
+        assert list(after.columns) == list(before.columns)
+        assert dict(after.units) == dict(before.units)
+        for name, column in before.columns.items():
+            assert after.column(name).tobytes() == column.tobytes()
 
 
 def test_a_frame_that_names_a_column_twice_is_refused():
@@ -255,7 +257,10 @@ def test_a_frame_whose_column_holds_no_numbers_is_refused(values):
         Recording.from_frame(polars.DataFrame({"time [s]": values}))
 
 
-def test_frames_without_polars_say_what_to_install(monkeypatch):
+def test_frames_without_their_library_say_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "polars", None)
-    with pytest.raises(DataError, match="needs polars: pip install polars"):
+    with pytest.raises(DataError, match="needs polars, which is not installed: pip install polars"):
+        make(time=[0]).to_frame("polars")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(DataError, match="needs pandas or polars, which is not installed: pip install pandas"):
         make(time=[0]).to_frame()

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from imulab.errors import DataError, UnitError, quoted
+from imulab.columns import check_unit, element_number, expected_quantities
+from imulab.errors import DataError, UnitError
+from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
 
@@ -18,18 +19,6 @@ Array = NDArray[np.float64]
 
 CORRECTED_BY = "corrected_by"
 """Key, in the head of a file, of each record that its samples were corrected by."""
-_QUANTITIES = {
-    "time": ("time",),
-    "accel": ("acceleration", "output"),
-    "gyro": ("rate", "output"),
-    "dtg": ("rate", "output"),
-    "fog": ("rate", "output"),
-    "temperature": ("temperature", "output"),
-    "table_angle": ("angle", "output"),
-}
-_ELEMENT = re.compile(r"(?:accel|gyro)(?:_[xyz])?_(\d+)")
-_CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
-"""What loggers call the time, and the unit in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +27,6 @@ class Source:
 
     file: str
     sha256: str
-
-
-class Frame(Protocol):
-    """What pandas and polars data frames have in common."""
-
-    columns: Any
-
-    def __getitem__(self, name: str) -> Any:
-        """Return a column."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +106,7 @@ class Recording:
         try:
             return self.columns[name]
         except KeyError:
-            foreign = all(_expected(other) in (None, ("time",)) for other in self.columns)
+            foreign = all(expected_quantities(other) in (None, ("time",)) for other in self.columns)
             several = sorted({number for other in self.columns if (number := element_number(other, name)) is not None})
             if several:
                 raise DataError(
@@ -196,109 +176,117 @@ class Recording:
         return replace(self, columns={**self.columns, **columns}, units={**self.units, **units})
 
     @classmethod
-    def from_frame(cls, frame: Frame, name: str = "frame") -> Recording:
-        """Make a recording from a pandas or polars data frame with columns named ``name [unit]``."""
-        columns, units = {}, {}
-        for title in frame.columns:
-            key, unit = parse_column_title(str(title), name)
-            if key in columns:
-                raise DataError(f"{name}: column {key} appears twice")
-            values = frame[title].to_numpy()
-            if values.dtype.kind not in "iufb":
-                raise DataError(f"{name}: column {key}: expected numbers, found {values.dtype}")
-            columns[key] = np.asarray(values, dtype=np.float64)
-            units[key] = unit
-        return cls(columns=columns, units=units, name=name)
+    def from_arrays(
+        cls,
+        *,
+        accel: ArrayLike | None = None,
+        gyro: ArrayLike | None = None,
+        mag: ArrayLike | None = None,
+        temperature: ArrayLike | None = None,
+        time: ArrayLike | None = None,
+        rate: float | None = None,
+        unit: str | None = None,
+        units: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        name: str = "arrays",
+        **columns: ArrayLike,
+    ) -> Recording:
+        """Make a recording from arrays.
 
-    def to_frame(self) -> Any:
-        """Return a polars data frame with columns named ``name [unit]`` (needs polars)."""
-        try:
-            import polars
-        except ImportError:
-            raise DataError("to_frame needs polars: pip install polars") from None
-        return polars.DataFrame({f"{name} [{self.units[name]}]": values for name, values in self.columns.items()})
+        Parameters
+        ----------
+        accel, gyro, mag
+            Outputs of a triad, shape (n, 3).
+        temperature, time
+            Shape (n,), in degC and s unless `units` says otherwise; times may be dates (`datetime64`).
+        rate
+            Sampling rate, Hz, instead of `time`; with neither, the rows are attitudes at rest.
+        unit
+            Unit of the sensors whose quantity it measures, such as ``"g"``; ``"count"`` and ``"V"`` are of all.
+        units
+            Units of sensors or single columns: ``{"accel": "g", "gyro": "deg/s"}``.
+        metadata
+            What the head of a file would say: ``{"serial": "42", "gravity": "9.81362 m/s^2"}``.
+        name
+            What messages call the recording.
+        columns
+            Further columns, shape (n,) or (n, 3): ``gyro_1``, ``std_accel``, ``truth_rate`` ...
 
+        Raises
+        ------
+        DataError
+            An array has another shape, holds no numbers, or is longer than the others.
+        UnitError
+            A sensor has no unit, or one of another quantity.
+        OptionError
+            A name is nearly one of those above, or both `time` and `rate` are given.
 
-def element_number(column: str, stem: str = "") -> int | None:
-    """Return which of several IMUs a column such as ``accel_x_7`` (of the stem ``accel_x``) is of, None for others."""
-    match = _ELEMENT.fullmatch(column)
-    return int(match[1]) if match and column.startswith(f"{stem}_" if stem else "") else None
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import imulab as il
+        >>> il.Recording.from_arrays(accel=np.tile([0.0, 0.0, 1.0], (200, 1)), rate=100.0, unit="g")
+        Recording(arrays: 200 samples of time [s], accel_x [g], accel_y [g], accel_z [g])
+        """
+        given = {"time": time, "accel": accel, "gyro": gyro, "mag": mag, "temperature": temperature, **columns}
+        found, symbols = columns_of_arrays(given, rate=rate, unit=unit, units=units, name=name)
+        return cls(found, symbols, metadata or {}, name)
 
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Frame,
+        units: Mapping[str, str] | None = None,
+        *,
+        unit: str | None = None,
+        rate: float | None = None,
+        metadata: Mapping[str, str] | None = None,
+        name: str = "frame",
+    ) -> Recording:
+        """Make a recording from a pandas or polars data frame with columns named as in files, ``accel_x [g]``.
 
-def parse_column_title(title: str, file: str) -> tuple[str, str]:
-    """Split ``name [unit]``; a name outside the vocabulary may come without a unit.
+        Parameters
+        ----------
+        frame
+            The data; where it has no column ``time``, dates in its index are the times.
+        units
+            Units of columns whose titles have none: ``{"accel": "g", "gyro_x": "deg/s", "time": "ms"}``.
+        unit, rate, metadata, name
+            As for `from_arrays`.
 
-    Raises
-    ------
-    UnitError
-        No unit on a column that needs one, or an unknown unit.
-    """
-    name, bracket, rest = title.strip().strip('"').strip().partition("[")
-    name = name.strip()
-    _check_name(name, title, file)
-    if not bracket:
-        if _expected(name) is None:
-            return name, "1"
-        raise UnitError(f"{file}: column {name} has no unit; expected a title such as '{name} [{_example(name)}]'")
-    if not rest.rstrip().endswith("]"):
-        raise UnitError(f"{file}: column title {title.strip()!r}: expected 'name [unit]'")
-    symbol = rest.rstrip()[:-1].strip()
-    try:
-        return name, parse_unit(symbol).symbol
-    except UnitError as error:
-        if _expected(name) is None and symbol:
-            return name, symbol  # not ours to convert: it passes through
-        raise UnitError(f"{file}: column {name}: {error}") from None
+        Raises
+        ------
+        DataError
+            A column holds no numbers, or appears twice.
+        UnitError
+            A column of a sensor has no unit, or one of another quantity.
+        OptionError
+            `units` names no column, or both a time and a rate are there.
 
+        Examples
+        --------
+        >>> import imulab as il
+        >>> frame = il.simulate_tumble(gravity=9.81).to_frame()
+        >>> frame.columns[1]
+        'accel_x [m/s^2]'
+        >>> il.Recording.from_frame(frame).units["accel_x"]
+        'm/s^2'
+        """
+        found, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
+        return cls(found, symbols, metadata or {}, name)
 
-def _check_name(name: str, title: str, file: str) -> None:
-    """Refuse what is meant as a name of the vocabulary but is not one."""
-    if has_hidden(title.replace("\t", "")):
-        raise UnitError(f"{file}: column title {quoted(title.strip())}: expected plain text, found a control character")
-    if ";" in title or "\t" in title or title.count("[") > 1:
-        mark = "';'" if ";" in title else "a tab" if "\t" in title else "blanks"
-        raise UnitError(
-            f"{file}: titles {title.strip()[:40]!r}: separated by {mark}, expected ','; describe the file with "
-            "--layout FILE.toml (imulab show --formats has an example)"
-        )
-    lower = name.lower()
-    clock = _CLOCK.fullmatch(lower)
-    meant = "time" if clock else lower.replace(" ", "_")
-    if meant != name and _expected(meant) is not None:
-        example = f", in a title such as 'time [{clock[1]}]'" if clock and clock[1] else ""
-        raise UnitError(f"{file}: column {name!r}: expected the name {meant!r}{example}")
+    def to_frame(self, library: str | None = None) -> Any:
+        """Return a data frame with columns named ``name [unit]``: of pandas, or of the `library` ``"polars"``.
 
-
-def _expected(name: str) -> tuple[str, ...] | None:
-    stem = name.removeprefix("truth_").removeprefix("std_")
-    for prefix, quantities in _QUANTITIES.items():
-        if stem == prefix or stem.startswith(prefix + "_"):
-            return quantities
-    return None
-
-
-def _example(name: str) -> str:
-    return {"time": "s", "acceleration": "m/s^2", "rate": "deg/s", "temperature": "degC", "angle": "deg"}[
-        (_expected(name) or ("time",))[0]
-    ]
-
-
-def check_unit(name: str, unit: str, file: str) -> None:
-    """Check that a column of the vocabulary has a unit of its quantity.
-
-    Raises
-    ------
-    UnitError
-        It has none, or one of another quantity.
-    """
-    expected = _expected(name)
-    if expected is None:
-        return
-    quantity = parse_unit(unit).quantity if unit else "nothing"
-    if quantity not in expected:
-        raise UnitError(
-            f"{file}: column {name}: expected a unit of {' or '.join(expected)}, found {unit!r} ({quantity})"
-        )
+        Raises
+        ------
+        DataError
+            The library is not installed.
+        OptionError
+            `library` is neither of the two.
+        """
+        titled = {f"{name} [{self.units[name]}]": values for name, values in self.columns.items()}
+        return data_frame(titled, library)
 
 
 def check_finite(recording: Recording, names: list[str]) -> None:

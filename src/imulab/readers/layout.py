@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from imulab.columns import check_unit
 from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.quantity_entries import check_keys, number_of, scale_factor_of
-from imulab.recording import Array, check_unit
+from imulab.recording import Array
 from imulab.toml import load_toml
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 

@@ -10,12 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from imulab.columns import parse_column_title
 from imulab.errors import ReadError
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import library
 from imulab.readers.layout import Layout
 from imulab.readers.readings import Readings
-from imulab.recording import CORRECTED_BY, Array, Recording, parse_column_title
+from imulab.recording import CORRECTED_BY, Array, Recording
 
 _NOT_OURS = ("ARROW:", "org.apache.")
 _OTHERS_JSON = ("pandas", "huggingface", "geo")  # what other writers leave under these names begins with a brace

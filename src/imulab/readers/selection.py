@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from imulab.columns import element_number
 from imulab.errors import OptionError
-from imulab.recording import Recording, element_number
+from imulab.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)

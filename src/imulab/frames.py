@@ -1,0 +1,308 @@
+"""Arrays and data frames to the columns of a recording, and back; pandas and polars are used, neither is needed."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.columns import check_name, example_unit, expected_quantities
+from imulab.errors import DataError, OptionError, UnitError, listed, meant, quoted
+from imulab.units import parse_unit
+
+TRIADS = ("accel", "gyro", "mag")
+"""Sensors of three axes, which may come as one array of shape (n, 3)."""
+DEFAULT_UNITS = {"time": "s", "temperature": "degC"}
+"""Units of arrays that are given without one; a data frame states all its units."""
+_LIBRARIES = ("pandas", "polars")
+_WORDS = (*TRIADS, "temperature", "time", "rate", "unit", "units", "metadata", "name")
+_LIKE_NUMBERS = "iufb"
+_TEXTS = ("object", "str", "string", "category")
+_TIMES = ("datetime64", "timedelta64")
+
+Columns = dict[str, NDArray[np.float64]]
+
+
+class Frame(Protocol):
+    """What pandas and polars data frames have in common."""
+
+    columns: Any
+
+    def __getitem__(self, name: Any) -> Any:
+        """Return a column."""
+
+
+@dataclass
+class Units:
+    """What was said of units: for single columns or sensors, and one for all sensors whose quantity it measures.
+
+    ``where`` is how a message says to state a unit that is missing, with ``{name}``, ``{sensor}`` and ``{unit}``.
+    """
+
+    name: str
+    each: Mapping[str, str]
+    common: str | None
+    where: str
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    used: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.each, Mapping) or not all(isinstance(v, str) for v in self.each.values()):
+            raise OptionError(f"units {quoted(self.each)}: expected names and their units, such as {{'gyro': 'deg/s'}}")
+        if self.common is not None:
+            if not isinstance(self.common, str):
+                raise OptionError(f"unit {quoted(self.common)}: expected a text such as 'g' or 'deg/s'")
+            parse_unit(self.common)
+
+    def of(self, column: str, stated: str | None = None) -> str:
+        """Return the unit of a column; `stated` is that of its title."""
+        said = next((key for key in _stems(column) if key in self.each), None)
+        if said is not None:
+            self.used.add(said)
+            symbol = self._known(column, self.each[said])
+            if stated is not None and self._known(column, stated) != symbol:
+                raise OptionError(f"{self.name}: column {column} [{stated}]: units has {symbol!r} for it; expected one")
+            return symbol
+        if stated is not None:
+            return self._known(column, stated)
+        quantities = expected_quantities(column)
+        sensor = next((part for part in TRIADS if part in _stems(column)), column)
+        fits = quantities or (["output"] if sensor in TRIADS else [])
+        if self.common is not None and column not in DEFAULT_UNITS and parse_unit(self.common).quantity in fits:
+            self.used.add("unit")
+            return parse_unit(self.common).symbol
+        default = self.defaults.get(column)
+        if default is not None:
+            return default
+        if quantities is None and sensor not in TRIADS:
+            return "1"
+        example = "uT" if quantities is None else example_unit(column)
+        how = self.where.format(name=column, sensor=sensor, unit=example)
+        raise UnitError(f"{self.name}: column {column} has no unit; expected {how}")
+
+    def check_used(self, columns: Iterable[str]) -> None:
+        """Refuse what was said of no column."""
+        known = list(dict.fromkeys(stem for column in columns for stem in _stems(column)))
+        for key in self.each:
+            if key not in self.used:
+                raise OptionError(f"{self.name}: units: no column {quoted(key)}; columns: {listed(known, key)}")
+        if self.common is not None and "unit" not in self.used:
+            raise OptionError(
+                f"{self.name}: unit {self.common!r}: expected that of a column that has none of its own; found "
+                f"{' '.join(known)}"
+            )
+
+    def _known(self, column: str, symbol: str) -> str:
+        """Return the unit as it is written here; of a column outside the vocabulary it may be any."""
+        try:
+            return parse_unit(symbol).symbol
+        except UnitError as error:
+            if expected_quantities(column) is None and symbol:
+                return symbol
+            raise UnitError(f"{self.name}: column {column}: {error}") from None
+
+
+def columns_of_arrays(
+    arrays: Mapping[str, Any],
+    *,
+    rate: float | None,
+    unit: str | None,
+    units: Mapping[str, str] | None,
+    name: str,
+) -> tuple[Columns, dict[str, str]]:
+    """Return columns and units of arrays by name: a sensor's of shape (n, 3), others of shape (n,).
+
+    A name may have its unit behind it, ``accel [g]``. Without `rate` and without an array ``time`` the rows are
+    attitudes.
+
+    Raises
+    ------
+    DataError
+        An array has another shape, holds no numbers, or is longer than the others.
+    UnitError
+        A sensor has no unit, or one of another quantity.
+    OptionError
+        A name is nearly one of those known, or time is stated twice.
+    """
+    where = "units={{'{sensor}': '{unit}'}}"
+    found = Units(name, units or {}, unit, where, DEFAULT_UNITS)
+    entries = [
+        part for title, values in arrays.items() if values is not None for part in _split(str(title), values, name)
+    ]
+    return _put_together(entries, found, rate)
+
+
+def columns_of_frame(
+    frame: Frame,
+    *,
+    rate: float | None,
+    unit: str | None,
+    units: Mapping[str, str] | None,
+    name: str,
+) -> tuple[Columns, dict[str, str]]:
+    """Return columns and units of a pandas or polars data frame; times may stand in its index.
+
+    Raises
+    ------
+    DataError
+        A column holds no numbers, or appears twice.
+    UnitError
+        A column of the vocabulary has no unit, or one of another quantity.
+    OptionError
+        Time is stated twice.
+    """
+    where = "a title such as '{name} [{unit}]', or units={{'{sensor}': '{unit}'}}"
+    found = Units(name, units or {}, unit, where)
+    titles = {original: _joined(original) for original in frame.columns}
+    if len(titles) < len(frame.columns):
+        twice = next(title for title in titles if list(frame.columns).count(title) > 1)
+        raise DataError(f"{name}: column {twice} appears twice")
+    entries = [(*_title(title, name), _numbers(frame[at], title, name)) for at, title in titles.items()]
+    index = getattr(frame, "index", None)
+    if _dtype(index).startswith(_TIMES) and not any(key == "time" for key, _, _ in entries):
+        entries.insert(0, ("time", None, _numbers(index, "time", name)))
+    return _put_together(entries, found, rate)
+
+
+def is_frame(value: object) -> bool:
+    """Return whether something is a data frame, to this module's purposes."""
+    return hasattr(value, "columns") and hasattr(value, "__getitem__") and hasattr(value, "shape")
+
+
+def data_frame(columns: Mapping[str, Any], library: str | None = None) -> Any:
+    """Return columns as a data frame of pandas or polars; without a `library` of pandas, or else of polars.
+
+    Raises
+    ------
+    OptionError
+        Another library.
+    DataError
+        It is not installed.
+    """
+    if library not in (None, *_LIBRARIES):
+        raise OptionError(f"library {library!r}: expected one of {listed(_LIBRARIES, library)}")
+    for name in _LIBRARIES if library is None else (library,):
+        try:
+            return import_module(name).DataFrame(dict(columns))
+        except ImportError:
+            continue
+    raise DataError(
+        f"to_frame needs {library or ' or '.join(_LIBRARIES)}, which is not installed: pip install "
+        f"{library or _LIBRARIES[0]}"
+    )
+
+
+def _stems(column: str) -> list[str]:
+    """``truth_gyro_x_3`` and what it is a part of: ``truth_gyro_x``, ``truth_gyro``, and the same of ``gyro_x_3``."""
+    found = []
+    for whole in dict.fromkeys((column, re.sub("^(truth|std)_", "", column))):
+        parts = whole.split("_")
+        found += ["_".join(parts[:count]) for count in range(len(parts), 0, -1)]
+    return [stem for stem in found if stem not in ("truth", "std")]
+
+
+def _joined(title: Any) -> str:
+    """Return a title as text; one of several levels with ``_`` between them."""
+    return "_".join(str(part) for part in title if str(part)) if isinstance(title, tuple) else str(title)
+
+
+def _title(title: str, name: str) -> tuple[str, str | None]:
+    """Split ``name [unit]``."""
+    key, bracket, rest = title.strip().partition("[")
+    key = key.strip()
+    check_name(key, title, name)
+    if not bracket:
+        return key, None
+    if not rest.endswith("]"):
+        raise UnitError(f"{name}: column title {title.strip()!r}: expected 'name [unit]'")
+    return key, rest[:-1].strip()
+
+
+def _split(title: str, values: Any, name: str) -> Iterator[tuple[str, str | None, Any]]:
+    """Yield the columns of an array: one, or three of a triad."""
+    key, unit = _title(title, name)
+    if key not in _WORDS and expected_quantities(key) is None and (hint := meant(_WORDS, key, 0.7)):
+        raise OptionError(f"{name}: unknown name {key!r}{hint}")
+    array = _numbers(values, key, name)
+    if array.ndim == 2 and array.shape[1] == 3:
+        yield from ((f"{key}_{axis}", unit, array[:, i]) for i, axis in enumerate("xyz"))
+    elif array.ndim == 1 and key not in TRIADS:
+        yield key, unit, array
+    else:
+        shape = "(n, 3)" if key in TRIADS else "(n,)"
+        turned = " (transposed?)" if array.ndim == 2 and array.shape[0] == 3 else ""
+        raise DataError(f"{name}: {key}: expected an array of shape {shape}, found {array.shape}{turned}")
+
+
+def _numbers(column: Any, title: str, name: str) -> NDArray[Any]:
+    """Return an array of floats, or of times; missing values are NaN."""
+    try:
+        values = column.to_numpy() if hasattr(column, "to_numpy") else np.asarray(column)
+        if values.dtype.kind == "O" and _dtype(column).startswith(_TIMES):
+            values = column.to_numpy(dtype="datetime64[ns]")  # pandas' dates of a time zone
+        elif values.dtype.kind == "O" and _dtype(column) not in _TEXTS:
+            values = column.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' own numbers, some of them missing
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name}: column {title}: expected numbers ({error})") from None
+    if values.dtype.kind in _LIKE_NUMBERS:
+        return np.asarray(values, dtype=np.float64)
+    if values.dtype.kind in "mM" and _title(title, name) == ("time", None):
+        return values
+    raise DataError(f"{name}: column {title}: expected numbers, found {_kind(column, values)}")
+
+
+def _dtype(column: Any) -> str:
+    """Return what a library calls the type of a column."""
+    return str(getattr(column, "dtype", "object")).lower()
+
+
+def _kind(column: Any, values: NDArray[Any]) -> str:
+    return "texts" if values.dtype.kind in "OU" else str(getattr(column, "dtype", values.dtype))
+
+
+def _put_together(
+    entries: list[tuple[str, str | None, NDArray[Any]]], units: Units, rate: float | None
+) -> tuple[Columns, dict[str, str]]:
+    """Return columns and units of one length, with a time of the stated rate."""
+    columns: Columns = {}
+    symbols: dict[str, str] = {}
+    for key, stated, values in entries:
+        if key in columns:
+            raise DataError(f"{units.name}: column {key} appears twice")
+        if columns and len(values) != len(first := next(iter(columns.values()))):
+            raise DataError(
+                f"{units.name}: {key} has {len(values)} rows, {next(iter(columns))} has {len(first)}: expected as many"
+            )
+        if values.dtype.kind in "mM":
+            columns[key], symbols[key] = _seconds(values), "s"
+        else:
+            columns[key], symbols[key] = np.ascontiguousarray(values), units.of(key, stated)
+    if not columns:
+        raise DataError(f"{units.name}: expected data, found no columns")
+    if rate is not None:
+        columns, symbols = _with_rate(columns, symbols, rate, units.name)
+    units.check_used(columns)
+    return columns, symbols
+
+
+def _with_rate(columns: Columns, symbols: dict[str, str], rate: float, name: str) -> tuple[Columns, dict[str, str]]:
+    """Return columns and units with a time that begins at 0."""
+    if "time" in columns:
+        raise OptionError(f"{name}: time and rate: expected one of the two, found both")
+    if isinstance(rate, bool) or not isinstance(rate, int | float | np.number) or not 0 < rate < math.inf:
+        raise OptionError(f"{name}: rate {quoted(rate)}: expected a number of samples per second, such as 100.0")
+    count = len(next(iter(columns.values())))
+    return {"time": np.arange(count) / float(rate), **columns}, {"time": "s", **symbols}
+
+
+def _seconds(times: NDArray[Any]) -> NDArray[np.float64]:
+    """Return dates or durations as seconds since the first date, or as they are."""
+    known = times[~np.isnat(times)]
+    since = times - known[0] if times.dtype.kind == "M" and known.size else times
+    return np.asarray(since / np.timedelta64(1, "ns"), dtype=np.float64) * 1e-9

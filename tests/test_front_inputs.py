@@ -1,0 +1,147 @@
+"""Data as people have it: arrays and data frames of pandas and polars, and what is refused of them in one line."""
+
+import numpy as np
+import pandas
+import polars
+import pytest
+
+import imulab as il
+from imulab.errors import DataError, ImulabError, OptionError, UnitError
+
+TRIAD = np.arange(12.0).reshape(4, 3)
+FRAMES = pytest.mark.parametrize("library", [pandas, polars], ids=["pandas", "polars"])
+
+
+def test_arrays_become_the_columns_that_a_file_would_have():
+    made = il.Recording.from_arrays(
+        accel=TRIAD.tolist(), gyro=TRIAD + 100, temperature=[20, 21, 22, 23], rate=50, unit="mg", units={"gyro": "dps"},
+        std_accel=np.ones((4, 3)), pressure=[1, 2, 3, 4], metadata={"serial": "7"}, name="bench",
+    )  # fmt: skip
+    axes = ["accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z"]
+    assert list(made.columns) == ["time", *axes, "temperature", "std_accel_x", "std_accel_y", "std_accel_z", "pressure"]
+    assert [made.units[name] for name in (*axes, "std_accel_y", "temperature", "time", "pressure")] == [
+        *["mg"] * 3, *["deg/s"] * 3, "mg", "degC", "s", "1",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(made.column("time"), [0.0, 0.02, 0.04, 0.06])
+    np.testing.assert_array_equal(made.triad("accel"), TRIAD)
+    np.testing.assert_array_equal(made.column("gyro_z"), TRIAD[:, 2] + 100)
+    assert (made.name, made.metadata["serial"]) == ("bench", "7")
+
+
+@pytest.mark.parametrize("unit", ["count", "V", "mA"])
+def test_the_unit_of_a_raw_output_is_that_of_every_sensor_but_not_of_the_temperature(unit):
+    made = il.Recording.from_arrays(accel=TRIAD, mag=TRIAD, temperature=np.ones(4), time=np.arange(4), unit=unit)
+    assert {made.units[name] for name in made.columns if name[0] in "am"} == {unit}
+    assert (made.units["temperature"], made.units["time"]) == ("degC", "s")
+
+
+def test_without_time_and_rate_the_rows_are_attitudes():
+    assert il.Recording.from_arrays(accel=TRIAD, unit="g").time is None
+
+
+def test_dates_become_seconds_since_the_first():
+    dates = np.datetime64("2026-11-23T02:00:00") + np.array([0, 10, 25, 1000]) * np.timedelta64(1, "ms")
+    made = il.Recording.from_arrays(accel=TRIAD, time=dates, unit="g")
+    np.testing.assert_allclose(made.column("time"), [0.0, 0.01, 0.025, 1.0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "words"),
+    [
+        ({"accel": TRIAD}, UnitError, r"arrays: column accel_x has no unit; expected units=\{'accel': 'm/s\^2'\}"),
+        ({"accel": TRIAD, "gyro": TRIAD, "unit": "g"}, UnitError, r"gyro_x has no unit; expected units=\{'gyro'"),
+        ({"mag": TRIAD, "accel": TRIAD, "unit": "g"}, UnitError, r"mag_x has no unit; expected units=\{'mag': 'uT'\}"),
+        ({"accel": TRIAD, "unit": "furlong"}, UnitError, "unknown unit 'furlong'"),
+        ({"accel": TRIAD, "unit": 9.81}, OptionError, "unit 9.81: expected a text such as 'g'"),
+        ({"accel": TRIAD, "unit": "deg/s"}, UnitError, "accel_x has no unit"),
+        ({"gyro": TRIAD, "units": {"gyro": "g"}}, UnitError, "gyro_x: expected a unit of rate or output, found 'g'"),
+        ({"gyro": TRIAD, "units": {"gyr": "g"}}, UnitError, "gyro_x has no unit"),
+        ({"gyro": TRIAD, "unit": "dps", "units": {"gyr": "g"}}, OptionError, "no column 'gyr'.*did you mean 'gyro'"),
+        ({"gyro": TRIAD, "units": {"gyro": "dps"}, "unit": "g"}, OptionError, "unit 'g': expected that of a column"),
+        ({"gyro": TRIAD, "units": "deg/s"}, OptionError, "units 'deg/s': expected names and their units"),
+        ({"accel": TRIAD.T, "unit": "g"}, DataError, r"accel: expected .* \(n, 3\), found \(3, 4\) \(transposed\?\)"),
+        ({"accel": TRIAD[:, 0], "unit": "g"}, DataError, r"accel: expected an array of shape \(n, 3\), found \(4,\)"),
+        ({"gyro_1": TRIAD[None], "unit": "dps"}, DataError, r"gyro_1: expected an array of shape \(n,\), found \(1, 4"),
+        ({"accel": [["a", "b", "c"]], "unit": "g"}, DataError, "column accel: expected numbers, found texts"),
+        ({"accel": [[1, 2, 3], [4, 5]], "unit": "g"}, DataError, "column accel: expected numbers"),
+        ({"accel": TRIAD, "gyro": TRIAD[1:], "unit": "count"}, DataError, "gyro_x has 3 rows, accel_x has 4"),
+        ({"accel": TRIAD, "unit": "g", "rate": 1, "time": [0, 1, 2, 3]}, OptionError, "time and rate: expected one"),
+        ({"accel": TRIAD, "unit": "g", "rate": 0}, OptionError, "rate 0: expected a number of samples per second"),
+        ({"accel": TRIAD, "unit": "g", "rate": "100 Hz"}, OptionError, "rate '100 Hz': expected a number"),
+        ({"acel": TRIAD, "unit": "g"}, OptionError, "unknown name 'acel'; did you mean 'accel'?"),
+        ({"Accel": TRIAD, "unit": "g"}, UnitError, "column 'Accel': expected the name 'accel'"),
+        ({"unit": "g"}, DataError, "expected data, found no columns"),
+    ],
+)  # fmt: skip
+def test_arrays_that_cannot_be_are_refused_in_a_line(given, error, words):
+    with pytest.raises(error, match=words) as refused:
+        il.Recording.from_arrays(**given)
+    assert "\n" not in str(refused.value)
+
+
+@FRAMES
+def test_a_frame_is_read_as_a_file_is(library):
+    frame = library.DataFrame(
+        {"time [ms]": [0, 10, 20, 30], "accel_x [m/s²]": [1.0, 2.0, 3.0, 4.0], "gyro_x": [1, 2, 3, 4], "p": [0.5] * 4}
+    )
+    made = il.Recording.from_frame(frame, {"gyro": "deg/s"}, metadata={"serial": "7"})
+    assert dict(made.units) == {"time": "ms", "accel_x": "m/s^2", "gyro_x": "deg/s", "p": "1"}
+    np.testing.assert_array_equal(made.column("gyro_x"), [1.0, 2.0, 3.0, 4.0])
+    assert all(column.dtype == np.float64 for column in made.columns.values())
+    assert made.metadata["serial"] == "7"
+
+
+@FRAMES
+@pytest.mark.parametrize(
+    ("columns", "given", "words"),
+    [
+        (
+            {"accel_x": [1.0]}, {},
+            r"column accel_x has no unit; expected a title such as 'accel_x \[m/s\^2\]', or units=\{'accel': 'm/s\^2'",
+        ),
+        ({"time": [1.0]}, {}, r"column time has no unit; expected a title such as 'time \[s\]'"),
+        ({"temperature": [1.0]}, {"unit": "count"}, "column temperature has no unit"),
+        ({"accel_x [g]": [1.0]}, {"units": {"accel": "mg"}}, "column accel_x .g.: units has 'mg' for it; expected one"),
+        ({"accel_x [g": [1.0]}, {}, "expected 'name .unit.'"),
+        ({"Accel_X [g]": [1.0]}, {}, "expected the name 'accel_x'"),
+        ({"accel_x [g]": ["1.5"]}, {}, "column accel_x .g.: expected numbers, found texts"),
+        ({"time [s]": [1.0], "accel_x [g]": [1.0]}, {"rate": 10}, "time and rate: expected one of the two"),
+    ],
+)  # fmt: skip
+def test_frames_that_cannot_be_are_refused_in_a_line(library, columns, given, words):
+    with pytest.raises(ImulabError, match=words) as refused:
+        il.Recording.from_frame(library.DataFrame(columns), **given)
+    assert "\n" not in str(refused.value)
+    assert str(refused.value).startswith("frame: ")
+
+
+@FRAMES
+def test_missing_values_of_a_frame_are_not_numbers(library):
+    values = pandas.array([1, None], dtype="Int64") if library is pandas else [1, None]
+    made = il.Recording.from_frame(library.DataFrame({"accel_x [g]": values}))
+    np.testing.assert_array_equal(made.column("accel_x"), [1.0, np.nan])
+
+
+@pytest.mark.parametrize("where", ["column", "index"])
+def test_dates_of_a_frame_become_seconds(where):
+    dates = pandas.date_range("2026-11-23", periods=3, freq="20ms", tz="Europe/Berlin")
+    frame = pandas.DataFrame({"accel_x [g]": [1.0, 2.0, 3.0]}, index=dates if where == "index" else None)
+    if where == "column":
+        frame["time"] = dates.tz_localize(None)
+    np.testing.assert_allclose(il.Recording.from_frame(frame).column("time"), [0.0, 0.02, 0.04], atol=1e-15)
+
+
+def test_a_pandas_frame_of_two_levels_is_read_and_one_that_names_a_column_twice_is_refused():
+    frame = pandas.DataFrame(TRIAD, columns=pandas.MultiIndex.from_product([["accel"], ["x", "y", "z"]]))
+    np.testing.assert_array_equal(il.Recording.from_frame(frame, unit="g").triad("accel"), TRIAD)
+    frame.columns = ["accel_x [g]", "accel_y [g]", "accel_x [g]"]
+    with pytest.raises(DataError, match=r"column accel_x \[g\] appears twice"):
+        il.Recording.from_frame(frame)
+
+
+def test_a_frame_has_the_library_that_is_asked_for():
+    made = il.Recording.from_arrays(accel=TRIAD, unit="g")
+    assert isinstance(made.to_frame(), pandas.DataFrame)
+    assert isinstance(made.to_frame("polars"), polars.DataFrame)
+    with pytest.raises(OptionError, match="library 'dask': expected one of pandas polars"):
+        made.to_frame("dask")
