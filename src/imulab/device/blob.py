@@ -20,12 +20,10 @@ FORMAT = "imulab.blob"
 _HEAD = 16
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Kind(Part):
     kind: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Text(Part):
     sensor: dict[str, str]
     software: str
@@ -33,18 +31,15 @@ class _Text(Part):
     sections: list[_Kind]
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Triad(Part):
     output_unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Centrifuge(Part):
     axes: list[str]
     highest: Size
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Warmup(Part):
     axes: Annotated[list[str], "columns"]
     units: Annotated[list[str], "columns"]
@@ -52,7 +47,6 @@ class _Warmup(Part):
     end: Size
 
 
-@dataclass(frozen=True, kw_only=True)
 class _Array(Part):
     elements: int
     axes: int

@@ -9,9 +9,19 @@ in the part that is read. Keys that no field names are ignored. A field whose na
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    TypeVar,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from imulab.errors import RecordError
 
@@ -47,12 +57,18 @@ _PLAIN = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
 class Part:
     """What code reads of one part of a record; whoever reads a field that the record lacks gets a RecordError.
 
-    A record need not hold what nobody asks it for: one that is only exported needs no data for figures.
+    Its classes are frozen dataclasses with keywords only. A record need not hold what nobody asks it for: one that is
+    only exported needs no data for figures.
     """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclass(frozen=True, kw_only=True)(cls)
 
     if not TYPE_CHECKING:
 
@@ -73,7 +89,6 @@ class Named(dict[str, Any]):
         raise RecordError(f"the record lacks {_at(self.place, key)}")
 
 
-@dataclass(frozen=True, kw_only=True)
 class Quantity(Part):
     """A value with its unit, and its standard uncertainty where one is stated."""
 
@@ -82,7 +97,6 @@ class Quantity(Part):
     standard_uncertainty: Size | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Length(Part):
     """A value of 0 or more with its unit."""
 
@@ -90,7 +104,6 @@ class Length(Part):
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class Above0(Part):
     """A value above 0 with its unit."""
 

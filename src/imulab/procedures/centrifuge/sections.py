@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated
 
 from imulab.errors import RecordError
@@ -12,7 +12,6 @@ from imulab.records.sections import Above0, Kind, Length, Part, Quantity, Size, 
 Sense = Annotated[int, Kind("1 or -1", lambda value: type(value) is int and value in (1, -1))]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Model(Part):
     """``model``; the terms of the curve by axis."""
 
@@ -24,7 +23,6 @@ class Model(Part):
     temperature: Quantity | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Tried(Part):
     """One model of the curve that was tried."""
 
@@ -34,14 +32,12 @@ class Tried(Part):
     chosen: bool
 
 
-@dataclass(frozen=True, kw_only=True)
 class Curve(Part):
     """The models tried on one axis."""
 
     tried: list[Tried]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Repeatability(Part):
     """``fit.repeatability``."""
 
@@ -50,7 +46,6 @@ class Repeatability(Part):
     within_power_cycle: Size
 
 
-@dataclass(frozen=True, kw_only=True)
 class CycleRow(Part):
     """K and zeta of one power cycle, by axis."""
 
@@ -65,7 +60,6 @@ class CycleRow(Part):
         return {"x": self.x, "y": self.y, "x_down": self.x_down, "y_down": self.y_down}[key]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Error(Part):
     """One row of the error budget."""
 
@@ -79,7 +73,6 @@ class Error(Part):
     basis: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(Part):
     """``fit``; factors and degrees of freedom by parameter, curves by axis."""
 
@@ -93,7 +86,6 @@ class Fit(Part):
     error_budget: list[Error]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Line(Part):
     """Amplitudes in and out of phase with their covariance; of a run also K, from its amplitude."""
 
@@ -104,7 +96,6 @@ class Line(Part):
     K: Quantity | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Level(Part):
     """One of ``levels``: its runs by their place in ``runs``, and the drift per specific force of each axis."""
 
@@ -121,7 +112,6 @@ class Level(Part):
         return {"x": self.x, "y": self.y, "x_down": self.x_down, "y_down": self.y_down}[key]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Run(Part):
     """One of ``runs``; what follows `specific_force` is of loaded runs."""
 
@@ -144,7 +134,6 @@ class Run(Part):
         return {"x": self.x, "y": self.y}[axis]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Spectrum(Part):
     """One of ``data.spectra``: heights of lines over the rate, rad/s, by column."""
 
@@ -154,14 +143,12 @@ class Spectrum(Part):
     height: dict[str, Annotated[list[float], "rates"]]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Data(Part):
     """``data``."""
 
     spectra: list[Spectrum]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Centrifuge(Part):
     """A centrifuge record."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, TypeVar
 
 import numpy as np
@@ -19,7 +18,6 @@ _LEAST_WHITE = 0.05
 Square = Annotated[list[Annotated[list[float], "elements"]], "elements"]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Model(Part):
     """``model``; `units`, `truth` and `calibrated` of a comparison, `aligned` and `gauge` of a calibration."""
 
@@ -35,7 +33,6 @@ class Model(Part):
     temperature: Quantity | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(Part):
     """``fit``."""
 
@@ -43,7 +40,6 @@ class Fit(Part):
     duration: Above0
 
 
-@dataclass(frozen=True, kw_only=True)
 class PerGyro(Part):
     """A number of an element: one where it has one axis, a list over x, y, z where it has three."""
 
@@ -62,7 +58,6 @@ class PerGyro(Part):
         return np.atleast_1d(np.array(self.standard_uncertainty, dtype=np.float64))
 
 
-@dataclass(frozen=True, kw_only=True)
 class Matrix(Part):
     """The alignment of an element of three axes."""
 
@@ -71,7 +66,6 @@ class Matrix(Part):
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class Element(Part):
     """One of ``elements``."""
 
@@ -95,7 +89,6 @@ class Element(Part):
         return np.array([[1 / self.scale_factor.value]])
 
 
-@dataclass(frozen=True, kw_only=True)
 class Correlation(Part):
     """``correlation``: the noise that elements share on each axis, and the weights that it asks for."""
 
@@ -107,7 +100,6 @@ class Correlation(Part):
     limit: PerAxis[Length]
 
 
-@dataclass(frozen=True, kw_only=True)
 class AllanCurve(Part):
     """A curve of Allan deviation over averaging time, s."""
 
@@ -115,14 +107,12 @@ class AllanCurve(Part):
     deviation: list[float]
 
 
-@dataclass(frozen=True, kw_only=True)
 class CalibrationData(Part):
     """``data`` of a calibration."""
 
     allan: PerAxis[PerElement[AllanCurve]]
 
 
-@dataclass(frozen=True, kw_only=True)
 class ArrayRecord(Part):
     """The record of a calibration."""
 
@@ -146,7 +136,6 @@ class ArrayRecord(Part):
         return known
 
 
-@dataclass(frozen=True, kw_only=True)
 class MethodRow(Part):
     """What a method reaches on one axis; None where it has no such number."""
 
@@ -160,7 +149,6 @@ class MethodRow(Part):
     split_half: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Health(Part):
     """Weights and flags of each gyro over time, s; nothing where the method robust failed."""
 
@@ -174,7 +162,6 @@ class Health(Part):
         return "time" in vars(self)
 
 
-@dataclass(frozen=True, kw_only=True)
 class ComparisonData(Part):
     """``data`` of a comparison, by method; a method that failed has the reason as text."""
 
@@ -188,7 +175,6 @@ class ComparisonData(Part):
     readings_names: PerAxis[PerElement[str]]
 
 
-@dataclass(frozen=True, kw_only=True)
 class ComparisonRecord(Part):
     """The record of a comparison."""
 

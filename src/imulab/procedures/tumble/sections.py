@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, TypeVar
 
 from imulab.errors import RecordError
@@ -16,7 +16,6 @@ PerTurn = Annotated[list[T], "turns"]
 Three = Annotated[list[T], 3]
 
 
-@dataclass(frozen=True, kw_only=True)
 class StatedGravity(Part):
     """``model.gravity``: local gravity, m/s^2, and where it is from."""
 
@@ -26,7 +25,6 @@ class StatedGravity(Part):
     from_: str
 
 
-@dataclass(frozen=True, kw_only=True)
 class Model(Part):
     """``model``."""
 
@@ -39,7 +37,6 @@ class Model(Part):
     temperature: Quantity | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Order(Part):
     """One row of ``fit.orders``; rms and errors in m/s^2."""
 
@@ -55,14 +52,12 @@ class Order(Part):
     largest_uncertainty: Size | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Spread(Part):
     """A parameter over the trials of a Monte Carlo run, in its SI unit."""
 
     interval_95: Annotated[list[float], 2]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Trials(Part):
     """``fit.monte_carlo``."""
 
@@ -71,7 +66,6 @@ class Trials(Part):
     parameters: dict[str, Spread]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Prior(Part):
     """``fit.prior``: what each parameter owes to the prior, as a share of its variance."""
 
@@ -79,14 +73,12 @@ class Prior(Part):
     shares: dict[str, float]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Blend(Part):
     """``fit.blend``: the highest order that the stated uncertainty allows for."""
 
     highest_order: int
 
 
-@dataclass(frozen=True, kw_only=True)
 class TurnAside(Part):
     """A turn that was set aside, s, and what it missed, rad."""
 
@@ -95,7 +87,6 @@ class TurnAside(Part):
     miss: Length
 
 
-@dataclass(frozen=True, kw_only=True)
 class GyroFit(Part):
     """``fit.gyro``."""
 
@@ -106,7 +97,6 @@ class GyroFit(Part):
     set_aside: list[TurnAside] = field(default_factory=list)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(Part):
     """``fit``."""
 
@@ -140,7 +130,6 @@ class Fit(Part):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
 class HeldAttitudes(Part):
     """``data.attitudes``: of each its mean output, the specific force, m/s^2, and what is left of |f| - g."""
 
@@ -163,7 +152,6 @@ class HeldAttitudes(Part):
         return [(a, b) for a, b in zip(self.start, self.stop, strict=True) if a is not None and b is not None]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Trace(Part):
     """``data.trace``: standard deviation within the sliding window over time, and the threshold of rest."""
 
@@ -172,7 +160,6 @@ class Trace(Part):
     threshold: float
 
 
-@dataclass(frozen=True, kw_only=True)
 class Turns(Part):
     """``data.gyro``: of each turn its edges, s, and the residual angle, rad."""
 
@@ -181,7 +168,6 @@ class Turns(Part):
     residual: PerTurn[float]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Data(Part):
     """``data``."""
 
@@ -190,7 +176,6 @@ class Data(Part):
     gyro: Turns | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Tumble(Part):
     """A tumble record."""
 

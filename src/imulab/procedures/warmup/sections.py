@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Annotated, TypeVar
 
 from imulab.errors import RecordError
@@ -15,7 +15,6 @@ PerTemperature = Annotated[list[T], "temperatures"]
 Rows = Annotated[list[Annotated[list[Annotated[list[float], "terms"]], "axes"]], "rows"]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Model(Part):
     """``model``."""
 
@@ -25,7 +24,6 @@ class Model(Part):
     temperature: Quantity | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
 class ModelRow(Part):
     """One row of ``fit.models``; each a number for each axis, None where it is not known."""
 
@@ -41,7 +39,6 @@ class ModelRow(Part):
     exit_jump: PerAxis[float | None]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Repeatability(Part):
     """``fit.repeatability``: what power cycles repeat to, and units, where there are several."""
 
@@ -51,7 +48,6 @@ class Repeatability(Part):
     unit: PerAxis[float | None] | None
 
 
-@dataclass(frozen=True, kw_only=True)
 class Fit(Part):
     """``fit``."""
 
@@ -79,7 +75,6 @@ class Fit(Part):
         raise RecordError(f"fit.models lacks {'the chosen model' if model is None else f'model {model}'}")
 
 
-@dataclass(frozen=True, kw_only=True)
 class HeldTable(Part):
     """``table`` as the file holds it."""
 
@@ -98,7 +93,6 @@ class HeldTable(Part):
     time_constants: list[Positive] = field(default_factory=list)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Cycle(Part):
     """One of ``data.cycles``: a power cycle in bins, referenced to its settled mean."""
 
@@ -113,7 +107,6 @@ class Cycle(Part):
     curve: PerAxis[list[float | None]]
 
 
-@dataclass(frozen=True, kw_only=True)
 class Data(Part):
     """``data``."""
 
@@ -125,7 +118,6 @@ class Data(Part):
         return sorted({cycle.calibration_temperature for cycle in self.cycles})
 
 
-@dataclass(frozen=True, kw_only=True)
 class Warmup(Part):
     """A warm-up record."""
 
