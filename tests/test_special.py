@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-NAMES = ["chdtrc", "chdtri", "fdtrc", "ndtr", "ndtri", "stdtr", "stdtrit"]
+NAMES = ["chdtrc", "chdtri", "fdtrc", "ndtr", "ndtri", "stdtr", "stdtrit", "sici"]
 
 
 def _printed(code):

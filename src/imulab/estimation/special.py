@@ -48,3 +48,4 @@ def _functions() -> ModuleType:
 _HELD = _functions()
 chdtrc, chdtri, fdtrc = _HELD.chdtrc, _HELD.chdtri, _HELD.fdtrc
 ndtr, ndtri, stdtr, stdtrit = _HELD.ndtr, _HELD.ndtri, _HELD.stdtr, _HELD.stdtrit
+sici = _HELD.sici
