@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from imulab.errors import DataError, ImulabError, SegmentError, UnitError
-from imulab.procedures.tumble import segment
+from imulab.procedures.tumble import held, segment
 from imulab.procedures.tumble.segment import find_attitudes
 from imulab.recording import Recording
 from reference import tumble as reference
@@ -169,7 +169,7 @@ def test_the_mean_is_that_of_the_samples_of_the_pieces():
 
 def test_the_covariance_of_the_mean_is_that_of_batch_means(monkeypatch):
     samples, time, _ = tumble(DIRECTIONS)
-    monkeypatch.setattr(segment, "POOL_DEGREES", 0.0)  # each attitude on its own
+    monkeypatch.setattr(held, "POOL_DEGREES", 0.0)  # each attitude on its own
     attitudes = find_attitudes(recording(samples, time))
     lengths = attitudes.pieces[:, 1] - attitudes.pieces[:, 0]
     batch = int(np.median(lengths // 13)) // 10 * 13  # ten batches, of whole blocks of 0.13 s

@@ -134,37 +134,17 @@ def on_one_clock(
             done = max(done, int(clock.ticks[:ready].max()))
         if ready == 0:
             continue
-        ticks = clock.ticks[:ready]
-        kept = np.ones(ready, dtype=np.bool_)
-        for other in others:
-            from_tick, to_tick = _bounds(clock, other, ended=ended)
-            within = (ticks >= from_tick) & (ticks <= to_tick)
-            other.left_out += int(np.count_nonzero(~within))
-            kept &= within
-        said = list(notes)
-        ticks = ticks[kept]
+        kept = _kept(clock, others, ready, ended=ended)
+        ticks, values = clock.ticks[:ready][kept], clock.values[:ready][kept]
+        clock.drop(ready)
         if not ticks.size:
-            clock.drop(ready)
             continue
-        start = int(ticks[0]) if origin is None else origin
-        origin = start
-        columns: dict[str, Array] = {"time": (ticks - start) / per_second}
-        units = {"time": "s"}
-        values = clock.values[:ready][kept]
-        for buffer in buffers:
-            if buffer is not clock:
-                values, moved = _interpolated(buffer, ticks, start, per_second, name)
-                if moved:
-                    said.append(_note(buffer, clock, per_second))
-            columns |= {key: np.ascontiguousarray(values[:, i]) for i, key in enumerate(buffer.stream.units)}
-            units |= buffer.stream.units
+        origin = int(ticks[0]) if origin is None else origin
+        block = _block(buffers, ticks, values, origin, per_second, name)
         if held is not None:
             yield held
-        held = Recording(
-            columns=columns, units=units, metadata=metadata(start), name=name, first_row=row, notes=tuple(said)
-        )
+        held = replace(block, metadata=metadata(origin), first_row=row, notes=(*notes, *block.notes))
         row += len(ticks)
-        clock.drop(ready)
     if held is None:
         apart = [other.stream.what for other in others if other.left_out]
         if apart:
@@ -206,6 +186,34 @@ def _bounds(clock: _Buffer, other: _Buffer, *, ended: bool) -> tuple[float, floa
     late = other.first - clock.first if clock.first is not None else 0
     low = other.first if 0 < late <= WIDEST_GAP * np.nan_to_num(other.step) else -np.inf
     return low, other.last if ended else np.inf
+
+
+def _kept(clock: _Buffer, others: list[_Buffer], ready: int, *, ended: bool) -> NDArray[np.bool_]:
+    """Return which of the clock's next rows are kept, shape (ready,), and count the others."""
+    ticks = clock.ticks[:ready]
+    kept = np.ones(ready, dtype=np.bool_)
+    for other in others:
+        from_tick, to_tick = _bounds(clock, other, ended=ended)
+        within = (ticks >= from_tick) & (ticks <= to_tick)
+        other.left_out += int(np.count_nonzero(~within))
+        kept &= within
+    return kept
+
+
+def _block(buffers: list[_Buffer], ticks: Ticks, values: Array, origin: int, per_second: int, name: str) -> Recording:
+    """Return rows of the clock with the other streams at their ticks, and a note for each that was interpolated."""
+    clock = buffers[0]
+    columns: dict[str, Array] = {"time": (ticks - origin) / per_second}
+    units = {"time": "s"}
+    notes = []
+    for buffer in buffers:
+        if buffer is not clock:
+            values, moved = _interpolated(buffer, ticks, origin, per_second, name)
+            if moved:
+                notes.append(_note(buffer, clock, per_second))
+        columns |= {key: np.ascontiguousarray(values[:, i]) for i, key in enumerate(buffer.stream.units)}
+        units |= buffer.stream.units
+    return Recording(columns=columns, units=units, name=name, notes=tuple(notes))
 
 
 def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:

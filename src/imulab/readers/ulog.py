@@ -177,18 +177,7 @@ def _choose(
         wanted.append("sensor_gyro")
     if topic is None and raw:
         samples = {t: contents.counts[there[t, instance]] if (t, instance) in there else 0 for t in _TOPICS}
-        combined = samples.pop("sensor_combined")
-        few = " and ".join(f"{count} of {title}" for title, count in samples.items())
-        if any(combined > logs.PLAINLY_MORE * count for count in samples.values()):
-            if any(count > logs.PLAINLY_MORE * combined for count in samples.values()):
-                contents.notes.append(
-                    f"sensor_combined, which has {combined} samples, is not read: there are {few}; a topic chooses"
-                )
-            else:
-                wanted = ["sensor_combined"]
-                contents.notes.append(
-                    f"sensor_combined, which has {combined} samples, is read rather than {few}; a topic chooses"
-                )
+        wanted = _raw_or_combined(samples, wanted, contents.notes)
     chosen = [title for title in wanted if (title, instance) in there]
     if not chosen:
         found = ", ".join(f"{title} {number}" for title, number in sorted(there))
@@ -216,6 +205,18 @@ def _choose(
             streams += [LoggedStream("accelerometer", _ACCEL), LoggedStream("gyroscope", _GYRO)]
             contents.notes.append("sensor_combined holds outputs that PX4 has already corrected")
     return streams, sources
+
+
+def _raw_or_combined(samples: dict[str, int], raw: list[str], notes: list[str]) -> list[str]:
+    """Return the topics to read: `raw` or, where that has plainly more samples, sensor_combined; note which and why."""
+    combined = samples.pop("sensor_combined")
+    few = " and ".join(f"{count} of {title}" for title, count in samples.items())
+    if not any(combined > logs.PLAINLY_MORE * count for count in samples.values()):
+        return raw
+    read = not any(count > logs.PLAINLY_MORE * combined for count in samples.values())
+    how = f"is read rather than {few}" if read else f"is not read: there are {few}"
+    notes.append(f"sensor_combined, which has {combined} samples, {how}; a topic chooses")
+    return ["sensor_combined"] if read else raw
 
 
 def _fields(contents: _Contents, title: str, name: str) -> dict[str, _Field]:

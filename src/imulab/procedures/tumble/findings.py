@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.least_squares import coverage_factor
+from imulab.estimation.least_squares import Observability, coverage_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended
 from imulab.procedures.tumble.model import AXES, MISALIGNMENTS, parameter_count
 from imulab.procedures.tumble.optimal import CLOSEST, near_vertical
+from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.outliers import FREEDOM, HIGHEST_TESTED, Aside
 from imulab.procedures.tumble.sections import data_of, fit_of
 from imulab.procedures.tumble.solve import Problem, Solution, forces
@@ -50,6 +51,27 @@ class Stated:
     given_order: Array | None = None
     freedom_given_order: float | None = None
     blended: Blended | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the attitudes that were not set aside say of the unit, in units of g.
+
+    `with_gravity` says that the covariance holds gravity's own uncertainty already; `prior` is the record's entry on an
+    earlier record, and `notes` are findings about that.
+    """
+
+    attitudes: Attitudes
+    problem: Problem
+    solution: Solution
+    given_order: Stated | None
+    stated: Stated | None
+    found: Found
+    observability: Observability
+    orders: tuple[OrderRow, ...]
+    with_gravity: bool = False
+    prior: Mapping[str, Any] | None = None
+    notes: Sequence[str] = ()
 
 
 def uncertainty_entries(stated: Stated | None) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from imulab.procedures.tumble.axes import check_axes
 from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spread
 from imulab.procedures.tumble.checks import check_attitudes, check_residuals
 from imulab.procedures.tumble.choices import FROM_DATA
-from imulab.procedures.tumble.findings import Found, Stated
+from imulab.procedures.tumble.findings import Estimate, Found, Stated
 from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold, solve_linearised
 from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.montecarlo import propagate
@@ -30,7 +29,7 @@ from imulab.procedures.tumble.options import check_options
 from imulab.procedures.tumble.order_zero import with_assumed_alignment
 from imulab.procedures.tumble.orders import OrderChoice, OrderRow, absolute_weights, choose_order, solve_orders
 from imulab.procedures.tumble.outliers import NONE_ASIDE, Aside, set_aside
-from imulab.procedures.tumble.prior import GROUPS, Aged, Known, entries, findings, known_of, put_together
+from imulab.procedures.tumble.prior import GROUPS, entries, findings, known_of, put_together
 from imulab.procedures.tumble.record import Scaling, make_record
 from imulab.procedures.tumble.sections import model_of
 from imulab.procedures.tumble.solve import Problem, Solution, evaluate, forces, informed_rows, solve_norm
@@ -149,97 +148,102 @@ def fit_tumble(
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
-    reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
-    spread = scaling.scale[:, None] * scaling.scale
-    noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
-    motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
-    every = Problem(reading, noise, 1, robust=loss == "huber", motion=motion)
-    known = None
     if prior is not None:
         order = _prior_order(prior, order, attitudes)
-        known = known_of(prior, scaling, local, attitudes.unit)
+    rest = None
+    if method == "linearised":
+        rest = SOURCE_THRESHOLD
+        if threshold is not None:
+            rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
+    estimate = _estimate(
+        attitudes, local, scaling, order, loss, rest,
+        nonlinearity=nonlinearity, prior=prior, ageing=ageing, cross=cross,
+    )  # fmt: skip
+    trials = None
+    if monte_carlo is not None:
+        freedom = _freedom_for_trials(estimate)
+        trials = propagate(
+            estimate.problem, estimate.solution, trials=monte_carlo, freedom=freedom, progress=progress
+        )  # fmt: skip
+    options = {
+        "order": order,
+        "method": method,
+        "loss": loss,
+        "gravity": local.value,
+        **({} if nonlinearity is None else {"nonlinearity": list(nonlinearity)}),
+        **({} if monte_carlo is None else {"monte_carlo": monte_carlo}),
+        **({"cross": True} if cross else {}),
+        **({} if rest is None else {"threshold": rest.in_si(local.value)}),
+    }
+    record = make_record(estimate, local, scaling, options, trials)
+    return TumbleFit(
+        calibration=with_assumed_alignment(record) if estimate.problem.order == 0 else record,
+        observability=estimate.observability,
+        orders=estimate.orders,
+        residuals=local.value * estimate.found.solution.deviations[0],
+        down_weights=estimate.found.solution.down_weights[0],
+    )
+
+
+def _estimate(
+    attitudes: Attitudes,
+    gravity: Gravity,
+    scaling: Scaling,
+    order: int | str,
+    loss: str,
+    rest: Threshold | None,
+    *,
+    nonlinearity: tuple[float, float] | None,
+    prior: Calibration | None,
+    ageing: Sequence[float],
+    cross: bool,
+) -> Estimate:
+    """Set attitudes aside, choose the order, solve, and state the uncertainty; `rest` is that of method linearised."""
+    every = _problem(attitudes, scaling, robust=loss == "huber")
+    known = None
+    if prior is not None:
+        known = known_of(prior, scaling, gravity, attitudes.unit)
     aside, fitted = NONE_ASIDE, dict[int, Solution]()
-    if loss == "auto" and method == "norm" and not cross:
+    if loss == "auto" and rest is None and not cross:
         aside, fitted = set_aside(every, lambda of: _fits(of, order))
     used, kept = every, attitudes
     if aside.index:
         used, kept = every.only(aside.others(len(attitudes))), attitudes.only(aside.others(len(attitudes)))
     choice: OrderChoice | None = None
     if order in FROM_DATA and len(kept) >= parameter_count(1):
-        choice = choose_order(used, local.value, fitted or solve_orders(used))
+        choice = choose_order(used, gravity.value, fitted or solve_orders(used))
     problem = replace(used, order=choice.order if choice else 1 if order in FROM_DATA else int(order), cross=cross)
     aged = None
     if known is not None:
-        aged = put_together(problem, known, local, _scaled_ageing(ageing, local.value))
+        aged = put_together(problem, known, gravity, _scaled_ageing(ageing, gravity.value))
         problem = aged.problem
-    rest = SOURCE_THRESHOLD
-    if threshold is not None:
-        rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
-    solved = aged.solution if aged else fitted.get(problem.order)
-    solution, seen = _solve(problem, kept, rest if method == "linearised" else None, choice, solved)
-    matrix, freedom = (aged.covariance, aged.freedom) if aged else _covariance(problem, solution)
-    stated = None if matrix is None else Stated(matrix, freedom)
-    if choice is not None and stated is not None:
+    solution, seen = _solve(problem, kept, rest, choice, aged.solution if aged else fitted.get(problem.order))
+    given = Stated(aged.covariance, aged.freedom) if aged else _given_order(problem, solution)
+    stated = given
+    if choice is not None and given is not None:
         blended = with_known_spread(used, choice, nonlinearity) if nonlinearity else blend_orders(used, choice)
-        if order == "blend":
-            problem, solution = _at_blend(used, solution, blended)
-            stated = Stated(blended.covariance, blended.freedom, blended=blended)
-        else:
-            stated = Stated(blended.about(solution.theta[0]), blended.freedom, matrix, freedom, blended)
+        problem, solution, stated = _whatever_the_order(used, problem, solution, given, blended, order == "blend")
     found = _found(attitudes, replace(every, order=problem.order, cross=cross), solution, aside)
-    check_residuals(kept, solution, local.value)
+    check_residuals(kept, solution, gravity.value)
     check_axes(attitudes, forces(found.problem, found.solution)[0])
-    trials = None
-    if monte_carlo is not None:
-        if matrix is None:
-            raise OptionError(
-                f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
-                f"columns); found {len(kept)} attitudes for {parameter_count(problem.order)} parameters"
-            )
-        trials = propagate(problem, solution, trials=monte_carlo, freedom=freedom, progress=progress)
-    record = make_record(
-        attitudes=kept,
-        gravity=local,
-        scaling=scaling,
-        problem=problem,
-        solution=solution,
-        stated=stated,
-        found=found,
-        observability=seen,
-        orders=choice.rows if choice else (),
-        options={"order": order, "method": method, "loss": loss, "gravity": local.value}
-        | ({} if nonlinearity is None else {"nonlinearity": list(nonlinearity)})
-        | ({} if monte_carlo is None else {"monte_carlo": monte_carlo})
-        | ({"cross": True} if cross else {})
-        | ({"threshold": rest.in_si(local.value)} if method == "linearised" else {}),
-        monte_carlo=trials,
-        **_prior_found(prior, known, aged, scaling, local, kept),
-    )
-    return TumbleFit(
-        calibration=with_assumed_alignment(record) if problem.order == 0 else record,
-        observability=seen,
-        orders=choice.rows if choice else (),
-        residuals=local.value * found.solution.deviations[0],
-        down_weights=found.solution.down_weights[0],
-    )
-
-
-def _prior_found(
-    prior: Calibration | None,
-    known: Known | None,
-    aged: Aged | None,
-    scaling: Scaling,
-    gravity: Gravity,
-    attitudes: Attitudes,
-) -> dict[str, Any]:
-    """Return what the record is to say of its prior."""
+    estimate = Estimate(kept, problem, solution, given, stated, found, seen, choice.rows if choice else ())
     if prior is None or known is None or aged is None:
-        return {}
-    return {
-        "with_gravity": aged.with_gravity,
-        "entries": {"prior": entries(prior, known, aged, scaling, gravity)},
-        "findings": findings(prior, aged, attitudes.recording, len(attitudes)),
-    }
+        return estimate
+    return replace(
+        estimate,
+        with_gravity=aged.with_gravity,
+        prior=entries(prior, known, aged, scaling, gravity),
+        notes=findings(prior, aged, attitudes.recording, len(kept)),
+    )
+
+
+def _problem(attitudes: Attitudes, scaling: Scaling, *, robust: bool) -> Problem:
+    """Return the attitudes in units of g, relative to the nominal sensor."""
+    reading = ((attitudes.mean - scaling.zero) / scaling.scale)[None]
+    spread = scaling.scale[:, None] * scaling.scale
+    noise = None if attitudes.covariance is None else (attitudes.covariance / spread)[None]
+    motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
+    return Problem(reading, noise, 1, robust=robust, motion=motion)
 
 
 def _fits(problem: Problem, order: int | str) -> dict[int, Solution]:
@@ -256,11 +260,28 @@ def _found(attitudes: Attitudes, problem: Problem, solution: Solution, aside: As
     return Found(attitudes, problem, every, aside)
 
 
-def _at_blend(problem: Problem, solution: Solution, blended: Blended) -> tuple[Problem, Solution]:
-    """Return problem and solution at the blend's own values."""
-    problem = replace(problem, order=blended.order)
-    at_blend = evaluate(problem, replace(solution, theta=blended.theta[None]))
-    return problem, replace(at_blend, down_weights=solution.down_weights)
+def _whatever_the_order(
+    used: Problem, problem: Problem, solution: Solution, given: Stated, blended: Blended, at_blend: bool
+) -> tuple[Problem, Solution, Stated]:
+    """Return problem, solution and an uncertainty that holds whatever the order; the blend's own values if asked."""
+    if not at_blend:
+        about = blended.about(solution.theta[0])
+        return problem, solution, Stated(about, blended.freedom, given.covariance, given.freedom, blended)
+    problem = replace(used, order=blended.order)
+    own = evaluate(problem, replace(solution, theta=blended.theta[None]))
+    own = replace(own, down_weights=solution.down_weights)
+    return problem, own, Stated(blended.covariance, blended.freedom, blended=blended)
+
+
+def _freedom_for_trials(estimate: Estimate) -> float | None:
+    """Return the degrees of freedom of the noise that is drawn; refuse attitudes that tell nothing of theirs."""
+    if estimate.given_order is None:
+        attitudes, order = estimate.attitudes, estimate.problem.order
+        raise OptionError(
+            f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
+            f"columns); found {len(attitudes)} attitudes for {parameter_count(order)} parameters"
+        )
+    return estimate.given_order.freedom
 
 
 def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:
@@ -337,22 +358,18 @@ def _solved(problem: Problem, attitudes: Attitudes, linearised: Threshold | None
     return solve_norm(problem)
 
 
-def _covariance(problem: Problem, solution: Solution) -> tuple[Array | None, float | None]:
-    """Covariance of theta given the order, (p, p), and the degrees of freedom of its scale (None: noise known)."""
+def _given_order(problem: Problem, solution: Solution) -> Stated | None:
+    """Return what is known of theta if the order is right; None where nothing tells the noise."""
     n, size = problem.reading.shape[1], parameter_count(problem.order, problem.cross)
     freedom = n - size
     base = covariance(solution.jacobian, 1 / solution.variance)[0]
-    known = problem.covariance is not None
     if problem.robust and freedom > 0:
         factor = huber_inflation(solution.standardised(), size)[0] * solution.scale[0] ** 2
-        return base * factor, float(freedom)
-    if known:
-        return base, _finite(solution.freedom[0])
+        return Stated(base * factor, float(freedom))
+    if problem.covariance is not None:
+        known = float(solution.freedom[0])
+        return Stated(base, known if np.isfinite(known) else None)
     if freedom == 0:
-        return None, None
+        return None
     chi_square = float((solution.residuals[0] ** 2 / solution.variance[0]).sum())
-    return base * (chi_square / freedom), float(freedom)
-
-
-def _finite(freedom: float) -> float | None:
-    return float(freedom) if np.isfinite(freedom) else None
+    return Stated(base * (chi_square / freedom), float(freedom))

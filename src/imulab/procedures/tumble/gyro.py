@@ -188,12 +188,7 @@ def fit_gyro(
     directions = direction_covariance(record, attitudes, means, case.force)
     zero = None if fit_bias else found.rest.zero_uncertainty
     shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
-    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
-    pulled = jacobian.T @ shared @ jacobian
-    # What the residuals scatter beyond all that is taken as a variance of their own, the same in each.
-    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
-    variance = max(left, 0.0) / freedom
-    matrix = bread @ pulled @ bread + variance * bread
+    matrix, variance = _covariance_with_shared(found, shared, freedom)
     linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
     if linearity is not None:
         notes += linearity.notes()
@@ -243,6 +238,19 @@ def _observability_of_turns(found: Solved, freedom: int, name: str) -> Observabi
             f"(condition number {seen.condition:.0f}); use more turns, about more directions"
         )
     return seen
+
+
+def _covariance_with_shared(found: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
+    """Return the covariance of the parameters, (p, p), and the variance that each residual has of its own.
+
+    `shared`, (3 m, 3 m), is what the residuals have in common; what they scatter beyond it is taken to be alike in all.
+    """
+    residual, jacobian = found.residual, found.jacobian
+    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
+    pulled = jacobian.T @ shared @ jacobian
+    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
+    variance = max(left, 0.0) / freedom
+    return bread @ pulled @ bread + variance * bread, variance
 
 
 def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:

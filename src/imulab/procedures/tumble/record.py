@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import shake_warnings
 from imulab.procedures.tumble.findings import (
     FEW_DEGREES,
-    Found,
-    Stated,
+    Estimate,
     aside_warnings,
     assumption_notes,
     freedom_finding,
@@ -47,8 +45,6 @@ _DOWN_WEIGHTED = 0.5
 _NOT_BY_CHANCE = 0.01
 _HIGH_CONDITION = 300.0
 _TO_MICRO = 1e6
-
-
 _REMEDIES = {
     ("norm", "square"): "--loss auto sets it aside",
     ("norm", "auto"): "it was not set aside: --loss huber limits its pull",
@@ -66,46 +62,81 @@ class Scaling:
 
 
 def make_record(
-    *,
-    attitudes: Attitudes,
+    estimate: Estimate,
     gravity: Gravity,
     scaling: Scaling,
-    problem: Problem,
-    solution: Solution,
-    stated: Stated | None,
-    found: Found,
-    observability: Observability,
-    orders: tuple[OrderRow, ...],
     options: Mapping[str, Any],
     monte_carlo: MonteCarlo | None = None,
-    with_gravity: bool = False,
-    entries: Mapping[str, Any] = MappingProxyType({}),
-    findings: Sequence[str] = (),
 ) -> Calibration:
-    """Turn a solution in units of g into the record.
+    """Turn an estimate in units of g into the record.
 
     ``S = scale sigma / g``, ``b = (zero + scale z) / S``, ``k_j = theta_j / g^(j-1)``; covariances are carried along by
-    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share. `with_gravity`
-    says that the covariance holds it already; `entries` and `findings` are added to the fit's and to the warnings.
+    their derivatives, and gravity's own uncertainty is added, which all scale factors and biases share.
     """
-    g, order = gravity.value, problem.order
-    names = parameter_names(order, problem.cross)
-    units = parameter_units(order, attitudes.unit, problem.cross)
-    values, derivative = _to_si(solution.theta[0], scaling, g, order)
-    shared = (not with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values, order)
-    matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
-    given = np.full(len(names), np.nan)
-    if stated is not None and stated.given_order is not None:
-        given = np.sqrt(np.diag(derivative @ stated.given_order @ derivative.T) + shared**2)
-    recording = attitudes.recording
-    n, size = len(attitudes), len(names)
-    chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
+    attitudes, problem, solution, found = estimate.attitudes, estimate.problem, estimate.solution, estimate.found
+    g, recording = gravity.value, attitudes.recording
+    parameters, matrix, shared = _parameters(estimate, gravity, scaling)
     freedom = data_freedom(problem, solution.jacobian[0], 1 / solution.variance[0])
-    known = problem.covariance is not None
-    if not known:
+    chi_square = float((solution.down_weights[0] * solution.residuals[0] ** 2 / solution.own_variance[0]).sum())
+    if problem.covariance is None:
         chi_square *= g**2
+    return Calibration(
+        procedure="tumble",
+        parameters=parameters,
+        covariance=Covariance((), ())
+        if matrix is None
+        else Covariance(tuple(parameters), tuple(map(tuple, matrix.tolist()))),
+        model=_model(attitudes, problem, gravity),
+        fit={
+            **_fit(estimate, options, g, chi_square, freedom),
+            **({"shared": {gravity.name: dict(zip(parameters, shared.tolist(), strict=True))}} if shared.any() else {}),
+            **_propagated(monte_carlo, scaling, gravity, problem.order),
+            **({} if estimate.prior is None else {"prior": estimate.prior}),
+        },
+        options=dict(options),
+        data=_data(found.attitudes, scaling, found.problem, found.solution, g),
+        sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
+        sources=(recording.source,) if recording.source else (),
+        warnings=(
+            *_warnings(attitudes, gravity, problem, solution, estimate.observability, options),
+            *_scatter_warnings(problem, solution, chi_square, freedom),
+            *shake_warnings(problem.motion, solution),
+            *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(estimate.orders)),
+            *vertical_warnings(found, str(options["method"])),
+            *aside_warnings(found, options),
+            *assumption_notes(estimate.stated),
+            *estimate.notes,
+        ),
+    )
+
+
+def _parameters(
+    estimate: Estimate, gravity: Gravity, scaling: Scaling
+) -> tuple[dict[str, Parameter], Array | None, Array]:
+    """Return the parameters in SI, their covariance, (p, p), and what of it they share through gravity, (p,)."""
+    g, order, cross, stated = gravity.value, estimate.problem.order, estimate.problem.cross, estimate.stated
+    names, units = parameter_names(order, cross), parameter_units(order, estimate.attitudes.unit, cross)
+    values, derivative = _to_si(estimate.solution.theta[0], scaling, g, order)
+    shared = (not estimate.with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values, order)
+    matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
+    uncertainty: list[float | None] = [None] * len(names)
+    given: list[float | None] = [None] * len(names)
+    if matrix is not None:
+        uncertainty = np.sqrt(np.diag(matrix)).tolist()
+    if stated is not None and stated.given_order is not None:
+        given = np.sqrt(np.diag(derivative @ stated.given_order @ derivative.T) + shared**2).tolist()
+    columns = zip(names, values.tolist(), uncertainty, units, given, strict=True)
+    return (
+        {name: Parameter(v, u, unit, standard_uncertainty_given_order=o) for name, v, u, unit, o in columns},
+        matrix,
+        shared,
+    )
+
+
+def _model(attitudes: Attitudes, problem: Problem, gravity: Gravity) -> dict[str, Any]:
+    """Return the law of the record, and the conditions of the test."""
     model: dict[str, Any] = {
-        "order": order,
+        "order": problem.order,
         "gravity": gravity.entry(),
         "output_unit": attitudes.unit,
         "gauge": GAUGE,
@@ -113,56 +144,30 @@ def make_record(
     }
     if attitudes.temperature is not None:
         model["temperature"] = {"value": attitudes.temperature, "unit": "degC"}
-    return Calibration(
-        procedure="tumble",
-        parameters={
-            name: Parameter(
-                float(values[i]),
-                None if matrix is None else float(np.sqrt(matrix[i, i])),
-                unit,
-                standard_uncertainty_given_order=None if np.isnan(given[i]) else float(given[i]),
-            )
-            for i, (name, unit) in enumerate(zip(names, units, strict=True))
-        },
-        covariance=Covariance((), ())
-        if matrix is None
-        else Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
-        model=model,
-        fit={
-            "method": options["method"],
-            "loss": options["loss"],
-            "attitudes": n,
-            "set_aside": [number + 1 for number in found.aside.index],
-            "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
-            "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
-            "degrees_of_freedom": n - size if problem.prior is None else freedom,
-            "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
-            "noise": "known" if known else "estimated from the residuals",
-            "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
-            **uncertainty_entries(stated),
-            "rank": observability.rank,
-            "condition_number": observability.condition,
-            "iterations": int(solution.iterations[0]),
-            "orders": [dict(vars(row)) for row in orders],
-            **({"shared": {gravity.name: dict(zip(names, shared.tolist(), strict=True))}} if shared.any() else {}),
-            **_propagated(monte_carlo, scaling, gravity, order),
-            **entries,
-        },
-        options=dict(options),
-        data=_data(found.attitudes, scaling, found.problem, found.solution, g),
-        sensor={key: recording.metadata[key] for key in ("serial", "model", "element") if key in recording.metadata},
-        sources=(recording.source,) if recording.source else (),
-        warnings=(
-            *_warnings(attitudes, gravity, problem, solution, observability, options),
-            *_scatter_warnings(problem, solution, chi_square, freedom),
-            *shake_warnings(problem.motion, solution),
-            *_pattern_warnings(attitudes, problem, solution, order_chosen=bool(orders)),
-            *vertical_warnings(found, str(options["method"])),
-            *aside_warnings(found, options),
-            *assumption_notes(stated),
-            *findings,
-        ),
-    )
+    return model
+
+
+def _fit(estimate: Estimate, options: Mapping[str, Any], g: float, chi_square: float, freedom: float) -> dict[str, Any]:
+    """Return how the estimate was made, and how well it fits."""
+    problem, solution, orders = estimate.problem, estimate.solution, estimate.orders
+    n, size = len(estimate.attitudes), solution.theta.shape[1]
+    return {
+        "method": options["method"],
+        "loss": options["loss"],
+        "attitudes": n,
+        "set_aside": [number + 1 for number in estimate.found.aside.index],
+        "rms": {"value": g * float(np.sqrt(np.mean(solution.deviations[0] ** 2))), "unit": "m/s^2"},
+        "leave_one_out": _leave_one_out(orders, problem, solution, str(options["method"]), g),
+        "degrees_of_freedom": n - size if problem.prior is None else freedom,
+        "reduced_chi_square": chi_square / freedom if freedom > 0 else None,
+        "noise": "known" if problem.covariance is not None else "estimated from the residuals",
+        "excess": {"value": g * float(solution.excess[0]), "unit": "m/s^2"},
+        **uncertainty_entries(estimate.stated),
+        "rank": estimate.observability.rank,
+        "condition_number": estimate.observability.condition,
+        "iterations": int(solution.iterations[0]),
+        "orders": [dict(vars(row)) for row in orders],
+    }
 
 
 def zero_outputs(record: Calibration) -> dict[str, Parameter]:

@@ -186,12 +186,7 @@ def make_curves(
     if settling_time is None:  # the longest over temperatures and units
         _, each = np.unique(unit * len(temperatures) + group, return_inverse=True)
         settling_time, settled = _choose_settling_time(cycles, [bins for bins, _ in still], each, end, limit)
-    for cycle, (bins, _) in zip(cycles, still, strict=True):
-        early = int((bins.stop <= settling_time + _NEARLY).sum())
-        if early < _FEWEST:
-            raise DataError(
-                f"{cycle.name}: {early} s of samples before T_M = {settling_time:g} s: expected {_FEWEST} s or more"
-            )
+    _check_early(cycles, [bins for bins, _ in still], settling_time)
     noise = _white_noise([bins for bins, _ in still])
     edges = bin_edges(settling_time)
     c, b, a = len(cycles), len(edges) - 1, len(cycles[0].axes)
@@ -231,6 +226,16 @@ def make_curves(
         halved=halved,
     )
     return curves, settled
+
+
+def _check_early(cycles: Sequence[Cycle], still: Sequence[Bins], settling_time: float) -> None:
+    """Refuse a cycle that has hardly a sample of the warm-up."""
+    for cycle, bins in zip(cycles, still, strict=True):
+        early = int((bins.stop <= settling_time + _NEARLY).sum())
+        if early < _FEWEST:
+            raise DataError(
+                f"{cycle.name}: {early} s of samples before T_M = {settling_time:g} s: expected {_FEWEST} s or more"
+            )
 
 
 def bin_edges(stop: float) -> Array:

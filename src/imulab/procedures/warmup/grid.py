@@ -37,6 +37,22 @@ def temperature_mark(temperature: float, temperatures: Array) -> str:
     return _SYMBOLS[int(np.argmin(np.abs(temperatures - temperature))) % len(_SYMBOLS)]
 
 
+def _temperature_key(temperatures: Array) -> list[dict[str, Any]]:
+    """Return a trace without points for each temperature, for the key."""
+    return [
+        {
+            "type": "scatter",
+            "mode": "lines+markers",
+            "x": [None],
+            "y": [None],
+            "name": f"{at:g} °C",
+            "line": {"color": temperature_colour(at, temperatures), "width": 3},
+            "marker": {"symbol": temperature_mark(at, temperatures), "size": 7},
+        }
+        for at in temperatures.tolist()
+    ]
+
+
 def grid(
     *,
     title: str,
@@ -55,24 +71,12 @@ def grid(
     down = -(-len(names) // across)
     gap_x, gap_y = 0.06, 0.16 / down
     width, height = (1 - gap_x * (across - 1)) / across, (1 - gap_y * (down - 1)) / down
-    traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "showlegend": True,
         "legend": {"orientation": "h", "x": 0, "y": 1 + 0.09 / down, "yanchor": "bottom", "itemsizing": "constant"},
         "annotations": [],
     }
-    traces += [
-        {
-            "type": "scatter",
-            "mode": "lines+markers",
-            "x": [None],
-            "y": [None],
-            "name": f"{at:g} °C",
-            "line": {"color": temperature_colour(at, temperatures), "width": 3},
-            "marker": {"symbol": temperature_mark(at, temperatures), "size": 7},
-        }
-        for at in temperatures.tolist()
-    ]
+    traces = _temperature_key(temperatures)
     for number, (name, cell) in enumerate(zip(names, cells, strict=True)):
         row, column = divmod(number, across)
         suffix = "" if number == 0 else str(number + 1)

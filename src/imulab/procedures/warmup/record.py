@@ -33,10 +33,8 @@ def make_record(
     """Turn a fitted table and what is known of its errors into a record."""
     parameters, names, matrix = _parameters(curves, chosen, spread, worst)
     serials = sorted({cycle.serial for cycle in curves.cycles if cycle.serial})
-    models = {cycle.sensor_model for cycle in curves.cycles if cycle.sensor_model}
-    sensor = {"serial": serials[0]} if len(serials) == 1 else {}
-    if len(models) == 1:
-        sensor["model"] = models.pop()
+    models = sorted({cycle.sensor_model for cycle in curves.cycles if cycle.sensor_model})
+    sensor = {key: values[0] for key, values in (("serial", serials), ("model", models)) if len(values) == 1}
     return Calibration(
         procedure="warmup",
         parameters=parameters,
