@@ -17,6 +17,7 @@ from imulab.recording import Array
 from imulab.report import panels as grid
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import BAD, GOOD, QUIET, Figure
+from imulab.report.traces import rounded, scatter
 
 MOST_PANELS = 24
 _MOST_POINTS = 1500
@@ -63,7 +64,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
         traces.append(
             {
                 "type": "bar",
-                "x": grid.plain((edges[1:] + edges[:-1]) / 2),
+                "x": rounded((edges[1:] + edges[:-1]) / 2),
                 "y": counts.tolist(),
                 "width": float(edges[1] - edges[0]),
                 "marker": {"color": GOOD},
@@ -105,18 +106,11 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
 
 def _diamonds(serials: Sequence[str], values: Array, out: np.ndarray, x: str, y: str) -> dict[str, Any]:
     """Mark the units that stand out, at the foot of a histogram."""
-    return {
-        "type": "scatter",
-        "mode": "markers",
-        "x": grid.plain(values[out]),
-        "y": [0] * int(out.sum()),
-        "text": [s for s, o in zip(serials, out, strict=True) if o],
-        "marker": {"color": BAD, "size": 9, "symbol": "diamond"},
-        "cliponaxis": False,
-        "xaxis": x,
-        "yaxis": y,
-        "hovertemplate": "%{text}: %{x}<extra></extra>",
-    }
+    return scatter(
+        rounded(values[out]), [0] * int(out.sum()), "markers", text=[s for s, o in zip(serials, out, strict=True) if o],
+        marker={"color": BAD, "size": 9, "symbol": "diamond"}, cliponaxis=False, xaxis=x, yaxis=y,
+        hovertemplate="%{text}: %{x}<extra></extra>",
+    )  # fmt: skip
 
 
 def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Figure]:
@@ -148,18 +142,10 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
         for chosen, colour, size, symbol in ((usual, GOOD, 4, "circle"), (np.flatnonzero(out), BAD, 8, "diamond")):
             if chosen.size:
                 traces.append(
-                    {
-                        "type": "scatter",
-                        "mode": "markers",
-                        "x": [where[i] for i in chosen],
-                        "y": grid.plain(values[chosen]),
-                        "text": [item.serials[i] for i in chosen],
-                        "marker": {"color": colour, "size": size, "symbol": symbol},
-                        "xaxis": x,
-                        "yaxis": y,
-                        "hovertemplate": "%{text}: %{y}<extra></extra>",
-                    }
-                )
+                    scatter([where[i] for i in chosen], rounded(values[chosen]), "markers", xaxis=x, yaxis=y,
+                            marker={"color": colour, "size": size, "symbol": symbol},
+                            text=[item.serials[i] for i in chosen], hovertemplate="%{text}: %{y}<extra></extra>")
+                )  # fmt: skip
         if item.drift is not None:
             traces.append(_drift_line(item.drift, shown, x, y))
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
@@ -194,20 +180,10 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
 def _drift_line(drift: Drift, shown: Display, x: str, y: str) -> dict[str, Any]:
     """Draw the fitted drift from the first date to the last."""
     ends = np.array([drift.value_at_start, drift.value_at_start + drift.per_day * drift.days])
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "x": [small.date(drift.start), small.date(drift.start + drift.days)],
-        "y": grid.plain(np.asarray(shown.of(ends))),
-        "line": {
-            "color": BAD if drift.significant else QUIET,
-            "width": 2,
-            "dash": "dash" if drift.significant else "solid",
-        },
-        "xaxis": x,
-        "yaxis": y,
-        "hoverinfo": "skip",
-    }
+    colour, dash = (BAD, "dash") if drift.significant else (QUIET, "solid")
+    days = [small.date(drift.start), small.date(drift.start + drift.days)]
+    line = {"color": colour, "width": 2, "dash": dash}
+    return scatter(days, rounded(shown.of(ends)), "lines", line=line, xaxis=x, yaxis=y, hoverinfo="skip")
 
 
 def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
@@ -231,22 +207,9 @@ def change_figure(title: str, changes: Sequence[FleetChange]) -> Figure | None:
                     x.append(round(place + 0.6 * ((i * 0.618034) % 1.0 - 0.5), 3))
                     y.append(round(z, 3))
                     text.append(f"{change.serial}, {change.name}")
-        traces.append(
-            {
-                "type": "scatter",
-                "mode": "markers",
-                "x": x,
-                "y": y,
-                "text": text,
-                "marker": {
-                    "color": colour,
-                    "size": 5 if not beyond else 8,
-                    "symbol": "diamond" if beyond else "circle",
-                    "opacity": 0.8,
-                },
-                "hovertemplate": "%{text}: %{y}<extra></extra>",
-            }
-        )
+        size, symbol = (8, "diamond") if beyond else (5, "circle")
+        marker = {"color": colour, "size": size, "symbol": symbol, "opacity": 0.8}
+        traces.append(scatter(x, y, "markers", text=text, marker=marker, hovertemplate="%{text}: %{y}<extra></extra>"))
         every += zip(x, y, text, strict=True)
     deviations = np.array([z for _, z, _ in every])
     far = bulk(deviations)

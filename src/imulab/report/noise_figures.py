@@ -13,14 +13,14 @@ from imulab.recording import Array, Recording
 from imulab.report import panels, render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.traces import DASHES, SYMBOLS, band, rounded, scatter
 from imulab.verdict import Note, verdict_of
 
 _HOUR = 3600.0
 _DEGREE = math.pi / 180
 _BLOCKS = 400
+_DIGITS = 5
 _COLOURS = (GOOD, BAD, "#8e6bbd", "#c99a2e", "#4f9d69", INK)
-_DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
-_MARKS = ("circle", "square", "diamond", "triangle-up", "x", "star")
 _MOST_LINES = len(_COLOURS)
 _MOST_NAMED = 6
 
@@ -105,16 +105,10 @@ def _curves(found: dict[str, Any], names: list[str]) -> Figure:
         at = int(np.argmin(deviation))
         lowest.append((float(deviation[at]), float(tau[at]), name))
         traces += [
-            {
-                "type": "scatter", "mode": "lines", "x": _plain([*tau, *tau[::-1]]), "y": _plain([*low, *high[::-1]]),
-                "fill": "toself", "fillcolor": _faint(_COLOURS[k]), "line": {"width": 0}, "hoverinfo": "skip",
-                "showlegend": False,
-            },
-            {
-                "type": "scatter", "mode": "lines+markers", "name": name, "x": _plain(tau), "y": _plain(deviation),
-                "line": {"color": _COLOURS[k], "dash": _DASHES[k]}, "marker": {"symbol": _MARKS[k], "size": 6},
-                "hovertemplate": f"{name}<br>%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>",
-            },
+            band(tau, low, high, _COLOURS[k], _DIGITS, showlegend=False),
+            scatter(rounded(tau, _DIGITS), rounded(deviation, _DIGITS), "lines+markers", name=name,
+                    line={"color": _COLOURS[k], "dash": DASHES[k]}, marker={"symbol": SYMBOLS[k], "size": 6},
+                    hovertemplate=f"{name}<br>%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>"),
         ]  # fmt: skip
     message = "All samples are the same."
     if lowest:
@@ -154,12 +148,11 @@ def _samples(found: dict[str, Any], recording: Recording, names: Sequence[str]) 
         time = (np.arange(len(blocks)) + 0.5) * size / rate
         low, mean, high = blocks.min(axis=1), blocks.mean(axis=1), blocks.max(axis=1)
         x, y = panels.names(index)
-        where = {"type": "scatter", "mode": "lines", "xaxis": x, "yaxis": y, "hoverinfo": "skip"}
+        line = {"line": {"color": GOOD, "width": 1}, "hoverinfo": "skip", "xaxis": x, "yaxis": y}
         traces += [
-            {**where, "x": _plain([*time, *time[::-1]]), "y": _plain([*low, *high[::-1]]), "fill": "toself",
-             "fillcolor": _faint(GOOD), "line": {"width": 0}},
-            {**where, "x": _plain(time), "y": _plain(mean), "line": {"color": GOOD, "width": 1}},
-        ]  # fmt: skip
+            band(time, low, high, GOOD, _DIGITS, xaxis=x, yaxis=y),
+            scatter(rounded(time, _DIGITS), rounded(mean, _DIGITS), "lines", **line),
+        ]
         panels.panel(layout, index, len(names), f"{name}, {unit}")
         layout[panels.axis_key(x)]["title"] = {"text": "time, s", "font": {"size": 11}, "standoff": 4}
         ends = np.concatenate([low, high])
@@ -181,15 +174,6 @@ def _samples(found: dict[str, Any], recording: Recording, names: Sequence[str]) 
         layout=layout,
         height=panels.height(len(names)),
     )
-
-
-def _faint(colour: str) -> str:
-    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.18)"
-
-
-def _plain(values: Any) -> list[float]:
-    return [float(f"{value:.5g}") for value in values]
 
 
 def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:

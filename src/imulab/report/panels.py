@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from imulab.recording import Array
-
 COLUMNS = 3
 _GAP_ACROSS = 0.075
 _ROW_HEIGHT = 215
@@ -94,8 +92,3 @@ def line(x: str, y: str, place: float, colour: str, dash: str) -> dict[str, Any]
         "y1": 1,
         "line": {"color": colour, "width": 1.5, "dash": dash},
     }
-
-
-def plain(values: Array) -> list[float]:
-    """Return values for a figure, which needs no more than seven digits."""
-    return [float(f"{value:.7g}") for value in values.tolist()]

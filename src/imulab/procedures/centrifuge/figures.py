@@ -23,6 +23,8 @@ from imulab.procedures.centrifuge.tables import (
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, format_uncertain
+from imulab.report.panels import axis_key, names
+from imulab.report.traces import SYMBOLS, axis, band, rounded, scatter
 from imulab.units import STANDARD_GRAVITY, from_si
 
 _POINTS = 121
@@ -33,7 +35,6 @@ _SPECTRUM_CAPTION = (
     "X without it is the drift K a, marked as fitted. A broad foot under a line is a rate that wanders; further lines "
     "are vibration."
 )
-_MARKS = ("circle", "square", "diamond", "triangle-up", "cross", "star", "x", "triangle-down")
 _SPECTRA = (("dtg_x", "X"), ("fog", "FOG"), ("residual_x", "X − FOG"))
 _CYCLES = (GOOD, BAD, INK, "#7a5c99", "#b8860b", "#4c8c4a")
 
@@ -152,16 +153,12 @@ def _g(force: float) -> str:
     return f"{from_si(force, 'g'):.3g} g"
 
 
-def _axis(title: str, **more: Any) -> dict[str, Any]:
-    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", "automargin": True, **more}
+def _scatter(x: Any, y: Any, name: str, mode: str, **more: Any) -> dict[str, Any]:
+    return scatter(rounded(x), rounded(y), mode, name=name, **more)
 
 
-def _scatter(x: Any, y: Any, name: str, **more: Any) -> dict[str, Any]:
-    return {"type": "scatter", "x": _plain(x), "y": _plain(y), "name": name, **more}
-
-
-def _plain(values: Any) -> list[float | None]:
-    return [None if value is None else float(value) for value in values]
+def _bars(values: Any, colour: str) -> dict[str, Any]:
+    return {"type": "data", "array": rounded(values), "color": colour, "thickness": 1.2, "width": 4}
 
 
 def _zeta(record: Calibration, sets: list[str]) -> Figure:
@@ -169,7 +166,6 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
     traces: list[dict[str, Any]] = []
     shown = [p for p in sets if "down" not in p] or sets
     for number, prefix in enumerate(shown):
-        axis = "" if number == 0 else str(number + 1)
         levels = numbers(record, prefix)
         force = np.array([force_of(record, level) for level in levels])
         grid = np.linspace(0.0, 1.02 * force.max(), _POINTS)
@@ -178,42 +174,30 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
         half = coverage_factor(None) * np.array([_curve_change(record, prefix, a) for a in grid])
         x = grid / STANDARD_GRAVITY
         change = 100 * (K / K0 - 1)
-        where = {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+        where = _place(number)
         traces += [
-            _scatter([*x, *x[::-1]], [*(change + 100 * half), *(change - 100 * half)[::-1]], "curve, 95 %",
-                fill="toself",
-                     fillcolor="rgba(31,111,139,0.18)", line={"width": 0}, hoverinfo="skip", showlegend=number == 0,
-                         **where),
-            _scatter(x, change, "fitted curve", mode="lines", line={"color": GOOD, "width": 2},
+            band(x, change + 100 * half, change - 100 * half, GOOD, name="curve, 95 %",
+                 showlegend=number == 0, **where),
+            _scatter(x, change, "fitted curve", "lines", line={"color": GOOD, "width": 2},
                 showlegend=number == 0, **where),
         ]  # fmt: skip
         measured = np.array([record.value(f"{prefix}K_{level}") for level in levels])
         factors = centrifuge_of(record).fit.coverage_factor_95
-        u = np.array(
-            [
-                (record.parameter(f"{prefix}K_{level}").standard_uncertainty or 0.0) * factors[f"{prefix}K_{level}"]
-                for level in levels
-            ]
-        )
+        u = np.array([_half_width(record, factors, f"{prefix}K_{level}") for level in levels])
         traces.append(
-            _scatter(force / STANDARD_GRAVITY, 100 * (measured / K0 - 1), "K_i against K0, 95 %", mode="markers",
+            _scatter(force / STANDARD_GRAVITY, 100 * (measured / K0 - 1), "K_i against K0, 95 %", "markers",
                      marker={"color": INK, "size": 7}, showlegend=number == 0,
-                     error_y={"type": "data", "array": _plain(100 * u / K0), "color": INK, "thickness": 1.2,
-                         "width": 4}, **where)
+                     error_y=_bars(100 * u / K0, INK), **where)
         )  # fmt: skip
         later = levels[1:]
         if later:
             zeta = [100 * record.value(f"{prefix}zeta_{level}") for level in later]
-            bars = [
-                100 * (record.parameter(f"{prefix}zeta_{n}").standard_uncertainty or 0.0) * factors[f"{prefix}zeta_{n}"]
-                for n in later
-            ]
+            bars = [100 * _half_width(record, factors, f"{prefix}zeta_{n}") for n in later]
             spread = 0.012 * float(force.max()) / STANDARD_GRAVITY
             traces.append(
-                _scatter(force[1:] / STANDARD_GRAVITY + spread, zeta, "zeta_i against K_1, 95 %", mode="markers",
+                _scatter(force[1:] / STANDARD_GRAVITY + spread, zeta, "zeta_i against K_1, 95 %", "markers",
                          marker={"color": BAD, "size": 7, "symbol": "diamond-open"}, showlegend=number == 0,
-                         error_y={"type": "data", "array": _plain(bars), "color": BAD, "thickness": 1.2,
-                             "width": 4}, **where)
+                         error_y=_bars(bars, BAD), **where)
             )  # fmt: skip
     return Figure(
         title="Change of the drift factor with specific force",
@@ -227,6 +211,16 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
     )
 
 
+def _half_width(record: Calibration, factors: dict[str, float], name: str) -> float:
+    """Half the 95 % interval of a parameter."""
+    return (record.parameter(name).standard_uncertainty or 0.0) * factors[name]
+
+
+def _place(number: int) -> dict[str, Any]:
+    """The axes of a panel, as a trace names them."""
+    return dict(zip(("xaxis", "yaxis"), names(number), strict=True))
+
+
 def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
     """Layout of panels side by side, the legend above."""
     count = len(titles)
@@ -236,10 +230,10 @@ def _panels(titles: list[str], below: str, gap: float = 0.09) -> dict[str, Any]:
         "margin": {"l": 70, "r": 20, "t": 50, "b": 55},
     }
     for number, title in enumerate(titles):
-        mark = "" if number == 0 else str(number + 1)
+        x, y = names(number)
         start = number * (width + gap)
-        layout[f"xaxis{mark}"] = _axis(below, domain=[start, start + width], anchor=f"y{mark}")
-        layout[f"yaxis{mark}"] = _axis(title, anchor=f"x{mark}")
+        layout[axis_key(x)] = axis(below, domain=[start, start + width], anchor=y, automargin=True)
+        layout[axis_key(y)] = axis(title, anchor=x, automargin=True)
     return layout
 
 
@@ -249,8 +243,8 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
     shown = [p for p in sets if "down" not in p] or sets
     annotations = []
     for number, prefix in enumerate(shown):
-        mark = "" if number == 0 else str(number + 1)
-        where = {"xaxis": f"x{mark}", "yaxis": f"y{mark}"}
+        x, y = names(number)
+        where = _place(number)
         key = prefix[0] if "down" not in prefix else f"{prefix[0]}_down"
         rows = [(row, line) for row in centrifuge_of(record).levels if (line := row.line(key)) is not None]
         if not rows:
@@ -263,14 +257,14 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
             ring = axes * np.sqrt(np.maximum(size, 0.0)) @ np.array([np.cos(angle), np.sin(angle)])
             ring *= 2.448  # 95 % of a two-dimensional normal distribution
             traces.append(
-                _scatter(z[index].real + ring[0], z[index].imag + ring[1], "95 % region", mode="lines",
+                _scatter(z[index].real + ring[0], z[index].imag + ring[1], "95 % region", "lines",
                     line={"color": QUIET, "width": 1},
                          hoverinfo="skip", showlegend=index == 0 and number == 0, **where)
             )  # fmt: skip
         traces.append(
-            _scatter(z.real, z.imag, "level, coloured by g", mode="lines+markers", line={"color": QUIET, "width": 1,
+            _scatter(z.real, z.imag, "level, coloured by g", "lines+markers", line={"color": QUIET, "width": 1,
                 "dash": "dot"},
-                     marker={"color": _plain(force), "colorscale": "Viridis", "size": 9,
+                     marker={"color": rounded(force), "colorscale": "Viridis", "size": 9,
                          "line": {"color": "#ffffff", "width": 1},
                              "showscale": number == len(shown) - 1,
                              "colorbar": {"title": {"text": "g"}, "thickness": 12}},
@@ -278,16 +272,16 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
                      showlegend=number == 0, **where)
         )  # fmt: skip
         annotations += [
-            {"x": z[index].real, "y": z[index].imag, "xref": f"x{mark}", "yref": f"y{mark}", "showarrow": True,
+            {"x": z[index].real, "y": z[index].imag, "xref": x, "yref": y, "showarrow": True,
              "text": f"{force[index]:.3g} g", "arrowcolor": QUIET, "ax": 26, "ay": -24 if index else 24}
             for index in (0, len(rows) - 1)
         ]  # fmt: skip
     layout = _panels([f"{_label(p)}: along Y, deg/h/g" for p in shown], "along X, deg/h/g", gap=0.13)
     layout["annotations"] = annotations
     for number in range(len(shown)):
-        mark = "" if number == 0 else str(number + 1)
-        layout[f"yaxis{mark}"] |= {"scaleanchor": f"x{mark}", "scaleratio": 1}
-        layout[f"xaxis{mark}"] |= {"constrain": "domain"}
+        x, y = names(number)
+        layout[axis_key(y)] |= {"scaleanchor": x, "scaleratio": 1}
+        layout[axis_key(x)] |= {"constrain": "domain"}
     caption = (
         "Where in the gyroscope's frame the drift per g is largest, and how large: points in a line outward are "
         "nonlinearity in size, across it a turning of the drift, which the magnitude does not show. The largest ring "
@@ -302,15 +296,14 @@ def _repeatability(record: Calibration, r: Centrifuge, sets: list[str]) -> Figur
     axes = list(dict.fromkeys(p[0] for p in sets))
     cycles = sorted({row.power_cycle for row in r.runs if row.role == "loaded"})
     number_of = {run: row.level for row in r.levels for run in row.runs}
-    for number, axis in enumerate(axes):
-        mark = "" if number == 0 else str(number + 1)
+    for number, letter in enumerate(axes):
         for cycle_number, cycle in enumerate(cycles):
             x, y, bars = [], [], []
             for index, run in enumerate(r.runs):
-                found = run.line(axis)
+                found = run.line(letter)
                 if run.role != "loaded" or run.power_cycle != cycle or found is None or found.K is None:
                     continue
-                prefix = f"{axis}_" + ("down_" if run.spin_axis == "down" else "")
+                prefix = f"{letter}_" + ("down_" if run.spin_axis == "down" else "")
                 if index not in number_of:
                     raise RecordError(f"levels: none has run {index}")
                 level = number_of[index]
@@ -320,18 +313,18 @@ def _repeatability(record: Calibration, r: Centrifuge, sets: list[str]) -> Figur
                 bars.append(100 * (relative(found.K.standard_uncertainty or 0.0, K) + 1))
             colour = _CYCLES[cycle_number % len(_CYCLES)]
             traces.append(
-                _scatter(x, y, f"power cycle {cycle}", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
-                         marker={"symbol": _MARKS[cycle_number % len(_MARKS)], "size": 7, "color": colour},
+                _scatter(x, y, f"power cycle {cycle}", "markers", **_place(number),
+                         marker={"symbol": SYMBOLS[cycle_number % len(SYMBOLS)], "size": 7, "color": colour},
                          error_y={"type": "data", "array": bars, "thickness": 1, "width": 3, "color": QUIET},
                          showlegend=number == 0)
             )  # fmt: skip
-    layout = _panels([f"{axis.upper()}: K off its level, %" for axis in axes], "level (number)")
+    layout = _panels([f"{letter.upper()}: K off its level, %" for letter in axes], "level (number)")
     ticks = [row.level for row in r.levels]
     texts = [f"{row.level}<br>{from_si(row.specific_force.value, 'g'):.3g} g" for row in r.levels]
     for number in range(len(axes)):
-        mark = "" if number == 0 else str(number + 1)
-        layout[f"xaxis{mark}"] |= {"tickvals": ticks, "ticktext": texts}
-        layout[f"yaxis{mark}"] |= {"zeroline": True, "zerolinecolor": QUIET}
+        x_key, y_key = map(axis_key, names(number))
+        layout[x_key] |= {"tickvals": ticks, "ticktext": texts}
+        layout[y_key] |= {"zeroline": True, "zerolinecolor": QUIET}
     spread = r.fit.repeatability
     words = [
         f"{what} by {size:.2g} {unit} beyond their noise"
@@ -358,15 +351,15 @@ def _spectra(r: Centrifuge) -> list[Figure]:
     titles, annotations = [], []
     for number, index in enumerate(picked):
         spectrum = found[index]
-        mark = "" if number == 0 else str(number + 1)
+        x, y = names(number)
         rate = from_si(np.array(spectrum.rate), "deg/s")
         lines = zip(_SPECTRA, (QUIET, "#b8860b", GOOD), ("solid", "dot", "dash"), strict=True)
         for (name, label), colour, dash in lines:
             height = np.maximum(from_si(np.array(spectrum.height[name]), "deg/h"), 1e-6)
             width = 2.4 if name == "residual_x" else 1.6
             traces.append(
-                _scatter(rate, height, label, mode="lines", line={"color": colour, "width": width, "dash": dash},
-                         xaxis=f"x{mark}", yaxis=f"y{mark}", showlegend=number == 0)
+                _scatter(rate, height, label, "lines", line={"color": colour, "width": width, "dash": dash},
+                         **_place(number), showlegend=number == 0)
             )  # fmt: skip
         row = level_of(r.levels, spectrum.level)
         key = "x" if spectrum.spin_axis == "up" else "x_down"
@@ -377,13 +370,13 @@ def _spectra(r: Centrifuge) -> list[Figure]:
         line = from_si(K * a, "deg/h")
         centre = float(np.median(rate))
         traces.append(
-            _scatter([centre], [line], "fitted K a", mode="markers", xaxis=f"x{mark}", yaxis=f"y{mark}",
+            _scatter([centre], [line], "fitted K a", "markers", **_place(number),
                      showlegend=number == 0, marker={"color": BAD, "size": 10, "symbol": "circle-open",
                          "line": {"width": 2}})
         )  # fmt: skip
         titles.append("height, deg/h" if number == 0 else "")
         annotations.append(
-            {"xref": f"x{mark} domain", "yref": f"y{mark} domain", "x": 0.0, "y": 1.01, "showarrow": False,
+            {"xref": f"{x} domain", "yref": f"{y} domain", "x": 0.0, "y": 1.01, "showarrow": False,
              "xanchor": "left", "yanchor": "bottom",
              "text": f"<b>{from_si(a, 'g'):.3g} g</b>: K a = {line:.3g} deg/h"}
         )  # fmt: skip
@@ -392,7 +385,7 @@ def _spectra(r: Centrifuge) -> list[Figure]:
     layout["legend"]["y"] = 1.09
     layout["margin"]["t"] = 75
     for number in range(len(picked)):
-        mark = "" if number == 0 else str(number + 1)
-        layout[f"yaxis{mark}"] |= {"type": "log", "tickvals": _DECADES, "ticktext": [f"{v:g}" for v in _DECADES]}
-        layout[f"xaxis{mark}"] |= {"nticks": 5}
+        x, y = names(number)
+        layout[axis_key(y)] |= {"type": "log", "tickvals": _DECADES, "ticktext": [f"{v:g}" for v in _DECADES]}
+        layout[axis_key(x)] |= {"nticks": 5}
     return [Figure("Spectrum around the table rate", _SPECTRUM_CAPTION, traces, layout, height=425)]

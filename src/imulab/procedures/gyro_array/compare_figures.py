@@ -10,9 +10,10 @@ from imulab.errors import RecordError
 from imulab.procedures.gyro_array.health import JUMPED, NON_FINITE, STUCK
 from imulab.procedures.gyro_array.model import unit_of_angle
 from imulab.procedures.gyro_array.sections import ComparisonRecord, comparison_of
-from imulab.procedures.gyro_array.traces import DASHES, MARGIN, allan_trace, axis, log_axis, of_axis
+from imulab.procedures.gyro_array.traces import allan_trace, curves, of_axis
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, plain_number
+from imulab.report.elements import BAD, GOOD, INK, Exhibits, Figure, ReportTable, plain_number
+from imulab.report.traces import DASHES, axis, log_axis, scatter
 
 _MOST_NAMED = 4
 _PALETTE = {
@@ -125,20 +126,16 @@ def _width(method: str) -> float:
 
 def _allan_methods(record: ComparisonRecord, a: int) -> Figure:
     unit = record.model.units[a]
-    curves = record.data.allan
-    order = ["single gyro", *[m for m in curves if m not in ("single gyro", "robust")], "robust"]
+    held = record.data.allan
+    order = ["single gyro", *[m for m in held if m not in ("single gyro", "robust")], "robust"]
     traces = [
-        allan_trace(curves[m][a], m, _PALETTE.get(m, INK), 1.0, _width(m), number=_NUMBER.get(m, 0))
+        allan_trace(held[m][a], m, _PALETTE.get(m, INK), 1.0, _width(m), number=_NUMBER.get(m, 0))
         for m in order
-        if m in curves
+        if m in held
     ]
-    first = {
-        m: next(d for d in curves[m][a].deviation if d > 0)
-        for m in curves
-        if max(curves[m][a].deviation, default=0.0) > 0
-    }
+    first = {m: d for m in held if (d := next((d for d in held[m][a].deviation if d > 0), None)) is not None}
     quiet = min(first, key=first.__getitem__, default="")
-    return Figure(
+    return curves(
         message=f"At the shortest time {quiet} is the quietest, {plain_number(first[quiet], 2)} {unit}."
         if quiet
         else "",
@@ -146,12 +143,8 @@ def _allan_methods(record: ComparisonRecord, a: int) -> Figure:
         caption="On the left, how quiet a sample is: a curve that bends down there is low-pass filtered. On the "
         "right, what the angle drifts by: no weighting changes the bias that all gyros share.",
         traces=traces,
-        layout={
-            "xaxis": log_axis("averaging time, s"),
-            "yaxis": log_axis(f"Allan deviation, {unit}"),
-            "legend": LEGEND,
-            "margin": MARGIN,
-        },
+        x=log_axis("averaging time, s"),
+        y=log_axis(f"Allan deviation, {unit}"),
         height=430,
     )
 
@@ -160,39 +153,25 @@ def _angles(record: ComparisonRecord, a: int) -> Figure:
     angle, factor = unit_of_angle(record.model.units[a])
     time = record.data.trace_time
     traces = [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "x": time,
-            "y": [factor * value for value in rows[a]],
-            "line": {
-                "color": _PALETTE.get(method, INK),
-                "width": _width(method),
-                "dash": DASHES[_NUMBER.get(method, 0)],
-            },
-            "name": method,
-            "hovertemplate": f"{method}<br>%{{x:.4g}} s: %{{y:.4g}} {angle}<extra></extra>",
-        }
+        scatter(time, [factor * value for value in rows[a]], "lines", name=method,
+                line={"color": _PALETTE.get(method, INK), "width": _width(method),
+                      "dash": DASHES[_NUMBER.get(method, 0)]},
+                hovertemplate=f"{method}<br>%{{x:.4g}} s: %{{y:.4g}} {angle}<extra></extra>")
         for method, rows in sorted(record.data.angle.items(), key=lambda item: item[0] == "robust")
-    ]
+    ]  # fmt: skip
     ends = {method: abs(factor * rows[a][-1]) for method, rows in record.data.angle.items()}
     if not ends:
         raise RecordError("data.angle: expected the angles of one method or more")
     least, most = min(ends, key=ends.__getitem__), max(ends, key=ends.__getitem__)
-    return Figure(
+    return curves(
         message=f"At the end {least} is off by {plain_number(ends[least], 2)} {angle}, {most} by "
         f"{plain_number(ends[most], 2)} {angle}.",
         title=f"Angle error over time{of_axis(record.model.axes[a])}",
         caption="Integral of the rate error. A straight line is a bias; lines on top of each other differ in nothing "
         "that counts for an attitude.",
         traces=traces,
-        layout={
-            "xaxis": axis("time, s"),
-            "yaxis": axis(f"angle error, {angle}"),
-            "legend": LEGEND,
-            "margin": MARGIN,
-        },
-        height=400,
+        x=axis("time, s"),
+        y=axis(f"angle error, {angle}"),
     )
 
 
@@ -221,27 +200,16 @@ def _health(record: ComparisonRecord, a: int) -> Figure:
     ):
         k, i = np.nonzero(flags & bit)
         if k.size:
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "x": [health.time[index] for index in k],
-                    "y": [names[index] for index in i],
-                    "marker": {"symbol": symbol, "color": colour, "size": 7},
-                    "name": label,
-                    "hovertemplate": f"%{{y}} {label}, %{{x:.4g}} s<extra></extra>",
-                }
-            )
-    return Figure(
+            at, which = [health.time[index] for index in k], [names[index] for index in i]
+            marker = {"symbol": symbol, "color": colour, "size": 7}
+            hover = f"%{{y}} {label}, %{{x:.4g}} s<extra></extra>"
+            traces.append(scatter(at, which, "markers", marker=marker, name=label, hovertemplate=hover))
+    return curves(
         title=f"Weight and health of each gyro under robust{of_axis(record.model.axes[a])}",
         caption="Dark: counts for much. White: not in use. Marks: stuck, non-finite, or a bias that jumped and is "
         "being estimated again.",
         traces=traces,
-        layout={
-            "xaxis": axis("time, s"),
-            "yaxis": {"automargin": True, "autorange": "reversed"},
-            "legend": LEGEND,
-            "margin": MARGIN,
-        },
+        x=axis("time, s"),
+        y={"automargin": True, "autorange": "reversed"},
         height=max(260, 30 * len(names) + 120),
     )

@@ -9,9 +9,10 @@ import numpy as np
 from imulab.errors import RecordError
 from imulab.procedures.gyro_array.compare_figures import exhibits_of_comparison
 from imulab.procedures.gyro_array.sections import ArrayRecord, PerGyro, array_of, model_of
-from imulab.procedures.gyro_array.traces import MARGIN, allan_trace, log_axis, of_axis
+from imulab.procedures.gyro_array.traces import allan_trace, curves, of_axis
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.elements import Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.traces import correlation_map, log_axis, strongest_pair
 from imulab.units import from_si
 
 _ELEMENT_SHADES = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#2e4057", "#d081a5", "#6f7f3f")
@@ -120,18 +121,13 @@ def _allan_elements(record: ArrayRecord, a: int) -> Figure:
     traces = []
     for i, curve in enumerate(record.data.allan[a]):
         traces.append(allan_trace(curve, record.elements[i].name, _ELEMENT_SHADES[i % 8], math.degrees(1), number=i))
-    return Figure(
+    return curves(
         title=f"Allan deviation of each gyro{of_axis(record.model.axes[a])}",
         caption="Slope −1/2: angle random walk. Flat: bias instability. Slope +1/2: rate random walk. A curve apart "
         "from the others is a gyro apart from the others; the last points on the right are few averages.",
         traces=traces,
-        layout={
-            "xaxis": log_axis("averaging time, s"),
-            "yaxis": log_axis("Allan deviation, deg/s"),
-            "legend": LEGEND,
-            "margin": MARGIN,
-        },
-        height=400,
+        x=log_axis("averaging time, s"),
+        y=log_axis("Allan deviation, deg/s"),
     )
 
 
@@ -141,32 +137,12 @@ def _correlation(record: ArrayRecord, a: int) -> Figure:
     matrix = np.array(shared.matrix[a])
     text = [[f"{value:.2f}" for value in row] for row in matrix]
     noise = float(np.median(shared.standard_uncertainty[a]))
-    off = np.where(np.eye(len(names), dtype=bool), 0.0, matrix)
-    i, j = np.unravel_index(int(np.argmax(np.abs(off))), off.shape)
     return Figure(
-        message=f"The pair that goes together most: {names[i]} and {names[j]}, {off[i, j]:+.2f}."
-        if len(names) > 1
-        else "",
+        message=f"The pair that goes together most: {strongest_pair(matrix, names)}." if len(names) > 1 else "",
         title=f"Correlation of the noise{of_axis(record.model.axes[a])}",
         caption=f"At {shared.averaging_time.value:g} s, ± {noise:.2f} each. What all share, no weights remove; "
         "a pair that goes together counts for less than two.",
-        traces=[
-            {
-                "type": "heatmap",
-                "z": matrix.round(3).tolist(),
-                "x": names,
-                "y": names,
-                "zmin": -1,
-                "zmax": 1,
-                "colorscale": [[0, GOOD], [0.5, "#ffffff"], [1, BAD]],
-                "xgap": 1,
-                "ygap": 1,
-                "text": text,
-                "texttemplate": "%{text}" if len(names) <= 12 else "",
-                "colorbar": {"thickness": 12},
-                "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
-            }
-        ],
+        traces=[correlation_map(matrix, names, text=text, texttemplate="%{text}" if len(names) <= 12 else "")],
         layout={"xaxis": {"automargin": True}, "yaxis": {"autorange": "reversed", "automargin": True}},
         height=max(360, 28 * len(names) + 120),
     )

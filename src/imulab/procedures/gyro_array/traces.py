@@ -1,23 +1,12 @@
-"""What the figures of an array have in common: axes, legend, a curve of Allan deviation."""
+"""What the figures of an array have in common: titles of axes, a figure of curves, a curve of Allan deviation."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from imulab.procedures.gyro_array.sections import AllanCurve
-
-MARGIN = {"l": 70, "r": 20, "t": 64, "b": 55}
-"""A legend above the plot has room below the buttons in the corner."""
-
-
-def axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return the layout of an axis."""
-    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
-
-
-def log_axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return the layout of a logarithmic axis."""
-    return axis(title, type="log", dtick=1, exponentformat="none", **more)
+from imulab.report.elements import LEGEND, Figure
+from imulab.report.traces import DASHES, MARGIN, SYMBOLS, scatter
 
 
 def of_axis(letter: str) -> str:
@@ -25,23 +14,26 @@ def of_axis(letter: str) -> str:
     return f", axis {letter}" if letter else ""
 
 
-DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot", "6px 2px 2px 2px", "2px 6px")
-SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross")
-"""What tells lines apart without colour, by their number."""
+def curves(
+    title: str, caption: str, traces: list[dict[str, Any]], x: dict[str, Any], y: dict[str, Any], message: str = "",
+    height: int = 400,
+) -> Figure:  # fmt: skip
+    """Return a figure of one plot with a legend above it."""
+    layout = {"xaxis": x, "yaxis": y, "legend": LEGEND, "margin": MARGIN}
+    return Figure(title, caption, traces, layout, height, message)
 
 
 def allan_trace(
     curve: AllanCurve, name: str, colour: str, factor: float, width: float = 1.6, *, number: int = 0
 ) -> dict[str, Any]:
     """Return a line of deviation times a factor over averaging time, s; values of 0 have no place on a log scale."""
-    known = [(t, d) for t, d in zip(curve.tau, curve.deviation, strict=False) if d > 0]
-    return {
-        "type": "scatter",
-        "mode": "lines+markers",
-        "x": [t for t, _ in known],
-        "y": [d * factor for _, d in known],
-        "line": {"color": colour, "width": width, "dash": DASHES[number % len(DASHES)]},
-        "marker": {"symbol": SYMBOLS[number % len(SYMBOLS)], "size": 6},
-        "name": name,
-        "hovertemplate": f"{name}<br>%{{x:.3g}} s: %{{y:.3g}}<extra></extra>",
-    }
+    known = [(t, d * factor) for t, d in zip(curve.tau, curve.deviation, strict=False) if d > 0]
+    return scatter(
+        [t for t, _ in known],
+        [d for _, d in known],
+        "lines+markers",
+        line={"color": colour, "width": width, "dash": DASHES[number % len(DASHES)]},
+        marker={"symbol": SYMBOLS[number % len(SYMBOLS)], "size": 6},
+        name=name,
+        hovertemplate=f"{name}<br>%{{x:.3g}} s: %{{y:.3g}}<extra></extra>",
+    )

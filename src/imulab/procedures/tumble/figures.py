@@ -24,6 +24,7 @@ from imulab.procedures.tumble.tables import orders_table, parameters_table, prop
 from imulab.records.calibration import Calibration
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import ALARM, BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
+from imulab.report.traces import axis, correlation_map, log_axis, scatter, strongest_pair
 from imulab.units import from_si
 
 
@@ -89,10 +90,6 @@ def _worst_scale_uncertainty(record: Calibration) -> float | None:
     return max(relative) if relative else None
 
 
-def _axis(title: str, **more: Any) -> dict[str, Any]:
-    return {"title": {"text": title}, "zeroline": False, "gridcolor": "#e6eaed", **more}
-
-
 def _residuals(record: Calibration) -> Figure:
     data = attitudes_of(record)
     number = list(range(1, len(data.residual) + 1))
@@ -132,11 +129,11 @@ def _residuals(record: Calibration) -> Figure:
             *marks,
         ],
         layout={
-            "xaxis": _axis(
+            "xaxis": axis(
                 "attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6], anchor="y"
             ),
-            "yaxis": _axis("after, µg", domain=[0, 0.6]) | scale,
-            "yaxis2": _axis("before, mg", domain=[0.68, 1]),
+            "yaxis": axis("after, µg", domain=[0, 0.6]) | scale,
+            "yaxis2": axis("before, mg", domain=[0.68, 1]),
             "showlegend": False,
         },
         height=460,
@@ -148,18 +145,10 @@ def _calibrated_points(data: HeldAttitudes, after: list[float], bars: list[float
     colours = [BAD if weight < ALARM else GOOD for weight in data.down_weight]
     shapes = ["diamond" if weight < ALARM else "circle" for weight in data.down_weight]
     marker = {"color": colours, "size": 8, "symbol": shapes}
-    trace: dict[str, Any] = {
-        "type": "scatter",
-        "mode": "markers",
-        "x": list(range(1, len(after) + 1)),
-        "y": after,
-        "marker": marker,
-        "xaxis": "x",
-        "yaxis": "y",
-        "text": data.label,
-        "hovertemplate": "%{text}<br>%{y:.1f} µg<extra></extra>",
-        "name": "after",
-    }
+    trace = scatter(
+        list(range(1, len(after) + 1)), after, "markers", marker=marker, xaxis="x", yaxis="y", text=data.label,
+        name="after", hovertemplate="%{text}<br>%{y:.1f} µg<extra></extra>",
+    )  # fmt: skip
     if bars is not None:
         trace["error_y"] = {"type": "data", "array": bars, "thickness": 1, "width": 2, "color": QUIET}
     return trace
@@ -176,28 +165,26 @@ def _trace(trace: Trace, data: HeldAttitudes) -> Figure:
         caption="Standard deviation within a sliding window (three axes together), the threshold below which the unit "
         "counts as at rest, and the stretches that were used (shaded), without their settling edges.",
         traces=[
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "x": trace.time,
-                "y": deviation,
-                "line": {"color": GOOD, "width": 1},
-                "name": "windowed standard deviation",
-                "hovertemplate": "%{x:.1f} s<br>%{y:.3g} mg<extra></extra>",
-            },
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "x": [trace.time[0], trace.time[-1]],
-                "y": [float(from_si(trace.threshold, "mg"))] * 2,
-                "line": {"color": BAD, "dash": "dash"},
-                "name": "threshold",
-                "hoverinfo": "skip",
-            },
+            scatter(
+                trace.time,
+                deviation,
+                "lines",
+                line={"color": GOOD, "width": 1},
+                name="windowed standard deviation",
+                hovertemplate="%{x:.1f} s<br>%{y:.3g} mg<extra></extra>",
+            ),
+            scatter(
+                [trace.time[0], trace.time[-1]],
+                [float(from_si(trace.threshold, "mg"))] * 2,
+                "lines",
+                line={"color": BAD, "dash": "dash"},
+                name="threshold",
+                hoverinfo="skip",
+            ),
         ],
         layout={
-            "xaxis": _axis("time, s"),
-            "yaxis": _axis("standard deviation, mg", type="log", dtick=1, exponentformat="none"),
+            "xaxis": axis("time, s"),
+            "yaxis": log_axis("standard deviation, mg"),
             "legend": LEGEND,
             "shapes": [
                 {
@@ -252,8 +239,8 @@ def _turns(data: Turns, aside: list[TurnAside]) -> Figure:
             *marks,
         ],
         layout={
-            "xaxis": _axis("turn", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
-            "yaxis": _axis("residual angle, deg", **({} if beyond is None else {"range": [0, beyond.high]})),
+            "xaxis": axis("turn", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
+            "yaxis": axis("residual angle, deg", **({} if beyond is None else {"range": [0, beyond.high]})),
             "showlegend": False,
         },
         height=320,
@@ -265,30 +252,14 @@ def _correlation(record: Calibration) -> Figure:
     sigma = np.sqrt(np.diag(matrix))
     correlation = matrix / np.outer(sigma, sigma)
     names = list(record.covariance.names)
-    off = np.abs(np.triu(correlation, 1))
-    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
     return Figure(
         title="Correlation of the parameters",
-        message=f"The pair that these attitudes tell apart least: {names[i]} and {names[j]}, {correlation[i, j]:+.2f}."
+        message=f"The pair that these attitudes tell apart least: {strongest_pair(correlation, names)}."
         if len(names) > 1
         else "",
         caption="From −1 to +1, with numbers on hovering. Near 1 or −1 off the diagonal: two parameters that these "
         "attitudes hardly tell apart, so that only their sum or difference is well known.",
-        traces=[
-            {
-                "type": "heatmap",
-                "z": correlation.round(3).tolist(),
-                "x": names,
-                "y": names,
-                "zmin": -1,
-                "zmax": 1,
-                "colorscale": [[0, GOOD], [0.5, "#ffffff"], [1, BAD]],
-                "xgap": 1,
-                "ygap": 1,
-                "colorbar": {"thickness": 12},
-                "hovertemplate": "%{y}, %{x}: %{z:.2f}<extra></extra>",
-            }
-        ],
+        traces=[correlation_map(correlation, names)],
         layout={
             "xaxis": {"tickangle": -45, "automargin": True},
             "yaxis": {"autorange": "reversed", "automargin": True},

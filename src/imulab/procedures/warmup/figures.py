@@ -13,6 +13,7 @@ from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
+from imulab.report.traces import rounded, scatter
 
 _POINTS = 121
 _LOST = "in noise"
@@ -182,7 +183,7 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
                 {
                     "mode": "markers",
                     "x": cycle.time,
-                    "y": _rounded(np.array(cycle.curve[i], dtype=np.float64) * factor),
+                    "y": rounded(np.array(cycle.curve[i], dtype=np.float64) * factor, 4),
                     "marker": {"color": colour, "symbol": mark, "size": 4, "opacity": 0.55},
                     "hovertemplate": f"{at:g} degC, {cycle.file}<br>%{{x:.0f}} s: %{{y:.3g}} {label}<extra></extra>",
                 }
@@ -193,8 +194,8 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
                 traces.append(
                     {
                         "mode": "lines",
-                        "x": _rounded(time),
-                        "y": _rounded(z[i] * factor),
+                        "x": rounded(time, 4),
+                        "y": rounded(z[i] * factor, 4),
                         "line": {"color": temperature_colour(at, table.temperatures), "width": 2},
                         "hovertemplate": f"{at:g} degC, fitted<br>%{{x:.0f}} s: %{{y:.3g}} {label}<extra></extra>",
                     }
@@ -224,8 +225,8 @@ def _residuals(record: Calibration, table: WarmupTable, kind: str, index: list[i
             cell.append(
                 {
                     "mode": "lines+markers",
-                    "x": _rounded(time),
-                    "y": _rounded(left[i] * factor),
+                    "x": rounded(time, 4),
+                    "y": rounded(left[i] * factor, 4),
                     "line": {"color": temperature_colour(at, table.temperatures), "width": 1.2},
                     "marker": {"size": 4, "symbol": temperature_mark(at, table.temperatures)},
                     "hovertemplate": f"{at:g} degC, {len(members)} cycles<br>%{{x:.0f}} s: %{{y:.3g}} {label}"
@@ -281,18 +282,10 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
         values = [_rms(row, index) * factor for row in rows]
         points = [(t, v) for t, v in zip(knots, values, strict=True) if np.isfinite(v) and v > 0]
         if points:
-            traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines+markers",
-                    "name": name,
-                    "x": [t for t, _ in points],
-                    "y": [float(f"{v:.4g}") for _, v in points],
-                    "line": {"color": colour, "dash": dash},
-                    "marker": {"symbol": symbol, "size": 8},
-                    "hovertemplate": f"{name}<br>%{{x:g}} degC: %{{y:.3g}} {label}<extra></extra>",
-                }
-            )
+            x, y = [t for t, _ in points], rounded([v for _, v in points], 4)
+            line, marker = {"color": colour, "dash": dash}, {"symbol": symbol, "size": 8}
+            hover = f"{name}<br>%{{x:g}} degC: %{{y:.3g}} {label}<extra></extra>"
+            traces.append(scatter(x, y, "lines+markers", name=name, line=line, marker=marker, hovertemplate=hover))
     after = [(_rms(row, index) * factor, at) for row, at in zip(chosen.by_temperature, knots, strict=True)]
     worst, at = max((pair for pair in after if pair[0] > 0), default=(0.0, 0.0))
     return Figure(
@@ -330,19 +323,11 @@ def _over_temperature(table: WarmupTable) -> Figure:
             shade = ["#12303c", GOOD, "#5aa5bd", "#a9cfdb"][j]
             dash = ["solid", "dash", "dashdot", "dot"][j]
             traces.append(
-                {
-                    "type": "scatter",
-                    "mode": "lines",
-                    "name": f"{instant:g} s",
-                    "showlegend": number == 0,
-                    "x": [float(f"{t:.12g}") for t in at],
-                    "y": _rounded(z[:, i, j] * factor),
-                    "xaxis": f"x{suffix}",
-                    "yaxis": f"y{suffix}",
-                    "line": {"color": shade, "width": 2, "dash": dash},
-                    "hovertemplate": f"{instant:g} s<br>%{{x:.1f}} degC: %{{y:.3g}} {label}<extra></extra>",
-                }
-            )
+                scatter(rounded(at, 12), rounded(z[:, i, j] * factor, 4), "lines", name=f"{instant:g} s",
+                        showlegend=number == 0, xaxis=f"x{suffix}", yaxis=f"y{suffix}",
+                        line={"color": shade, "width": 2, "dash": dash},
+                        hovertemplate=f"{instant:g} s<br>%{{x:.1f}} degC: %{{y:.3g}} {label}<extra></extra>")
+            )  # fmt: skip
     layout: dict[str, Any] = {"legend": {**LEGEND, "title": {"text": "after power-on: "}}}
     for number, (axis, label) in enumerate(names):
         suffix = "" if number == 0 else "2"
@@ -392,7 +377,3 @@ def _tests(record: Calibration, table: WarmupTable) -> ReportTable:
         columns=["degC", "cycles", "power-on, degC", "repeatability", "left", "left out", "settled drift", "end, s"],
         rows=rows,
     )
-
-
-def _rounded(values: Array) -> list[float | None]:
-    return [float(f"{value:.4g}") if np.isfinite(value) else None for value in values.tolist()]

@@ -8,17 +8,17 @@ import numpy as np
 
 from imulab.recording import Array
 from imulab.report.elements import Figure
+from imulab.report.traces import SYMBOLS, axis
 
 _ACROSS = 3
 _DECADES = [1, 10, 100, 1000]
-_SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "triangle-down", "cross")
 _SCALE = ("#2c4fa3", "#3d8fc4", "#58b5a6", "#a3bf58", "#e0a83c", "#d5663a", "#a8322f")
 """Cold to warm; distinct in lightness too."""
 
 
 def axis_style(title: str, **more: Any) -> dict[str, Any]:
     """Return a Plotly axis in the style of the reports."""
-    return {"title": {"text": title, "standoff": 12}, "zeroline": False, "gridcolor": "#e6eaed", **more}
+    return axis("", **more) | {"title": {"text": title, "standoff": 12}}
 
 
 def temperature_colour(temperature: float, temperatures: Array) -> str:
@@ -34,7 +34,7 @@ def temperature_colour(temperature: float, temperatures: Array) -> str:
 
 def temperature_mark(temperature: float, temperatures: Array) -> str:
     """Return the mark of the calibration temperature that is nearest."""
-    return _SYMBOLS[int(np.argmin(np.abs(temperatures - temperature))) % len(_SYMBOLS)]
+    return SYMBOLS[int(np.argmin(np.abs(temperatures - temperature))) % len(SYMBOLS)]
 
 
 def _temperature_key(temperatures: Array) -> list[dict[str, Any]]:
