@@ -68,6 +68,14 @@ def deviance(bins: Bins, values: Array) -> Array:
     return np.asarray((bins.freedom * (np.log(total) + bins.power / total)).sum(axis=-1))
 
 
+def information(bins: Bins, values: Array) -> Array:
+    """Return the covariance of the logarithms of a model's parameters, shape (8,), that the bins can tell, (8, 8)."""
+    power = bins.variances(values[None])
+    return np.asarray(
+        _inverse(_expansion(bins, values[None].copy(), power, bins.freedom[None])[2], values[None] > 0)[0]
+    )
+
+
 def fit(bins: Bins, models: Flags, limits: tuple[float, float], power: Array, freedom: Array) -> Fits:
     """Fit every model to every spectrum: rows count models, then spectra.
 
