@@ -52,3 +52,27 @@ def draw(rng, terms, n, dt, burn=0):
             response = np.cumprod(np.r_[1.0, (k - 0.5) / k])
             total += size * fftconvolve(rng.standard_normal(n + before), response)[before : n + before]
     return total
+
+
+def filtered_angle(rng, rates, dt, white, walk, aided):
+    """Errors of the angle of a filter of angle and bias, and its own variance of them, after aiding has ended.
+
+    rates: errors of a gyro, shape (trials, n); white, walk: what the filter is told; the angle is measured at the first
+    `aided` samples, with 0.3 of the white noise of a sample. Textbook discretisation of d(angle) = -bias + white.
+    """
+    measured = (0.3 * white) ** 2 * dt
+    step = np.array([[1.0, -dt], [0.0, 1.0]])
+    noise = np.array(
+        [[white**2 * dt + walk**2 * dt**3 / 3, -(walk**2) * dt**2 / 2], [-(walk**2) * dt**2 / 2, walk**2 * dt]]
+    )
+    state, covariance = np.zeros((2, len(rates))), np.diag([measured, 100 * white**2 / dt])
+    for index, rate in enumerate(rates.T):
+        state = step @ state
+        state[0] += rate * dt
+        covariance = step @ covariance @ step.T + noise
+        if index < aided:
+            gain = covariance[:, 0] / (covariance[0, 0] + measured)
+            seen = np.sqrt(measured) * rng.standard_normal(len(rates))
+            state = state + np.outer(gain, seen - state[0])
+            covariance = covariance - np.outer(gain, covariance[0])
+    return state[0], covariance[0, 0]

@@ -1,0 +1,208 @@
+"""What noise models say of many records: coverage, chosen terms, filters, how long to record."""
+
+import numpy as np
+import pytest
+
+from imulab.errors import OptionError
+from imulab.estimation.noise.choice import CANDIDATES, Averaged, average, choose
+from imulab.estimation.noise.duration import accuracy, length_for, visible
+from imulab.estimation.noise.intervals import profile
+from imulab.estimation.noise.likelihood import deviance, fit, information, time_limits
+from imulab.estimation.noise.terms import NAMES, Bins, allan_variance, letters, prepare, terms
+from imulab.estimation.noise.use import bias_square, walk_square, white_square
+from imulab.estimation.special import ndtr, ndtri
+from noise_models import AUTO, IN_TIME, LONG, TRUTHS, drawn, empty, intervals, transformed, values
+from reference import noise as reference
+
+
+def test_how_long_to_record_follows_the_rules_of_thumb():
+    """u(K)/K = sqrt(2 N/(K L)), u(B)/B = 1.25 N/(B sqrt L), Gauss-Markov .8 and 2.2 sqrt(T/L)."""
+    walk, flicker, markov = (TRUTHS[name] for name in ("N K", "N B", "N G, T = 100 s"))
+    assert accuracy(walk, 0.1, 1e4)[[0, 2]] == pytest.approx([1 / np.sqrt(2e5), np.sqrt(2 / (walk[2] * 1e4))], rel=0.02)
+    assert accuracy(flicker, 0.1, 1e4)[1] == pytest.approx(1.25 / (flicker[1] * 100), rel=0.05)
+    assert accuracy(markov, 0.1, 1e4)[4:6] == pytest.approx([0.08, 0.22], rel=0.03)
+    assert length_for(walk, 0.1, 2, 0.1) == pytest.approx(115 * 100, rel=0.03)
+    assert length_for(markov, 0.1, 4, 0.1) == pytest.approx(65 * 100, rel=0.03)
+    assert length_for(markov, 0.1, 5, 0.1) == pytest.approx(500 * 100, rel=0.03)
+    with pytest.raises(OptionError, match="expected a term that the model has"):
+        length_for(walk, 0.1, 1, 0.1)
+
+
+def test_limits_of_slow_noise_from_a_record_of_white_noise():
+    """K below about 11 N/L and B below 3.9 N/sqrt(L), twice the length and a half, or by root 2."""
+    white = values(white=1)
+    short, long = (visible(white, terms("NBK"), 0.1, length) for length in (1e4, 2e4))
+    assert short[[1, 2]] == pytest.approx([3.9e-2, 11.5e-4], rel=0.1)
+    assert (short / long)[[1, 2]] == pytest.approx([np.sqrt(2), 2.0], rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "expected"), [("N", "N"), ("N K", "NK"), ("N B", "NB"), ("N G, T = 100 s", "NG")])
+def test_the_terms_are_chosen_and_all_candidates_speak(name, expected):
+    power = drawn(np.random.default_rng(11), LONG, AUTO[name], 40)
+    choice = choose(prepare([LONG]), time_limits([LONG]), power, np.broadcast_to(LONG.freedom, power.shape))
+    assert np.mean([CANDIDATES[index] == expected for index in choice.chosen]) >= 0.9
+    assert not choice.rivals[np.arange(40), choice.chosen].any()
+    np.testing.assert_allclose(choice.weights.sum(axis=1), 1)
+    tau = np.array([100.0])
+    found = average(choice, lambda models: allan_variance(models, tau, 0.1))
+    low, middle, high = (found.quantile(level) for level in (0.025, 0.5, 0.975))
+    true = allan_variance(AUTO[name], tau, 0.1)
+    assert ((low < middle) & (middle < high)).all()
+    assert np.mean((low < true) & (true < high)) >= 0.85
+
+
+def test_quantisation_joins_where_it_shows():
+    rng = np.random.default_rng(12)
+    power = np.concatenate([drawn(rng, LONG, AUTO["N K Q"], 5), drawn(rng, LONG, AUTO["N K"], 5)])
+    freedom = np.broadcast_to(LONG.freedom, power.shape)
+    choice = choose(prepare([LONG]), time_limits([LONG]), power, freedom, full_band=True)
+    assert choice.models[:, :, 3].all(axis=1).tolist() == [True] * 5 + [False] * 5
+    partial = choose(prepare([LONG]), time_limits([LONG]), power, freedom)
+    assert not partial.models[:, :, 3].any()
+
+
+def test_quantiles_of_a_mixture_are_those_of_its_draws():
+    rng = np.random.default_rng(13)
+    centre, spread, weights = np.array([0.0, 1.0, 3.0]), np.array([0.1, 0.5, 0.2]), np.array([0.3, 0.5, 0.2])
+    mixture = Averaged(np.exp(centre)[None, :, None], spread[None, :, None], weights[None])
+    which = rng.choice(3, 400_000, p=weights)
+    draws = np.exp(centre[which] + np.sqrt(spread[which]) * rng.standard_normal(len(which)))
+    for level in (0.025, 0.5, 0.975):
+        assert mixture.quantile(level)[0, 0] == pytest.approx(np.quantile(draws, level), rel=0.01)
+    assert mixture.expected[0, 0] == pytest.approx(draws.mean(), rel=0.01)
+    nothing = Averaged(np.array([[[0.0], [1.0]]]), np.array([[[0.0], [0.1]]]), np.array([[0.1, 0.9]]))
+    assert nothing.quantile(0.025)[0, 0] == 0
+    assert nothing.quantile(0.5)[0, 0] == pytest.approx(np.exp(np.sqrt(0.1) * ndtri(0.4 / 0.9)), rel=1e-6)
+
+
+def test_a_filter_gets_white_noise_for_what_is_too_fast_to_be_slow():
+    model = values(white=1, gm1_sigma=2, gm1_time=0.02, gm2_sigma=0.1, gm2_time=100, walk=1e-3)
+    h, dt = np.array([10.0]), 0.01
+    slow = values(gm1_sigma=0.1, gm1_time=100, walk=1e-3)
+    assert walk_square(model, h, dt, shortest=0.02) == pytest.approx(3 * allan_variance(slow, h, dt) / 10)
+    assert white_square(model, shortest=0.02) == pytest.approx(1 + 2 * 4 * 0.02)
+    # A pure walk and pure white noise come back as they are.
+    assert walk_square(values(walk=0.3), h, dt) == pytest.approx(0.09, rel=1e-5)
+    assert white_square(values(white=0.3)) == pytest.approx(0.09)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRUTHS)
+def test_profiles_cover_and_estimates_reach_the_bound(name, request):
+    """95 % of intervals hold the truth; the scatter is the Cramer-Rao bound's where that is below 15 %."""
+    trials = 400 if request.config.getoption("--reduced") else 5000
+    truth = TRUTHS[name]
+    has = truth > 0
+    found, lower, upper = intervals(truth, drawn(np.random.default_rng(8), LONG, truth, trials))
+    cover = ((lower <= truth) & (truth <= upper)).mean(axis=0)[has]
+    margin = 2.5 * np.sqrt(0.05 * 0.95 / trials)
+    assert (np.abs(cover - 0.95) < 0.02 + margin).all(), cover
+    frame = prepare([LONG])
+    own = Bins(**{**vars(frame), "power": frame.variances(truth[None])[0]})
+    h, logs = 1e-4, np.log(truth[has])
+
+    def depth(logarithms):
+        model = np.zeros(len(NAMES))
+        model[has] = np.exp(logarithms)
+        return deviance(own, model[None])[0]
+
+    steps = h * np.eye(len(logs))
+    hessian = [
+        [
+            (depth(logs + a + b) - depth(logs + a - b) - depth(logs - a + b) + depth(logs - a - b)) / (8 * h * h)
+            for b in steps
+        ]
+        for a in steps
+    ]
+    bound = np.sqrt(np.diag(np.linalg.inv(hessian)))
+    errors = np.log(np.maximum(found.values[:, has], 1e-9)) - logs
+    ratio = np.sqrt((errors**2).mean(axis=0)) / bound
+    print(name, "cover", cover.round(3), "RMS/CRB", ratio.round(3), "CRB", bound.round(3))
+    allowed = np.where(np.flatnonzero(has) == 2, 1.15, 1.05) + 2.5 / np.sqrt(2 * trials)
+    assert (ratio < allowed)[bound < 0.15].all(), ratio
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "expected", "share"),
+    [
+        ("N", "N", 0.94),
+        ("N K", "NK", 0.9),
+        ("N B", "NB", 0.92),
+        ("N G, T = 100 s", "NG", 0.93),
+        ("N K, corner at L/10", "NK", 0.24),
+        ("N G, T = 1000 s", "", 0),
+    ],
+)
+def test_chosen_terms_and_averages_over_many_records(name, expected, share, request):
+    trials = 200 if request.config.getoption("--reduced") else 1000
+    truth, dt, length = AUTO[name], LONG.interval, LONG.length
+    power = drawn(np.random.default_rng(14), LONG, truth, trials)
+    choice = choose(
+        prepare([LONG]), time_limits([LONG]), power, np.broadcast_to(LONG.freedom, power.shape), full_band=True
+    )
+    chosen = [letters(choice.models[k, index]) for k, index in enumerate(choice.chosen)]
+    right = chosen.count(expected) / trials
+    tau = np.array([length / 100, length / 10])
+    found, true = average(choice, lambda models: allan_variance(models, tau, dt)), allan_variance(truth, tau, dt)
+    cover = ((found.quantile(0.025) <= true) & (true <= found.quantile(0.975))).mean(axis=0)
+    mean = np.array([length / 10])
+    ratio = np.sqrt(
+        average(choice, lambda models: bias_square(models, mean, dt)).expected / bias_square(truth, mean, dt)
+    )
+    within = (2 * ndtr(2 * ratio) - 1).mean()  # the error of a mean is normal, of the true variance
+    print(name, "right", right, "sigma covers", cover, "bias covers", within, "median u/u_true", np.median(ratio))
+    assert right >= share - 2.5 * np.sqrt(0.05 / trials)
+    assert cover[0] >= 0.88
+    assert cover[1] >= 0.83
+    assert within >= (0.88 if "T = 1000" in name else 0.91)  # a time constant of L/10 is no longer told from a walk
+    if name == "N":
+        assert np.median(ratio) <= 1.05
+
+
+@pytest.mark.parametrize("name", IN_TIME)
+def test_records_drawn_in_the_time_domain_give_their_parameters_back(name):
+    rng = np.random.default_rng(15)
+    spectrum = empty(20_000, 0.5)
+    truth = TRUTHS[name]
+    samples = np.array([reference.draw(rng, IN_TIME[name], 20_000, 0.5) for _ in range(60)])
+    power = transformed(samples, spectrum)
+    frame, limits = prepare([spectrum]), time_limits([spectrum])
+    freedom = np.broadcast_to(spectrum.freedom, power.shape)
+    has = np.broadcast_to(truth > 0, (60, len(NAMES)))
+    found = fit(frame, has[:1], limits, power, freedom)
+    lower, upper = profile(frame, found.values, has, limits, power, freedom)
+    cover = ((lower <= truth) & (truth <= upper)).mean(axis=0)[truth > 0]
+    assert (cover >= 0.88).all()  # 53 of 60: of 95 %, one sample of 60 in 100 has fewer
+    middle = np.median(found.values, axis=0)
+    spread = np.sqrt(np.diag(information(Bins(**{**vars(frame), "freedom": spectrum.freedom}), truth)))
+    off = np.abs(np.log(middle / np.where(truth > 0, truth, 1), where=truth > 0, out=np.zeros(len(NAMES))))
+    assert (off <= 4 * 1.25 * np.maximum(spread, 1e-9) / np.sqrt(60)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_TIME)
+@pytest.mark.parametrize("horizon", [10, 100, 300])
+def test_a_filter_with_the_fitted_white_noise_and_walk_knows_its_errors(name, horizon, request):
+    logs, each = (8, 60) if request.config.getoption("--reduced") else (30, 200)
+    rng = np.random.default_rng(16)
+    power = drawn(rng, LONG, TRUTHS[name], logs)
+    limits = time_limits([LONG])
+    choice = choose(prepare([LONG]), limits, power, np.broadcast_to(LONG.freedom, power.shape))
+    walks = average(choice, lambda models: walk_square(models, np.array([float(horizon)]), 0.1, limits[0])).mean[:, 0]
+    whites = average(choice, lambda models: white_square(models, limits[0])[..., None]).mean[:, 0]
+    squares = []
+    for white, walk in zip(np.sqrt(whites), np.sqrt(walks), strict=True):
+        rates = np.array([reference.draw(rng, IN_TIME[name], 2000 + horizon, 1.0) for _ in range(each)])
+        errors, variance = reference.filtered_angle(rng, rates, 1.0, white, walk, 2000)
+        squares.append((errors**2).mean() / variance)
+    ratio = np.sqrt(np.mean(squares))
+    print(
+        name,
+        horizon,
+        "actual/predicted",
+        ratio,
+        "K_h/true",
+        np.sqrt(walks / walk_square(TRUTHS[name], np.array([float(horizon)]), 0.1)).round(2),
+    )
+    assert 0.85 - 1.5 / np.sqrt(logs * each) <= ratio <= 1.25 + 1.5 / np.sqrt(logs * each)
