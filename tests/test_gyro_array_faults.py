@@ -4,13 +4,14 @@ Bounds are against the output of the healthy array on the same noise. w is the l
 sigma the largest noise of one gyro, 0.08 deg/s.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from imulab.device.unit import array_stream
 from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse
 from imulab.procedures.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
-from reference import gyro_array as reference
 from test_gyro_array_fuse import array_recording, dynamic
 
 SEEDS = (1, 2, 3, 4)
@@ -236,17 +237,6 @@ def test_a_late_gyro_is_no_bias_where_the_array_starts_in_motion(delay):
     assert max(mean) < (0.03 if delay else 0.002)
 
 
-@pytest.mark.parametrize("elements", [3, 5, 6])
-def test_motion_is_told_apart_as_in_the_transcription(elements):
-    readings = in_motion(elements, 0.006, 3000)[0][:, :elements] * np.linspace(0.98, 1.02, elements)
-    readings[2000:] -= in_motion(elements, 0.0, 3000)[1][2000:, None]  # and at rest
-    ours = array_stream("robust", elements, rate=100.0, memory=0.02 if elements == 5 else None).process(readings)
-    recursion = reference.Robust(elements, rate=100.0, memory=0.02 if elements == 5 else None)
-    for k, row in enumerate(readings.tolist()):
-        assert ours.rate[k, 0] == pytest.approx(recursion.step(row), abs=1e-8), k
-        assert (ours.flags[k, 0] & 127).tolist() == recursion.flags, k
-
-
 def test_one_gyro_ten_times_better_than_the_others_is_used():
     # The best weights leave 0.0976 of the noise of the others, the smallest variance that is believed 1.16 times that.
     rng = np.random.default_rng(4)
@@ -306,7 +296,7 @@ def test_a_coarse_array_at_rest_is_not_called_stuck():
     assert not (fused.flags & STUCK).any()
 
 
-# ---- any mixture of faults, sample by sample against the transcription -----------------------------------------------
+# ---- any mixture of faults -----------------------------------------------------------------------------------------
 
 
 def _mixture(rng: np.random.Generator, count: int, elements: int, rate: float) -> np.ndarray:
@@ -337,15 +327,33 @@ def _mixture(rng: np.random.Generator, count: int, elements: int, rate: float) -
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_any_mixture_of_faults_gives_the_flags_and_rates_of_the_transcription(seed):
+def test_any_mixture_of_faults_keeps_what_holds_whatever_is_broken(seed):
+    # The document has bounds for faults, but no equations. These hold for any readings: a rate wherever a gyro is left,
+    # weights that sum to one on those that are used, and nothing that depends on the sense or the unit of the axis or
+    # on the order of the gyros.
     rng = np.random.default_rng(seed)
     elements, rate, memory = 3 + seed % 7, (25.0, 50.0, 100.0)[seed % 3], (None, None, 0.02, 0.3)[seed % 4]
     readings = _mixture(rng, 800, elements, rate)
     known = None if seed % 5 else rng.uniform(0.2, 5, elements)
-    weights = {} if known is None else {"weights": known[None]}
-    ours = array_stream("robust", elements, rate=rate, memory=memory, **weights).process(readings)
-    recursion = reference.Robust(elements, rate=rate, memory=memory, reliability=known)
-    for k, row in enumerate(readings.tolist()):
-        expected = recursion.step(row)
-        assert (ours.flags[k, 0] & 127).tolist() == recursion.flags, k
-        assert ours.rate[k, 0] == pytest.approx(expected, abs=1e-11, nan_ok=True), k
+
+    def fused(z: np.ndarray, order: object = slice(None)) -> Any:
+        weights = {} if known is None else {"weights": known[order][None]}
+        return array_stream("robust", elements, rate=rate, memory=memory, **weights).process(z, weights=True)
+
+    ours = fused(readings)
+    finite, used = np.isfinite(readings), ours.weights[:, 0] > 0
+    there = np.isfinite(ours.rate[:, 0])
+    assert not there[~finite.any(axis=1)].any()
+    np.testing.assert_array_equal((ours.flags[:, 0] & NON_FINITE) > 0, ~finite)
+    np.testing.assert_array_equal((ours.flags[:, 0] & EXCLUDED) > 0, ~used)
+    assert not (used & ~finite).any()
+    np.testing.assert_allclose(ours.weights[there, 0].sum(axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_array_equal(used.any(axis=1), there)
+    for factor in (-1.0, 2.0**10, -(2.0**-20)):
+        other = fused(factor * readings)
+        np.testing.assert_array_equal(other.rate, factor * ours.rate)
+        np.testing.assert_array_equal(other.flags, ours.flags)
+    order = rng.permutation(elements)
+    other = fused(readings[:, order], order)
+    np.testing.assert_array_equal(other.flags, ours.flags[:, :, order])
+    np.testing.assert_allclose(other.rate, ours.rate, rtol=0, atol=1e-10)

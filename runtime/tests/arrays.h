@@ -31,7 +31,7 @@ static inline il_real coarse(il_real x, il_real steps) {
     return REAL(floor((double)(x * steps) + 0.5)) / steps;
 }
 
-/* Reading k of gyro i in a scenario of make_vectors.py. */
+/* Reading k of gyro i in a scenario; make_vectors.py has three of these. */
 static inline il_real faulty(int scenario, int k, int i) {
     const il_real x = v_array_base[k][i];
     switch (scenario) {
