@@ -15,6 +15,9 @@ ROOMS = [
 """From above (design.md); everything else lies in the root, below them all."""
 PROCEDURES = {path.parent.name for path in (SOURCE / "imulab" / "procedures").glob("*/entry.py")}
 KNOWN_CIRCLE = ("imulab.cli.records", "imulab.cli")  # `imulab demo` runs other commands
+FRONT = "imulab.procedures.front"
+"""What recordings and records show of themselves and are used for: only their own methods import it, when called."""
+BEHIND = {"imulab.recording", "imulab.records.calibration"}
 KNOWN_NAMES = {
     "imulab.device.blob",
     "imulab.device.tables",
@@ -54,6 +57,9 @@ def _imported(node: ast.AST) -> set[str]:
 
 
 ARROWS = {name: _imported(tree) - {name} for name, tree in MODULES.items()}
+TO_FRONT = {name for name in ARROWS if FRONT in ARROWS[name]}
+for module in TO_FRONT & BEHIND:
+    ARROWS[module] = ARROWS[module] - {FRONT}
 
 
 def _room(name: str) -> str:
@@ -73,6 +79,12 @@ def test_the_graph_is_that_of_the_package():
     assert {"tumble", "gyro_array", "warmup", "centrifuge"} <= PROCEDURES
     assert "imulab.procedures.registry" in ARROWS["imulab.procedures.run"]
     assert "imulab.procedures.tumble.fit" in ARROWS["imulab.procedures.tumble.task"]  # within a function
+
+
+def test_only_methods_of_recordings_and_records_reach_up_to_the_front():
+    assert TO_FRONT == BEHIND
+    inside = [node for name in BEHIND for node in MODULES[name].body]
+    assert not any(FRONT in _imported(node) for node in inside if not isinstance(node, ast.ClassDef))
 
 
 def test_arrows_go_down_only():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,9 @@ from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
+
+if TYPE_CHECKING:
+    from imulab.report.plots import Plot, Plots
 
 Array = NDArray[np.float64]
 
@@ -81,6 +84,23 @@ class Recording:
     def __repr__(self) -> str:
         titles = ", ".join(f"{name} [{unit}]" for name, unit in self.units.items())
         return f"Recording({self.name}: {len(self)} samples of {titles})"
+
+    def _repr_html_(self) -> str:
+        from imulab.procedures import front
+
+        return front.recording_html(self)
+
+    def plot(self, name: str | None = None) -> Plots | Plot:
+        """Return the columns over time, a figure for each sensor, or that of one sensor, such as ``"accel"``.
+
+        Raises
+        ------
+        OptionError
+            There is no such figure; the message lists them.
+        """
+        from imulab.procedures import front
+
+        return front.recording_plots(self, name)
 
     def __len__(self) -> int:
         for column in self.columns.values():

@@ -7,7 +7,8 @@ from pathlib import Path
 from imulab.device.blob import Blob, is_blob, load_blob
 from imulab.errors import RecordError
 from imulab.procedures.registry import PROCEDURES
-from imulab.records.calibration import Calibration, parsed
+from imulab.records.calibration import Calibration
+from imulab.records.reading import parsed
 
 
 def load(path: str | Path) -> Calibration:

@@ -118,6 +118,16 @@ class Section:
 
 
 @dataclass(frozen=True)
+class Row:
+    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ..."""
+
+    name: str
+    value: float
+    standard_uncertainty: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
 class Procedure:
     """A procedure's entry in the registry.
 
@@ -147,6 +157,8 @@ class Procedure:
         Why another program's file cannot hold its records; ``{target}`` is that program. None where they can.
     not_applied
         Why its records correct no recording by `apply`, and what takes them; None where they do.
+    rows
+        Record to its parameters in the units in which people read them; by their units if None.
     change_unit
         Change of a parameter and record to the factor from SI and the unit in which it is read; by unit if None.
     same_meaning
@@ -172,6 +184,7 @@ class Procedure:
     fuses: bool = False
     elsewhere: str | None = None
     not_applied: str | None = None
+    rows: Callable[[Calibration], Sequence[Row]] | None = None
     change_unit: Callable[[Change, Calibration], tuple[float, str]] | None = None
     same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
     beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from imulab import report
 from imulab.atomic_write import write_text
+from imulab.procedures.procedure import Row
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change, Comparison, compared
@@ -41,6 +43,20 @@ def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     """Return the factor from SI and the unit in which people read the change of a parameter."""
     own = procedure_of(record).change_unit
     return _READ.get(change.unit, (1.0, change.unit)) if own is None else own(change, record)
+
+
+def parameter_rows(record: Calibration) -> Sequence[Row]:
+    """Return the parameters of a record in the units in which people read them."""
+    own = procedure_of(record).rows
+    if own is not None:
+        rows: Sequence[Row] = own(record)
+        return rows
+    found = []
+    for name, p in record.parameters.items():
+        factor, unit = _READ.get(p.unit, (1.0, p.unit))
+        u = p.standard_uncertainty
+        found.append(Row(name, p.value * factor, None if u is None else u * factor, unit))
+    return found
 
 
 def rendered(record: Calibration) -> str:

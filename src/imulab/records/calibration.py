@@ -6,15 +6,13 @@ a SHA-256 of each source file and of its own content, so that an altered record 
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cache
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +20,23 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.atomic_write import write_text
 from imulab.errors import RecordError
+from imulab.frames import data_frame
 from imulab.printable import first_hidden, has_hidden, printable
 from imulab.recording import Source
 from imulab.records.json_text import content_sha256, sealed_text
 from imulab.records.json_text import json_text as json_text
-from imulab.records.sections import check_sizes
-from imulab.verdict import UNJUDGED, Verdict, as_judged, verdict_of
+from imulab.verdict import UNJUDGED, Verdict, verdict_of
+
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from imulab.procedures.inputs import Data, Reading
+    from imulab.recording import Recording
+    from imulab.report.plots import Plot, Plots
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
 BLOB_MAGIC = b"\x89IMULAB\n"
-_CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
-_ROUNDING = 1.0 + 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,126 +207,97 @@ class Calibration:
         """
         write_text(path, self.to_json())
 
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Calibration:
+        """Read a record; see `imulab.load`."""
+        from imulab.procedures import front
+
+        return front.load(Path(path))
+
+    def report(self, path: str | Path) -> None:
+        """Write the report as one HTML file; see `imulab.write_report`."""
+        from imulab.procedures import front
+
+        front.write_report(self, path)
+
+    def plot(self, name: str | None = None) -> Plots | Plot:
+        """Return the report's figures, which show themselves in a notebook, or the one whose title has these words.
+
+        Raises
+        ------
+        OptionError
+            There is no such figure; the message lists them.
+        RecordError
+            The record lacks the data that they need.
+
+        Examples
+        --------
+        >>> import imulab as il
+        >>> fit = il.fit_tumble(il.find_attitudes(il.simulate_tumble(gravity=9.81)), order=1, gravity=9.81)
+        >>> fit.calibration.plot("sphere").save("sphere.html")
+        """
+        from imulab.procedures import front
+
+        return front.plots(self, name)
+
+    def to_frame(self, library: str | None = None) -> Any:
+        """Return the parameters in SI as a data frame of pandas, or of the `library` ``"polars"``.
+
+        Raises
+        ------
+        DataError
+            The library is not installed.
+        """
+        parameters = self.parameters.values()
+        nan = math.nan
+        return data_frame(
+            {
+                "parameter": list(self.parameters),
+                "value": [p.value for p in parameters],
+                "standard_uncertainty": [nan if (u := p.standard_uncertainty) is None else u for p in parameters],
+                "unit": [p.unit for p in parameters],
+            },
+            library,
+        )
+
+    def cov(self, *names: str) -> NDArray[np.float64]:
+        """Return the covariance of these parameters, or of all in ``covariance.names``, shape (p, p), SI.
+
+        Raises
+        ------
+        RecordError
+            The record lacks it.
+        """
+        return self.covariance.block(names) if names else self.covariance.array()
+
+    def apply(self, data: Data, *, again: bool = False, **reading: Unpack[Reading]) -> Recording:
+        """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`."""
+        from imulab.procedures import front
+
+        return front.apply_to(self, data, again, reading)
+
+    def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
+        """Write the record in the form of firmware or another program; see `imulab.export` for targets and options."""
+        from imulab.procedures import front
+
+        return front.export_to(self, target, folder, **options)
+
+    def __repr__(self) -> str:
+        from imulab.procedures import front
+
+        return front.text(self)
+
+    def _repr_html_(self) -> str:
+        from imulab.procedures import front
+
+        return front.html(self)
+
     def __str__(self) -> str:
         lines = [f"{self.procedure} calibration of {self.sensor.get('serial', 'a unit without serial number')}"]
         for name, p in self.parameters.items():
             uncertainty = "" if p.standard_uncertainty is None else f" ± {p.standard_uncertainty:.2g}"
             lines.append(f"  {name} = {p.value:.9g}{uncertainty} {p.unit}")
         return "\n".join(lines)
-
-
-def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
-    """Return a record from the bytes of its file, and its ``content_sha256``.
-
-    What its procedure says of its sections is still to be checked: `imulab.procedures.loading.load` does both.
-
-    Raises
-    ------
-    RecordError
-        It is no record, is of a newer version, was altered, or lacks something.
-    """
-    if data.startswith(BLOB_MAGIC):
-        raise RecordError(
-            f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
-            "was made from (show, apply and array fuse take blobs)"
-        )
-    try:
-        content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
-    except (ValueError, RecursionError) as error:
-        if type(error) is ValueError and "int_max_str_digits" in str(error):
-            raise RecordError(
-                f"{name}: not a calibration record: it holds a whole number of thousands of digits"
-            ) from None
-        reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
-        if not data.lstrip().startswith(b"{"):
-            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
-        raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')
-    version = content.get("version")
-    if type(version) is not int or version < 1:
-        raise RecordError(f"{name}: expected a version number from 1, found {version!r}")
-    if version > SCHEMA_VERSION:
-        raise RecordError(
-            f"{name}: record version {version} is newer than version {SCHEMA_VERSION}, "
-            f"which imulab {VERSION} reads: update imulab"
-        )
-    stated = content.pop("content_sha256", None)
-    if stated is None:
-        raise RecordError(f"{name}: the record has no content_sha256: it was altered after it was written")
-    try:
-        found = content_sha256(content)
-    except ValueError as error:  # a number beyond the range of a double, or text that is no Unicode
-        raise RecordError(f"{name}: the record was altered after it was written ({error})") from None
-    if stated != found:
-        raise RecordError(f"{name}: the record was altered after it was written (its content_sha256 does not match)")
-    return _validated(content, name), found
-
-
-@cache
-def _adapter() -> Any:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(Calibration)
-
-
-def _validated(content: dict[str, Any], name: str) -> Calibration:
-    from pydantic import ValidationError
-
-    known = {f.name for f in fields(Calibration)} - {"sections"}
-    sections = {key: value for key, value in content.items() if key not in known and key != "format"}
-    for key in (
-        "procedure",
-        "sensor",
-        "created",
-        "software",
-        "sources",
-        "model",
-        "parameters",
-        "covariance",
-        "fit",
-    ):
-        if key not in content:
-            raise RecordError(f"{name}: the record lacks {key!r}")
-    try:
-        record: Calibration = _adapter().validate_python(
-            {key: value for key, value in content.items() if key in known} | {"sections": sections}
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise RecordError(f"{name}: {where}: {first['msg']}, found {_short(first['input'])}") from None
-    if place := first_hidden(content):
-        raise RecordError(f"{name}: {place} holds a control or bidirectional character; expected plain text")
-    if not _CREATED.fullmatch(record.created):
-        raise RecordError(f"{name}: created: expected a time such as 2026-11-20T12:00:00Z, found {record.created!r}")
-    size = len(record.covariance.names)
-    if len(record.covariance.matrix) != size or any(len(row) != size for row in record.covariance.matrix):
-        raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
-    try:
-        _check_numbers(record)
-        check_sizes(content)
-    except RecordError as error:
-        raise RecordError(f"{name}: {error}") from None
-    return replace(record, warnings=as_judged(record.warnings, record.verdict))
-
-
-def _check_numbers(record: Calibration) -> None:
-    """Check that uncertainties are none below zero, and that the covariance is one of known parameters."""
-    for key, p in record.parameters.items():
-        for value in (p.standard_uncertainty, p.standard_uncertainty_given_order):
-            if value is not None and value < 0:
-                raise RecordError(f"parameters.{key}: a standard uncertainty of {value:g}; expected 0 or more")
-    names, matrix = record.covariance.names, record.covariance.array()
-    unknown = [key for key in names if key not in record.parameters]
-    if unknown or len(set(names)) < len(names):
-        found = unknown[0] if unknown else next(key for key in names if names.count(key) > 1)
-        raise RecordError(f"covariance.names: expected each a parameter, once, found {found!r}")
-    spread = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    if (np.diag(matrix) < 0).any() or (np.abs(matrix) > _ROUNDING * np.outer(spread, spread)).any():
-        raise RecordError("covariance.matrix: a correlation beyond 1, or a variance below 0")
-    if (np.abs(matrix - matrix.T) > (_ROUNDING - 1) * np.outer(spread, spread)).any():
-        raise RecordError("covariance.matrix: expected a symmetric matrix")
 
 
 def plain_values(value: Any, where: str) -> Any:
@@ -346,19 +320,3 @@ def plain_values(value: Any, where: str) -> Any:
             return list(value)
         return [plain_values(item, f"{where}[{index}]") for index, item in enumerate(value)]
     return value
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) != len(pairs):
-        raise ValueError("a key appears twice")
-    return content
-
-
-def _refuse_constant(text: str) -> None:
-    raise ValueError(f"{text} is not a finite number")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -124,7 +124,7 @@ def _draw(figures: Sequence[Figure | None]) -> Any:
     from markupsafe import Markup
 
     plots = [None if f is None else {**_screen(f), "narrow": narrow(f)} for f in figures]
-    return Markup("const plots = {};\n").format(_json_for_script(plots)) + Markup(_file("draw.js"))
+    return Markup("const plots = {};\n").format(json_for_script(plots)) + Markup(_file("draw.js"))
 
 
 def _screen(figure: Figure) -> dict[str, Any]:
@@ -145,7 +145,7 @@ def _plotly() -> Any:
     return Markup(_file("vendor", "plotly-cartesian.min.js").replace("</script", "<\\/script"))
 
 
-def _json_for_script(value: Any) -> Any:
+def json_for_script(value: Any) -> Any:
     """Return JSON that cannot end the script element it stands in, and whose texts Plotly makes no links of."""
     from markupsafe import Markup
 

@@ -17,12 +17,13 @@ from imulab.procedures.centrifuge.parameters import Estimates, estimate
 from imulab.procedures.centrifuge.record import make_record
 from imulab.procedures.centrifuge.run import LoadedRun, reduce_run
 from imulab.procedures.centrifuge.static import StaticRun, reduce_static
+from imulab.procedures.result import Result
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
 
 
-@dataclass(frozen=True)
-class CentrifugeFit:
+@dataclass(frozen=True, repr=False)
+class CentrifugeFit(Result):
     """A reduced centrifuge test: the record, and the runs, levels and estimates behind it."""
 
     calibration: Calibration

@@ -21,6 +21,7 @@ from imulab.procedures.gyro_array.clocks import on_one_clock
 from imulab.procedures.gyro_array.latency import align_in_time, latency_notes
 from imulab.procedures.gyro_array.model import Elements, feedback_notes, find_elements, fixed_weights
 from imulab.procedures.gyro_array.rest import find_rest
+from imulab.procedures.result import Result
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import parse_unit, to_si
@@ -33,8 +34,8 @@ _CLIPPED_RUN = 3
 _SHARED = 0.5
 
 
-@dataclass(frozen=True)
-class ArrayFit:
+@dataclass(frozen=True, repr=False)
+class ArrayFit(Result):
     """A calibration of an array, with the Allan curves behind it, axis by axis."""
 
     calibration: Calibration

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from imulab.procedures.procedure import Row
 from imulab.procedures.tumble.record import zero_outputs
 from imulab.procedures.tumble.sections import Trials, fit_of, model_of
 from imulab.records.calibration import Calibration
@@ -17,16 +18,12 @@ _OFF_NOMINAL = "ppm off nominal"
 
 
 @dataclass(frozen=True)
-class EngineeringRow:
-    """One parameter as people read it: bias in mg, misalignment in mrad, k2 in µg/g² ...
+class EngineeringRow(Row):
+    """One parameter as people read it.
 
     `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
     """
 
-    name: str
-    value: float
-    standard_uncertainty: float | None
-    unit: str
     given_order: float | None = None
 
     def text(self) -> tuple[str, str]:

@@ -30,6 +30,7 @@ ENTRY = Procedure(
             triad="gyro",
         ),
     ),
+    rows=deferred(f"{_HERE}.engineering:engineering_rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
     beyond=deferred(f"{_HERE}.apply:beyond_test"),
     beyond_message=deferred(f"{_HERE}.apply:beyond_message"),

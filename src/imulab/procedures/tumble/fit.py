@@ -15,6 +15,7 @@ from imulab.estimation.least_squares import (
     observability,
 )
 from imulab.gravity import Gravity, local_gravity
+from imulab.procedures.result import Result
 from imulab.procedures.tumble.advice import helpful_attitudes
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.axes import check_axes
@@ -38,8 +39,8 @@ from imulab.records.calibration import Calibration
 from imulab.units import parse_unit, to_si
 
 
-@dataclass(frozen=True)
-class TumbleFit:
+@dataclass(frozen=True, repr=False)
+class TumbleFit(Result):
     """Result of a tumble fit.
 
     Attributes
@@ -61,9 +62,6 @@ class TumbleFit:
     orders: tuple[OrderRow, ...]
     residuals: Array
     down_weights: Array
-
-    def __repr__(self) -> str:
-        return f"TumbleFit({len(self.residuals)} attitudes, {self.calibration.fit['method']})"
 
 
 def fit_tumble(

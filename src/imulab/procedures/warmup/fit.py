@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
+from imulab.procedures.result import Result
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS
 from imulab.procedures.warmup.curves import Curves, make_curves
 from imulab.procedures.warmup.cycles import Cycle, common_axes, find_power_cycle, with_axes
@@ -34,8 +35,8 @@ SETTLING_SHARE = 0.05
 """A curve counts as settled below this share of the largest |Z| of its kind."""
 
 
-@dataclass(frozen=True)
-class WarmupFit:
+@dataclass(frozen=True, repr=False)
+class WarmupFit(Result):
     """Result of a warm-up fit.
 
     Attributes
@@ -57,9 +58,6 @@ class WarmupFit:
     models: tuple[Judged, ...]
     repeatability: Repeatability
     curves: Curves
-
-    def __repr__(self) -> str:
-        return f"WarmupFit({self.table.model}, {len(self.curves.cycles)} cycles)"
 
 
 def fit_warmup(

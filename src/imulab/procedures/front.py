@@ -1,0 +1,144 @@
+"""What recordings and records show of themselves, and what is done with them next.
+
+`Recording` and `Calibration` lie below all procedures; their methods import this one module when they are called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import OptionError, RecordError, listed
+from imulab.exporters import ExportOptions
+from imulab.exporters import export as export_records
+from imulab.procedures.apply import apply
+from imulab.procedures.inputs import Reading, as_recording
+from imulab.procedures.loading import load as load
+from imulab.procedures.procedure import Row
+from imulab.procedures.reports import exhibits_of, parameter_rows
+from imulab.procedures.reports import write_report as write_report
+from imulab.recording import Recording
+from imulab.records.calibration import Calibration
+from imulab.report.channels import channel_figures
+from imulab.report.elements import Figure, format_uncertain
+from imulab.report.plots import Plot, Plots
+from imulab.verdict import SENTENCES
+
+LINES = 12
+"""Of a result, as Python shows it."""
+_WIDTH = 150
+_COLOURS = {"good": "#1f6f8b", "look": "#b58a1b", "bad": "#c8553d"}
+_STYLE = "border-left: 4px solid {}; padding: 2px 10px; margin: 6px 0"
+
+
+def text(record: Calibration) -> str:
+    """Return a record in a few lines: what it is of, its verdict, its headline, its parameters."""
+    verdict = record.verdict
+    reasons = f": {_short(verdict.reasons[0])}" if verdict.reasons else ""
+    more = f" (and {len(verdict.reasons) - 1} more)" if len(verdict.reasons) > 1 else ""
+    lines = [_title(record), f"{verdict.state}: {SENTENCES[verdict.state]}{reasons}{more}"]
+    lines += [headline] if (headline := _headline(record)) else []
+    groups: dict[tuple[str, str], list[str]] = {}
+    for row in parameter_rows(record):
+        stem, _, last = row.name.rpartition("_")
+        stem, last = (stem, f"{last} ") if stem and (len(last) < 3 or last.isdecimal()) else (row.name, "")
+        groups.setdefault((stem, row.unit), []).append(
+            last + " ± ".join(_number(row)[: 1 if row.standard_uncertainty is None else 2])
+        )
+    width = max((len(stem) for stem, _ in groups), default=0)
+    rows = [_short(f"  {stem:{width}}  {', '.join(texts)} {unit}") for (stem, unit), texts in groups.items()]
+    room = LINES - len(lines)
+    if len(rows) > room:
+        rows = [*rows[: room - 1], f"  ... and {len(rows) - room + 1} more: to_frame() has all parameters"]
+    return "\n".join(lines + rows)
+
+
+def html(record: Calibration) -> str:
+    """Return a record as HTML: what it is of, its verdict, its headline, its parameters."""
+    verdict = record.verdict
+    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
+    rows = [[row.name, *_number(row), row.unit] for row in parameter_rows(record)]
+    return (
+        f"<div><strong>{escape(_title(record))}</strong>"
+        f'<div style="{_STYLE.format(_COLOURS[verdict.state])}">{escape(verdict.state)}: '
+        f"{escape(SENTENCES[verdict.state])}<ul>{reasons}</ul></div>"
+        f"<p>{escape(_headline(record))}</p>"
+        f"{_table(['parameter', 'value', 'standard uncertainty', 'unit'], rows)}</div>"
+    )
+
+
+def plots(record: Calibration, name: str | None) -> Plots | Plot:
+    """Return the figures of a record's report, or the one of this name."""
+    figures = [item for item in exhibits_of(record).items if isinstance(item, Figure)]
+    found = Plots(figures, _title(record))
+    return found if name is None else found[name]
+
+
+def apply_to(record: Calibration, data: Any, again: bool, reading: Mapping[str, Any] | Reading) -> Recording:
+    """Return data corrected by a record."""
+    return apply(record, as_recording(data, reading, Calibration.apply), again=again)
+
+
+def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:
+    """Write a record in the form of another program."""
+    known = [each.name for each in fields(ExportOptions)]
+    for name in options:
+        if name not in known:
+            raise OptionError(f"export: unknown option {name!r}; known: {listed(known, name)}")
+    return export_records(target, [record], folder, ExportOptions(**options))
+
+
+def recording_html(recording: Recording) -> str:
+    """Return a recording as HTML: its length, and the range of each column."""
+    rows = []
+    for name, values in recording.columns.items():
+        finite = values[np.isfinite(values)]
+        ends = (finite.min(), finite.mean(), finite.max()) if finite.size else ()
+        missing = str(len(values) - finite.size) if finite.size < len(values) else ""
+        rows.append([name, recording.units[name], *([f"{end:.6g}" for end in ends] or ["–"] * 3), missing])
+    time = recording.time
+    length = "" if time is None or len(time) < 2 else f" over {time[-1] - time[0]:.6g} s"
+    head = "".join(f"<br>{escape(key)}: {escape(value)}" for key, value in recording.metadata.items())
+    return (
+        f"<div><strong>{escape(recording.name)}</strong>: {len(recording)} samples{length}{head}"
+        f"{_table(['column', 'unit', 'min', 'mean', 'max', 'missing'], rows)}</div>"
+    )
+
+
+def recording_plots(recording: Recording, name: str | None) -> Plots | Plot:
+    """Return a recording's channels over time, a figure for each sensor, or the one of this name."""
+    found = Plots(channel_figures(recording), recording.name)
+    return found if name is None else found[name]
+
+
+def _title(record: Calibration) -> str:
+    serial = record.sensor.get("serial", "a unit without serial number")
+    return f"{record.procedure} calibration of {serial}, {record.created}"
+
+
+def _headline(record: Calibration) -> str:
+    """Return the result in a sentence; nothing of a record that lacks what it is made from."""
+    try:
+        return exhibits_of(record).headline
+    except RecordError:
+        return ""
+
+
+def _number(row: Row) -> tuple[str, str]:
+    value, uncertainty = format_uncertain(row.value, row.standard_uncertainty)
+    return value, uncertainty
+
+
+def _short(line: str) -> str:
+    return line if len(line) <= _WIDTH else line[: _WIDTH - 4] + " ..."
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{escape(title)}</th>" for title in titles)
+    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -1,0 +1,204 @@
+"""What a fit is given, as people have it: a file, a recording, a data frame, or arrays."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any, TypeAlias, TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imulab.errors import DataError, OptionError, listed, quoted
+from imulab.frames import Frame, columns_of_arrays, is_frame
+from imulab.quantities import chosen
+from imulab.readers import Layout, read
+from imulab.readers.selection import Selection, of_element, windowed
+from imulab.recording import Recording
+from imulab.records.calibration import Calibration
+
+Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mapping[str, ArrayLike]
+"""A file, a recording, a data frame of pandas or polars, an array of samples, or arrays by name."""
+Window: TypeAlias = str | tuple[float | None, float | None]
+
+
+class Reading(TypedDict, total=False):
+    """How data are to be understood: `time` to `units` of arrays and data frames, `layout` to `instance` of files.
+
+    Attributes
+    ----------
+    rate
+        Sampling rate, Hz, of arrays without `time`.
+    time
+        Times of an array, s, shape (n,).
+    unit
+        Unit of the sensors whose quantity it measures.
+    units
+        Units by sensor or column.
+    layout, topic, instance
+        As for `imulab.read`.
+    window
+        First and last time, s, as ``(10, 60)`` or ``"10:60"``.
+    element
+        One IMU of several, from 1.
+    """
+
+    rate: float | None
+    time: ArrayLike | None
+    unit: str | None
+    units: Mapping[str, str] | None
+    layout: str | os.PathLike[str] | Layout | None
+    topic: str | None
+    instance: int | None
+    window: Window | None
+    element: int | None
+
+
+_OF_ARRAYS = ("rate", "time", "unit", "units")
+_OF_FILES = ("layout", "topic", "instance")
+_EXPECTED = "a file name, a Recording, a data frame of pandas or polars, or arrays"
+
+
+def as_recording(
+    data: Data,
+    reading: Mapping[str, Any] | Reading,
+    function: Callable[..., Any],
+    columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None = None,
+    name: str = "data",
+) -> Recording:
+    """Return data as a recording.
+
+    Parameters
+    ----------
+    data
+        As people have them.
+    reading
+        How they are to be understood.
+    function
+        What was called with them, for messages.
+    columns
+        Array to its columns by name, where `data` is an array without names; a triad of accelerometers if not given.
+    name
+        The argument that they were given as.
+
+    Raises
+    ------
+    OptionError
+        A keyword that the function does not know, or that does not go with such data.
+    DataError
+        The data are something else; and what reading them raises.
+    """
+    called = function.__name__
+    check_keywords(reading, function)
+    given = {key: value for key, value in reading.items() if value is not None}
+    part = _part(given, called)
+    if isinstance(data, str | os.PathLike):
+        _refuse(given, _OF_ARRAYS, called, "a file says itself, by its titles or a layout")
+        return read(os.fspath(data), **_of(given, _OF_FILES), **part)
+    _refuse(given, _OF_FILES, called, "only files have that")
+    if isinstance(data, Recording):
+        _refuse(given, _OF_ARRAYS, called, "a recording has its own")
+        return _cut(data, **part)
+    arrays = _of(given, ("rate", "unit", "units"))
+    if is_frame(data):
+        _refuse(given, ("time",), called, "a data frame has it as the column 'time'")
+        return _cut(Recording.from_frame(data, **arrays), **part)  # type: ignore[arg-type]
+    named: Mapping[str, ArrayLike]
+    if isinstance(data, Mapping):
+        named = data
+    else:
+        samples = _array(data, called, name)
+        named = {"accel": samples} if columns is None else columns(samples)
+    whole = {"rate": None, "unit": None, "units": None, **arrays, "name": "arrays"}
+    return _cut(Recording(*columns_of_arrays({**_of(given, ("time",)), **named}, **whole), name="arrays"), **part)
+
+
+def as_record(record: Calibration | str | os.PathLike[str], called: str) -> Calibration:
+    """Return a record, read where its file is named.
+
+    Raises
+    ------
+    OptionError
+        It is neither.
+    RecordError
+        The file holds none.
+    """
+    if isinstance(record, Calibration):
+        return record
+    if isinstance(record, str | os.PathLike):
+        return Calibration.load(record)
+    raise OptionError(f"{called}: expected a record or the name of its file, found {described(record)}")
+
+
+def check_keywords(given: Iterable[str], function: Callable[..., Any]) -> None:
+    """Refuse keywords that a function does not have.
+
+    Raises
+    ------
+    OptionError
+        There is one; the message says which was meant.
+    """
+    own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
+    known = [*own, *Reading.__annotations__]
+    for key in given:
+        if key not in known:
+            raise OptionError(f"{function.__name__}: unknown option {key!r}; known: {listed(known, key)}")
+
+
+def described(found: object) -> str:
+    """Return what was found in place of something else, for a message."""
+    if isinstance(found, Calibration):
+        return f"a {found.procedure} record (arguments in the wrong order?)"
+    if isinstance(found, Recording):
+        return f"the recording {found.name} (arguments in the wrong order?)"
+    return f"{type(found).__name__} {quoted(found)}"
+
+
+def _array(data: object, called: str, name: str) -> NDArray[Any]:
+    """Return samples without a name as an array of numbers."""
+    if isinstance(data, np.ndarray | list | tuple) or hasattr(data, "__array__"):
+        try:
+            found = np.asarray(data)
+        except ValueError:
+            found = np.empty(0, dtype=object)
+        if found.dtype.kind in "iufb" and found.ndim > 1:
+            return found
+        shape = f"an array of shape {found.shape}" if found.dtype.kind in "iufb" else "a list of something else"
+        raise DataError(f"{called}: {name}: expected an array of numbers, a row for each sample, found {shape}")
+    raise DataError(f"{called}: {name}: expected {_EXPECTED}, found {described(data)}")
+
+
+def _part(given: Mapping[str, Any], called: str) -> dict[str, Any]:
+    """Return window and element as `read` takes them."""
+    window, element = given.get("window"), given.get("element")
+    if isinstance(window, str):
+        window = chosen(None, None, window, label=f"{called}: {{}}")["window"]
+    if window is not None and not (isinstance(window, tuple | list) and len(window) == 2):
+        raise OptionError(f"{called}: window {quoted(window)}: expected (FROM, TO) in s, such as (10, 60) or '10:60'")
+    for key in ("element", "instance"):
+        if (value := given.get(key)) is not None and (isinstance(value, bool) or not isinstance(value, int)):
+            raise OptionError(f"{called}: {key} {quoted(value)}: expected a whole number")
+    return {"window": None if window is None else tuple(window), "element": element}
+
+
+def _cut(recording: Recording, window: tuple[float | None, float | None] | None, element: int | None) -> Recording:
+    """Return one IMU of several, and what lies within a window of time."""
+    Selection(window=window, element=element)
+    name = recording.name
+    parts = list(windowed(of_element(iter([recording]), element, name), window, name))
+    if len(parts) == 1:
+        return parts[0]
+    joined = {key: np.concatenate([part.columns[key] for part in parts]) for key in parts[0].columns}
+    return replace(parts[0], columns=joined)
+
+
+def _refuse(given: Mapping[str, Any], keys: Iterable[str], called: str, reason: str) -> None:
+    for key in keys:
+        if key in given:
+            raise OptionError(f"{called}: {key} does not go with such data: {reason}")
+
+
+def _of(given: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    return {key: given[key] for key in keys if key in given}

@@ -1,0 +1,55 @@
+"""What every fit returns, whatever the procedure: its record, and what a person does with it next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from imulab.records.calibration import Calibration
+
+if TYPE_CHECKING:
+    from typing import Unpack
+
+    from imulab.procedures.inputs import Data, Reading
+    from imulab.recording import Array, Recording
+    from imulab.report.plots import Plot, Plots
+
+
+class Result:
+    """A fit: its ``calibration`` is the record, and every method is the record's own."""
+
+    calibration: Calibration
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} with a {self.calibration!r}"
+
+    def _repr_html_(self) -> str:
+        return self.calibration._repr_html_()
+
+    def save(self, path: str | Path) -> None:
+        """Write the record; errors as for `Calibration.save`."""
+        self.calibration.save(path)
+
+    def report(self, path: str | Path) -> None:
+        """Write the report; errors as for `Calibration.report`."""
+        self.calibration.report(path)
+
+    def plot(self, name: str | None = None) -> Plots | Plot:
+        """Return the report's figures, or one of them; see `Calibration.plot`."""
+        return self.calibration.plot(name)
+
+    def to_frame(self, library: str | None = None) -> Any:
+        """Return the parameters as a data frame; see `Calibration.to_frame`."""
+        return self.calibration.to_frame(library)
+
+    def cov(self, *names: str) -> Array:
+        """Return the covariance; see `Calibration.cov`."""
+        return self.calibration.cov(*names)
+
+    def apply(self, data: Data, *, again: bool = False, **reading: Unpack[Reading]) -> Recording:
+        """Return data corrected by the record; see `Calibration.apply`."""
+        return self.calibration.apply(data, again=again, **reading)
+
+    def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
+        """Write the record in the form of firmware or another program; see `Calibration.export`."""
+        return self.calibration.export(target, folder, **options)

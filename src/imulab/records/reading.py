@@ -1,0 +1,152 @@
+"""Records from the bytes of their files: checked for damage, for what they lack, and for what cannot be."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import fields, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from imulab._version import VERSION
+from imulab.errors import RecordError
+from imulab.printable import first_hidden
+from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration
+from imulab.records.json_text import content_sha256
+from imulab.records.sections import check_sizes
+from imulab.verdict import as_judged
+
+_CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
+_ROUNDING = 1.0 + 1e-6
+
+
+def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
+    """Return a record from the bytes of its file, and its ``content_sha256``.
+
+    What its procedure says of its sections is still to be checked: `imulab.procedures.loading.load` does both.
+
+    Raises
+    ------
+    RecordError
+        It is no record, is of a newer version, was altered, or lacks something.
+    """
+    if data.startswith(BLOB_MAGIC):
+        raise RecordError(
+            f"{name}: a blob, which holds a unit's numbers without uncertainties or history: expected the record it "
+            "was made from (show, apply and array fuse take blobs)"
+        )
+    try:
+        content = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant, object_pairs_hook=_unique)
+    except (ValueError, RecursionError) as error:
+        if type(error) is ValueError and "int_max_str_digits" in str(error):
+            raise RecordError(
+                f"{name}: not a calibration record: it holds a whole number of thousands of digits"
+            ) from None
+        reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
+        if not data.lstrip().startswith(b"{"):
+            raise RecordError(f"{name}: not a calibration record: it is not JSON (a recording?)") from None
+        raise RecordError(f"{name}: not a calibration record: {reason} ({error})") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise RecordError(f'{name}: not a calibration record: expected the key "format": "{FORMAT}"')
+    version = content.get("version")
+    if type(version) is not int or version < 1:
+        raise RecordError(f"{name}: expected a version number from 1, found {version!r}")
+    if version > SCHEMA_VERSION:
+        raise RecordError(
+            f"{name}: record version {version} is newer than version {SCHEMA_VERSION}, "
+            f"which imulab {VERSION} reads: update imulab"
+        )
+    stated = content.pop("content_sha256", None)
+    if stated is None:
+        raise RecordError(f"{name}: the record has no content_sha256: it was altered after it was written")
+    try:
+        found = content_sha256(content)
+    except ValueError as error:  # a number beyond the range of a double, or text that is no Unicode
+        raise RecordError(f"{name}: the record was altered after it was written ({error})") from None
+    if stated != found:
+        raise RecordError(f"{name}: the record was altered after it was written (its content_sha256 does not match)")
+    return _validated(content, name), found
+
+
+@cache
+def _adapter() -> Any:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Calibration)
+
+
+def _validated(content: dict[str, Any], name: str) -> Calibration:
+    from pydantic import ValidationError
+
+    known = {f.name for f in fields(Calibration)} - {"sections"}
+    sections = {key: value for key, value in content.items() if key not in known and key != "format"}
+    for key in (
+        "procedure",
+        "sensor",
+        "created",
+        "software",
+        "sources",
+        "model",
+        "parameters",
+        "covariance",
+        "fit",
+    ):
+        if key not in content:
+            raise RecordError(f"{name}: the record lacks {key!r}")
+    try:
+        record: Calibration = _adapter().validate_python(
+            {key: value for key, value in content.items() if key in known} | {"sections": sections}
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise RecordError(f"{name}: {where}: {first['msg']}, found {_short(first['input'])}") from None
+    if place := first_hidden(content):
+        raise RecordError(f"{name}: {place} holds a control or bidirectional character; expected plain text")
+    if not _CREATED.fullmatch(record.created):
+        raise RecordError(f"{name}: created: expected a time such as 2026-11-20T12:00:00Z, found {record.created!r}")
+    size = len(record.covariance.names)
+    if len(record.covariance.matrix) != size or any(len(row) != size for row in record.covariance.matrix):
+        raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
+    try:
+        _check_numbers(record)
+        check_sizes(content)
+    except RecordError as error:
+        raise RecordError(f"{name}: {error}") from None
+    return replace(record, warnings=as_judged(record.warnings, record.verdict))
+
+
+def _check_numbers(record: Calibration) -> None:
+    """Check that uncertainties are none below zero, and that the covariance is one of known parameters."""
+    for key, p in record.parameters.items():
+        for value in (p.standard_uncertainty, p.standard_uncertainty_given_order):
+            if value is not None and value < 0:
+                raise RecordError(f"parameters.{key}: a standard uncertainty of {value:g}; expected 0 or more")
+    names, matrix = record.covariance.names, record.covariance.array()
+    unknown = [key for key in names if key not in record.parameters]
+    if unknown or len(set(names)) < len(names):
+        found = unknown[0] if unknown else next(key for key in names if names.count(key) > 1)
+        raise RecordError(f"covariance.names: expected each a parameter, once, found {found!r}")
+    spread = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    if (np.diag(matrix) < 0).any() or (np.abs(matrix) > _ROUNDING * np.outer(spread, spread)).any():
+        raise RecordError("covariance.matrix: a correlation beyond 1, or a variance below 0")
+    if (np.abs(matrix - matrix.T) > (_ROUNDING - 1) * np.outer(spread, spread)).any():
+        raise RecordError("covariance.matrix: expected a symmetric matrix")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        raise ValueError("a key appears twice")
+    return content
+
+
+def _refuse_constant(text: str) -> None:
+    raise ValueError(f"{text} is not a finite number")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

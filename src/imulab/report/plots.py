@@ -1,0 +1,243 @@
+"""The report's own figures as objects that show themselves in notebooks and are saved as pages or pictures."""
+
+from __future__ import annotations
+
+import gzip
+import sys
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any, overload
+from uuid import uuid4
+
+from imulab.atomic_write import replacing, write_text
+from imulab.errors import OptionError, listed
+from imulab.report import json_for_script, render_page
+from imulab.report.elements import INK, Exhibits, Figure
+
+PICTURES = ("png", "svg", "pdf")
+_WIDTH = 900
+_LIBRARY = ("vendor", "plotly-cartesian.min.js")
+_BASE = {
+    "font": {"family": 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif', "size": 13, "color": INK},
+    "margin": {"l": 70, "r": 20, "t": 60, "b": 55},
+    "hovermode": "closest",
+    "paper_bgcolor": "#ffffff",
+    "plot_bgcolor": "#ffffff",
+}
+
+
+_TITLE = {"x": 0, "xanchor": "left", "yref": "container", "y": 0.98, "pad": {"l": 10}}
+
+
+@dataclass(frozen=True, repr=False)
+class Plot:
+    """One figure of a report: shows itself as the last line of a notebook's cell.
+
+    Attributes
+    ----------
+    figure
+        What is drawn.
+    subject
+        What it is a figure of, for the page that it is saved as.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> record = il.fit_tumble(il.find_attitudes(il.simulate_tumble(gravity=9.81)), order=1, gravity=9.81).calibration
+    >>> record.plot("residual").save("residuals.html")
+    """
+
+    figure: Figure
+    subject: str = ""
+
+    def __repr__(self) -> str:
+        return f"Plot({self.name!r}: shows itself in a notebook; .save('x.html') writes a page)"
+
+    @property
+    def name(self) -> str:
+        """Title of the figure."""
+        return self.figure.title
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figure as Plotly's own JSON values: ``data`` and ``layout``."""
+        own = self.figure.layout
+        title = {
+            "text": escape(self.name, quote=False),
+            "x": 0,
+            "xanchor": "left",
+            "yref": "container",
+            "y": 0.98,
+            "pad": {"l": 10},
+        }
+        margin = {**_BASE["margin"], **own.get("margin", {})}  # type: ignore[dict-item]
+        margin["t"] = max(int(margin["t"]), 60)
+        layout = {**_BASE, **own, "title": title, "margin": margin}
+        return {"data": self.figure.traces, "layout": {**layout, "height": self.figure.height + 40}}
+
+    def save(self, path: str | Path) -> None:
+        """Write the figure: ``.html`` as a page that needs no network, ``.png``, ``.svg`` and ``.pdf`` as a picture.
+
+        Raises
+        ------
+        OptionError
+            Another ending, the file cannot be written, or what draws pictures is not installed.
+        """
+        kind = _kind(path)
+        if kind == "html":
+            _write_page(path, self.subject or self.name, [self])
+            return
+        picture = _picture(self, kind, path)
+        with replacing(path) as stream:
+            stream.write(picture)
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+        """Return the figure for notebooks: JSON for those that know Plotly, HTML for the others."""
+        plot = self.to_dict()
+        return {
+            "application/vnd.plotly.v1+json": {**plot, "config": {"displaylogo": False}},
+            "text/html": _html(self, plot),
+            "text/plain": repr(self),
+        }
+
+
+class Plots(Sequence[Plot]):
+    """The figures of a report, by number or name: shows all of them in a notebook."""
+
+    def __init__(self, figures: Iterable[Figure], subject: str) -> None:
+        self.subject = subject
+        self._plots = tuple(Plot(figure, subject) for figure in figures)
+
+    @overload
+    def __getitem__(self, which: int | str) -> Plot: ...
+    @overload
+    def __getitem__(self, which: slice) -> tuple[Plot, ...]: ...
+    def __getitem__(self, which: int | str | slice) -> Plot | tuple[Plot, ...]:
+        """Return a figure by its number, or by its title or words of it."""
+        if not isinstance(which, str):
+            return self._plots[which]
+        asked = which.lower()
+        found = [plot for plot in self._plots if all(word in plot.name.lower() for word in asked.split())]
+        first = [plot for plot in found if plot.name.lower().startswith(asked)]
+        if len(first or found) == 1:
+            return (first or found)[0]
+        names = [repr(plot.name) for plot in found or self._plots]
+        problem = f"{len(found)} figures of that name" if found else "no such figure"
+        raise OptionError(f"plot {which!r}: {problem}; expected one of {listed(names, which)}")
+
+    def __len__(self) -> int:
+        return len(self._plots)
+
+    def __repr__(self) -> str:
+        shown = [f"  {number}  {plot.name}" for number, plot in enumerate(self._plots[:9])]
+        more = [f"  ... and {len(self) - 9} more"] if len(self) > 9 else []
+        return "\n".join([f"{len(self)} figures of {self.subject}", *shown, *more])
+
+    def save(self, path: str | Path) -> None:
+        """Write all figures as one page, ``.html``; errors as for `Plot.save`."""
+        if _kind(path) != "html":
+            raise OptionError(
+                f"{path}: a picture holds one figure: expected one of them, as in plots[0].save({str(path)!r})"
+            )
+        _write_page(path, self.subject, self._plots)
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
+
+        for plot in self._plots:
+            display(plot)
+
+
+def _kind(path: str | Path) -> str:
+    """Return the ending of a name that a figure can be saved under."""
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("html", *PICTURES):
+        raise OptionError(f"{path}: expected a name that ends in .html, .png, .svg or .pdf")
+    return kind
+
+
+def _write_page(path: str | Path, subject: str, plots: Sequence[Plot]) -> None:
+    write_text(path, render_page("imulab", subject, Exhibits("", [], [plot.figure for plot in plots])))
+
+
+def _picture(plot: Plot, kind: str, path: str | Path) -> bytes:
+    """Return a figure as a picture, drawn by the machine's own Chromium."""
+    try:
+        import kaleido
+        from kaleido.errors import ChromeNotFoundError
+    except ImportError:
+        needed = "kaleido: pip install 'imulab[plots]'"
+        raise OptionError(f"{path}: a picture needs {needed}; .html needs nothing") from None
+    figure = plot.to_dict()
+    height, scale = figure["layout"]["height"], 2 if kind == "png" else 1
+    options = {"format": kind, "width": _WIDTH, "height": height, "scale": scale}
+    with as_file(files("imulab.report").joinpath(*_LIBRARY)) as library:
+        try:
+            drawn = kaleido.calc_fig_sync(figure, opts=options, kopts={"plotlyjs": library.as_uri(), "mathjax": False})
+        except ChromeNotFoundError:
+            needed = "Chromium or Chrome on this machine"
+            raise OptionError(f"{path}: a picture needs {needed}; .html needs nothing") from None
+        except Exception as error:  # whatever goes wrong in another program
+            raise OptionError(f"{path}: Chromium did not draw the picture: {error}") from None
+    return bytes(drawn)
+
+
+def _html(plot: Plot, drawn: dict[str, Any]) -> str:
+    """Return a figure as HTML that draws itself without a network."""
+    place, figure = f"imulab-{uuid4().hex[:12]}", plot.figure
+    said = "".join(f"<p>{escape(text)}</p>" for text in (figure.message, figure.caption) if text)
+    packed = f'"{_packed()}"' if _FIRST.carries() else "null"
+    script = files("imulab.report").joinpath("notebook.js").read_text(encoding="utf-8")
+    height = drawn["layout"]["height"]
+    return (
+        f'<div style="background: #fff; color: {INK}; font-family: system-ui, sans-serif; max-width: 1000px">'
+        f'<div id="{place}" style="height: {height}px"></div>{said}</div>\n'
+        f'<script>{script}("{place}", {json_for_script(drawn)}, {packed})</script>'
+    )
+
+
+@cache
+def _packed() -> str:
+    """Return the library that draws, packed: a third of its size."""
+    text = files("imulab.report").joinpath(*_LIBRARY).read_bytes()
+    return b64encode(gzip.compress(text, 9, mtime=0)).decode("ascii")
+
+
+class _First:
+    """Which output of a notebook brings the library along: that of the first cell with a figure, each time it runs.
+
+    Where every output is a page of its own, all of them do.
+    """
+
+    def __init__(self) -> None:
+        self.cell: Any = None
+        self.run: Any = None
+
+    def carries(self) -> bool:
+        """Return whether the output that is being made brings it."""
+        if "google.colab" in sys.modules:
+            return True
+        cell, run = _where()
+        if self.run is None or (cell is not None and cell == self.cell and run != self.run):
+            self.cell, self.run = cell, run
+            return True
+        return cell is None and run is None
+
+
+_FIRST = _First()
+
+
+def _where() -> tuple[Any, Any]:
+    """Return the cell that is running, as the notebook calls it, and the number of the run; None outside of one."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if shell is None:
+        return None, None
+    try:
+        parent = shell.kernel.get_parent()
+    except AttributeError:
+        return None, shell.execution_count
+    return parent.get("metadata", {}).get("cellId"), shell.execution_count

@@ -1,0 +1,239 @@
+"""Results that show themselves: text, HTML, figures in notebooks and files, data frames, and what is done next."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pandas
+import polars
+import pytest
+
+import imulab as il
+from imulab.errors import DataError, ImulabError, OptionError, RecordError
+from imulab.procedures.reports import exhibits_of
+from imulab.report import plots as plots_module
+from imulab.report.channels import thinned
+from imulab.report.elements import Figure
+from imulab.report.plots import Plot
+from test_report import browse
+
+G = 9.80665
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return il.simulate_tumble(attitudes=24, order=2, knock=7, seed=4, gravity=G)
+
+
+@pytest.fixture(scope="module")
+def fit(recording):
+    return il.fit_tumble(il.find_attitudes(recording), order=2, gravity=G)
+
+
+def tumble():
+    return il.fit_tumble(il.find_attitudes(il.simulate_tumble(gravity=G)), order=5, gravity=G)
+
+
+def array():
+    return il.calibrate_array(il.simulate_array(experiment="static", duration=60.0))
+
+
+def warmup():
+    temperatures = (-40.0, 0.0, 60.0)
+    cycles = [il.simulate_warmup(at, seed=(1, number)) for number in (1, 2) for at in temperatures]
+    return il.fit_warmup(cycles, temperatures=temperatures, model="exponential")
+
+
+@pytest.mark.parametrize("made", [tumble, array, warmup])
+def test_every_result_shows_itself_in_twelve_lines_and_as_a_table(made):
+    result = made()
+    record = result.calibration
+    for shown in (record, result):
+        lines = repr(shown).splitlines()
+        assert len(lines) <= 12
+        assert max(map(len, lines)) < 250
+    assert record.sensor["serial"] in repr(result)
+    assert record.verdict.state in repr(result)
+    assert exhibits_of(record).headline in repr(record)
+    page = result._repr_html_()
+    assert page.count("<tr>") == len(record.parameters) + 1
+    assert "standard uncertainty" in page
+    figures = [item.title for item in exhibits_of(record).items if isinstance(item, Figure)]
+    assert [plot.name for plot in result.plot()] == figures
+
+
+def test_the_parameters_of_a_text_are_those_of_the_record_in_engineering_units(fit):
+    (line,) = [line for line in repr(fit.calibration).splitlines() if line.split()[0] == "bias"]
+    found = re.fullmatch(r"  bias +x (\S+) ± (\S+), y (\S+) ± (\S+), z (\S+) ± (\S+) mg", line)
+    for number, axis in enumerate("xyz"):
+        bias = fit.calibration.parameters[f"bias_{axis}"]
+        value, uncertainty = float(found[2 * number + 1]), float(found[2 * number + 2])
+        assert value * 9.80665e-3 == pytest.approx(bias.value, abs=0.06 * uncertainty * 9.80665e-3)
+        assert uncertainty * 9.80665e-3 == pytest.approx(bias.standard_uncertainty, rel=0.06)
+
+
+def test_the_text_of_a_verdict_names_the_gravest_reason(fit):
+    assert fit.calibration.verdict.state != "good"
+    second = repr(fit.calibration).splitlines()[1]
+    assert second.startswith(f"{fit.calibration.verdict.state}: ")
+    assert fit.calibration.verdict.reasons[0][:40] in second
+
+
+def test_parameters_and_covariance_as_tables_and_arrays(fit):
+    record = fit.calibration
+    for frame in (record.to_frame(), fit.to_frame("polars")):
+        assert list(frame["parameter"]) == list(record.parameters)
+        assert list(frame["value"]) == [p.value for p in record.parameters.values()]
+        assert next(iter(frame["unit"])) == "m/s^2"
+        np.testing.assert_allclose(frame["standard_uncertainty"].to_numpy() ** 2, np.diag(record.cov()), rtol=1e-9)
+    assert isinstance(record.to_frame(), pandas.DataFrame)
+    assert isinstance(record.to_frame("polars"), polars.DataFrame)
+    pair = record.cov("bias_z", "bias_x")
+    names = record.covariance.names
+    assert pair[0, 1] == record.cov()[names.index("bias_z"), names.index("bias_x")]
+    with pytest.raises(RecordError, match="lacks the covariance of bais_x"):
+        record.cov("bais_x")
+
+
+def test_what_is_done_next_is_what_the_functions_do(fit, recording, tmp_path):
+    fit.save(tmp_path / "r.json")
+    fit.report(tmp_path / "r.html")
+    il.write_report(fit.calibration, tmp_path / "same.html")
+    assert (tmp_path / "r.html").read_bytes() == (tmp_path / "same.html").read_bytes()
+    again = il.Calibration.load(tmp_path / "r.json")
+    expected = il.apply(again, recording)
+    frame = fit.apply(recording.to_frame("polars"))
+    arrays = fit.apply({"accel": recording.triad("accel")}, unit="m/s^2")
+    for made in (fit.apply(recording), frame, arrays):
+        np.testing.assert_array_equal(made.triad("accel"), expected.triad("accel"))
+    assert [path.name for path in fit.export("blob", tmp_path / "fw")] == ["unit.blob"]
+    with pytest.raises(OptionError, match=r"unknown option 'losy'.*did you mean 'lossy'"):
+        fit.export("px4", tmp_path / "fw", losy=True)
+
+
+def test_a_figure_is_found_by_number_or_words(fit):
+    plots = fit.plot()
+    assert fit.plot("SPHERE").name == plots["Attitudes on the sphere"].name == plots[1].name
+    assert [plot.name for plot in plots[1:3]] == [plots[1].name, plots[2].name]
+    assert len(repr(plots).splitlines()) <= 12
+    with pytest.raises(OptionError, match="plot 'spear': no such figure; expected one of 'Residual"):
+        fit.plot("spear")
+    with pytest.raises(OptionError, match=r"plot 'the': .* figures of that name; expected one of"):
+        fit.plot("the")
+
+
+def test_a_notebook_gets_json_and_html_and_the_library_once(fit, monkeypatch):
+    cell = [("a", 1)]
+    monkeypatch.setattr(plots_module, "_where", lambda: cell[0])
+    monkeypatch.setattr(plots_module, "_FIRST", plots_module._First())
+    sizes = []
+    for cell[0] in [("a", 1), ("a", 1), ("b", 2), ("a", 3), ("c", 4)]:
+        bundle = fit.plot("sphere")._repr_mimebundle_()
+        sizes.append(len(bundle["text/html"]))
+    drawn = bundle["application/vnd.plotly.v1+json"]
+    assert json.loads(json.dumps(drawn, allow_nan=False))["layout"]["title"]["text"] == "Attitudes on the sphere"
+    carried = [size > 400_000 for size in sizes]
+    assert carried == [True, False, False, True, False]  # the first cell brings it again when it runs again
+    assert max(sizes) < 800_000
+    assert min(sizes) < 30_000
+    monkeypatch.setitem(sys.modules, "google.colab", pytest)
+    assert len(fit.plot("sphere")._repr_mimebundle_()["text/html"]) > 400_000
+
+
+def test_a_browser_draws_what_a_notebook_gets_without_a_network(fit, chromium, tmp_path, monkeypatch):
+    monkeypatch.setattr(plots_module, "_FIRST", plots_module._First())
+    monkeypatch.setattr(plots_module, "_where", lambda: ("a", 1))
+    outputs = "".join(plot._repr_mimebundle_()["text/html"] for plot in fit.plot())
+    (tmp_path / "cells.html").write_text(f"<!doctype html><meta charset=utf-8>{outputs}")
+    dom = browse(chromium, tmp_path, tmp_path / "cells.html", "--dump-dom")
+    assert dom.count('class="plot-container') == len(fit.plot())
+    assert "after, µg" in dom
+
+
+def test_a_figure_is_saved_as_a_page(fit, tmp_path):
+    fit.plot("sphere").save(tmp_path / "one.html")
+    fit.plot().save(tmp_path / "all.html")
+    one, every = (
+        re.sub(r"<script>.*?</script>", "", (tmp_path / name).read_text(), flags=re.DOTALL)
+        for name in ("one.html", "all.html")
+    )
+    assert one.count("<figure>") == 1
+    assert every.count("<figure>") == len(fit.plot())
+    assert "Provenance" not in one
+
+
+@pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<svg"), ("pdf", b"%PDF")])
+def test_a_figure_is_saved_as_a_picture(fit, chromium, tmp_path, kind, begin):
+    pytest.importorskip("kaleido")
+    path = tmp_path / f"sphere.{kind}"
+    fit.plot("sphere").save(path)
+    assert path.read_bytes().startswith(begin)
+    assert path.stat().st_size > 4000
+
+
+@pytest.mark.parametrize(
+    ("name", "without", "words"),
+    [
+        ("x.gif", None, r"x.gif: expected a name that ends in .html, .png, .svg or .pdf"),
+        ("x.png", "kaleido", r"x.png: a picture needs kaleido: pip install 'imulab\[plots\]'; .html needs nothing"),
+    ],
+)
+def test_a_figure_that_cannot_be_saved_is_refused_in_a_line(fit, tmp_path, monkeypatch, name, without, words):
+    monkeypatch.chdir(tmp_path)
+    if without:
+        monkeypatch.setitem(sys.modules, without, None)
+    with pytest.raises(OptionError, match=words):
+        fit.plot("sphere").save(name)
+    with pytest.raises(OptionError, match=r"ends in|a picture holds one figure"):
+        fit.plot().save(name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_shows_itself_and_draws_its_sensors(recording):
+    page = recording._repr_html_()
+    assert page.count("<tr>") == len(recording.columns) + 1
+    assert f"{len(recording)} samples" in page
+    drawn = recording.plot("accel").figure
+    assert [trace["name"] for trace in drawn.traces] == ["accel_x", "accel_y", "accel_z"]
+    assert max(drawn.traces[0]["y"]) == recording.column("accel_x").max()
+    assert min(drawn.traces[2]["y"]) == recording.column("accel_z").min()
+    assert len(drawn.traces[0]["y"]) <= 4000
+    table = il.Recording.from_arrays(accel=np.eye(3), unit="g")
+    assert table.plot()[0].figure.layout["xaxis"]["title"]["text"] == "row"
+    assert isinstance(table.plot("accel"), Plot)
+
+
+def test_a_thinned_curve_keeps_what_stands_out_and_its_gaps():
+    values = np.zeros(100_000)
+    values[[12_345, 54_321]] = [7.0, -3.0]
+    values[60_000:61_000] = np.nan
+    place, kept = thinned(np.arange(100_000.0), values, 500)
+    assert kept.size == place.size == 1000
+    assert (np.nanmax(kept), np.nanmin(kept)) == (7.0, -3.0)
+    assert abs(place[np.nanargmax(kept)] - 12_345) < 200
+    gap = place[np.isnan(kept)]
+    assert 59_900 < gap.min() < gap.max() < 61_100
+
+
+def test_a_person_gets_one_line_without_a_library(fit, monkeypatch):
+    for library in ("pandas", "polars"):
+        monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(DataError, match="needs pandas or polars, which is not installed: pip install pandas"):
+        fit.to_frame()
+
+
+@pytest.mark.parametrize("data", [3.0, None, b"x.csv", "no such file.csv", [["a"]], np.zeros(5), {"accel": 3}])
+def test_what_is_no_recording_is_refused_in_a_line(fit, data):
+    with pytest.raises(ImulabError) as refused:
+        fit.apply(data, **({} if isinstance(data, str) else {"unit": "g"}))
+    assert "\n" not in str(refused.value)
+
+
+def test_importing_imulab_loads_no_library_that_draws_or_tabulates():
+    code = "import imulab, sys; print(*{name.split('.')[0] for name in sys.modules})"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "scipy", "pandas", "polars", "plotly", "kaleido", "IPython", "jinja2", "pydantic"} & set(
+        loaded
+    )
