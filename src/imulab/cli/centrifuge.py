@@ -119,8 +119,7 @@ def simulate(
     """Simulate the test of a tuned gyroscope of 3.3 deg/h/g: a manifest, a CSV file for each run, and the truth."""
     from dataclasses import replace
 
-    from imulab.procedures.centrifuge.manifest import load_manifest, make_manifest
-    from imulab.procedures.centrifuge.plan import plan_centrifuge
+    from imulab.procedures.centrifuge.manifest import load_manifest
     from imulab.procedures.centrifuge.simulate import simulate_centrifuge, typical_truth
 
     if manifest is not None:
@@ -131,20 +130,7 @@ def simulate(
                 raise OptionError(f"{option}: --plan {manifest} says that already; expected one or the other")
         test = load_manifest(manifest)
     else:
-        force, arm, net = (
-            _levels(levels),
-            quantity(radius, "--radius", "length", "m"),
-            quantity(net_rate, "--net-rate", "rate", "deg/s"),
-        )
-        number = whole_number(cycles, "--cycles")
-        plan_centrifuge(
-            levels=force, radius=arm, net_rate=net, cycles=number, K=1.0, dtg_noise=0.0, fog_noise=0.0, uncertainty=1.0
-        )
-        test = make_manifest(
-            levels=force, radius=arm, net_rate=net, cycles=number, both_senses=both_senses,
-            radius_uncertainty=1e-5 * arm, rate_uncertainty=quantity("0.0005", "", "rate", "deg/s"),
-            sensor={"serial": f"SIM-{seed}", "model": "simulated tuned gyroscope"},
-        )  # fmt: skip
+        test = _typical_test(levels, radius, net_rate, cycles, f"SIM-{seed}", both_senses=both_senses)
     truth = typical_truth(_fraction(nonlinearity, "--nonlinearity"))
     truth = replace(truth, rig=replace(truth.rig, tilt=quantity(tilt, "--tilt", "angle", "arcsec")))
     simulation = simulate_centrifuge(
@@ -159,6 +145,23 @@ def simulate(
     )
     _check_folder(output, test, manifest)
     _write_simulation(simulation, test, truth, output)
+
+
+def _typical_test(levels: str, radius: str, net_rate: str, cycles: str, serial: str, *, both_senses: bool) -> Manifest:
+    """Return the manifest of a test that options state; errors as those of a plan."""
+    from imulab.procedures.centrifuge.manifest import make_manifest
+    from imulab.procedures.centrifuge.plan import plan_centrifuge
+
+    force, arm = _levels(levels), quantity(radius, "--radius", "length", "m")
+    net, number = quantity(net_rate, "--net-rate", "rate", "deg/s"), whole_number(cycles, "--cycles")
+    plan_centrifuge(
+        levels=force, radius=arm, net_rate=net, cycles=number, K=1.0, dtg_noise=0.0, fog_noise=0.0, uncertainty=1.0
+    )
+    return make_manifest(
+        levels=force, radius=arm, net_rate=net, cycles=number, both_senses=both_senses,
+        radius_uncertainty=1e-5 * arm, rate_uncertainty=quantity("0.0005", "", "rate", "deg/s"),
+        sensor={"serial": serial, "model": "simulated tuned gyroscope"},
+    )  # fmt: skip
 
 
 @with_options(OPTIONS)

@@ -62,24 +62,10 @@ def run(
         distinct_verticals=distinct,
     )
     predicted = predicted_rows(plan.uncertainties(sigma))
-    there = f" with the {plan.already} already there" if plan.already else ""
-    noise_text = f"{from_si(sigma * STANDARD_GRAVITY, 'ug'):.4g} µg"
-    lead = (
-        f"{len(plan.directions)} attitudes{there} for order {plan.order}, criterion {criterion}: condition number "
-        f"{plan.condition_number:.1f}, {np.degrees(turning(plan.directions)):.0f} deg of turning. Predicted for a "
-        f"noise of {noise_text} in |f| per attitude{source_of_noise} and a nominal sensor."
-    )
-    if plan.order == 3:
-        lead += " Order 3 because attitudes for a lower one cannot show what that would leave in the scale factors."
-    if plan.again:
-        pairs = ", ".join(f"{one} and {other}" for one, other in plan.again)
-        lead += (
-            f" Put down twice: {pairs}. No more candidates lie 3 deg apart; the second time, after the others, lowers "
-            "the noise and shows what drifts, but no new direction."
-        )
+    few = freedom_finding(len(plan.directions) + plan.already, len(predicted), plan.order)
+    lead = _lead(plan, f"{from_si(sigma * STANDARD_GRAVITY, 'ug'):.4g} µg", source_of_noise, criterion)
     if distinct:
         lead += " Of the new attitudes no two have the same of x, y and z vertical, nor one that had it before."
-    few = freedom_finding(len(plan.directions) + plan.already, len(predicted), plan.order)
     if few is not None:
         lead += f" Too few to check the order: {few}."
     with ExitStack() as stack:
@@ -97,6 +83,25 @@ def run(
     for name, what in ((output, "plan"), (report, "sheet")):
         if name:
             print(f"{what}: {name}")
+
+
+def _lead(plan: Plan, noise: str, source_of_noise: str, criterion: str) -> str:
+    """Return what a plan is and predicts, and why it differs from what was asked for."""
+    there = f" with the {plan.already} already there" if plan.already else ""
+    lead = (
+        f"{len(plan.directions)} attitudes{there} for order {plan.order}, criterion {criterion}: condition number "
+        f"{plan.condition_number:.1f}, {np.degrees(turning(plan.directions)):.0f} deg of turning. Predicted for a "
+        f"noise of {noise} in |f| per attitude{source_of_noise} and a nominal sensor."
+    )
+    if plan.order == 3:
+        lead += " Order 3 because attitudes for a lower one cannot show what that would leave in the scale factors."
+    if plan.again:
+        pairs = ", ".join(f"{one} and {other}" for one, other in plan.again)
+        lead += (
+            f" Put down twice: {pairs}. No more candidates lie 3 deg apart; the second time, after the others, lowers "
+            "the noise and shows what drifts, but no new direction."
+        )
+    return lead
 
 
 def _as_json(plan: Plan, criterion: str, sigma: float, few: str | None) -> str:

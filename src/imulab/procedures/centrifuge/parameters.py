@@ -93,13 +93,8 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
     axes = len(items[0].line)
     width = 2 * axes
     size = width * len(items)
-    V = np.zeros((size, size))
-    for index, level in enumerate(items):
-        V[index * width : (index + 1) * width, index * width : (index + 1) * width] = level.covariance
     common = _cycles(levels, size, width)
-    V += common
-    corrections = np.concatenate([level.common for level in items], axis=1)
-    V += corrections.T @ corrections
+    V = _covariance(items, common, width)
     rows: list[_Row] = []
     curves: dict[str, CurveFit] = {}
     turning: dict[str, float] = {}
@@ -118,9 +113,8 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
             rows += [
                 _zeta(row, K[0], f"{prefix}zeta_{items[i].number}") for row, i in zip(K[1:], mine[1:], strict=True)
             ]
-            fitted = _curve(prefix, K, items, mine, V, curve)
-            curves[prefix] = fitted[0]
-            rows += fitted[1]
+            curves[prefix], more = _curve(prefix, K, items, mine, V, curve)
+            rows += more
             if all(items[index].directed for index in mine):
                 direction, probability = _direction(prefix, items, mine, axis, V, size, width)
                 rows.append(direction)
@@ -154,6 +148,17 @@ def estimate(levels: Levels, manifest: Manifest, *, method: str, curve: str = "a
         given=given,
         warnings=tuple(warnings),
     )
+
+
+def _covariance(items: tuple[Level, ...], common: Array, width: int) -> Array:
+    """Covariance of the levels' lines: of each its own, what power cycles do to all, and what corrections leave."""
+    V = np.zeros_like(common)
+    for index, level in enumerate(items):
+        V[index * width : (index + 1) * width, index * width : (index + 1) * width] = level.covariance
+    V += common
+    corrections = np.concatenate([level.common for level in items], axis=1)
+    V += corrections.T @ corrections
+    return V
 
 
 def _magnitude(level: Level, index: int, axis: int, size: int, width: int, name: str, method: str) -> _Row:

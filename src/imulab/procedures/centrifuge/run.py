@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError
-from imulab.procedures.centrifuge.cells import Cells, TooSlowError, compress, pieces_of
+from imulab.procedures.centrifuge.cells import Cells, Samples, TooSlowError, compress, pieces_of
 from imulab.procedures.centrifuge.channels import Channels
 from imulab.procedures.centrifuge.fourier import PeriodResult, PeriodSums
 from imulab.procedures.centrifuge.manifest import Manifest, Run
@@ -117,20 +117,9 @@ def reduce_run(
     """
     run, place = manifest.runs[index], manifest.place(index)
     channels = Channels(blocks, manifest, index)
-    table_rate = run.sense * run.table_rate
-    sums = PeriodSums(table_rate) if static is not None else None
+    sums = PeriodSums(run.sense * run.table_rate) if static is not None else None
     pieces = pieces_of(channels)
-    try:
-        cells = compress(pieces if sums is None else sums.watch(pieces), table_rate, run.net_rate)
-    except TooSlowError as error:
-        raise DataError(
-            f"{place}: {float(error.args[0]):.1f} samples per table period; expected 8 or more (a higher sample rate)"
-        ) from None
-    if cells is None:
-        raise DataError(
-            f"{place}: less than one period of the table ({2 * np.pi / run.table_rate:.4g} s at "
-            f"{from_si(run.table_rate, 'deg/s'):.6g} deg/s)"
-        )
+    cells = _cells(pieces if sums is None else sums.watch(pieces), run, place)
     _check_gaps(cells, place)
     _check_resolution(cells, run, place)
     used, warnings = steady_part(cells, place)
@@ -178,6 +167,22 @@ def reduce_run(
         spectrum=_spectrum(used, rates) if spectrum else None,
         warnings=(*warnings, *rates.warnings),
     )
+
+
+def _cells(pieces: Iterable[Samples], run: Run, place: str) -> Cells:
+    """Return a run averaged over cells; a run that is too slow or too short is refused."""
+    try:
+        cells = compress(pieces, run.sense * run.table_rate, run.net_rate)
+    except TooSlowError as error:
+        raise DataError(
+            f"{place}: {float(error.args[0]):.1f} samples per table period; expected 8 or more (a higher sample rate)"
+        ) from None
+    if cells is None:
+        raise DataError(
+            f"{place}: less than one period of the table ({2 * np.pi / run.table_rate:.4g} s at "
+            f"{from_si(run.table_rate, 'deg/s'):.6g} deg/s)"
+        )
+    return cells
 
 
 def _check_gaps(cells: Cells, place: str) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -105,73 +107,20 @@ def compare_methods(
     checks.watch(logged)
     warnings += [type(line)(f"{recording.name}: {line}") for line in checks.lines(turned=not aligned)]
     truth = elements.truth(recording)
-    start, stop = 0, len(recording)
-    if truth is None:
-        start, stop = _longest_quiet(recording, readings, rate)
-        if stop - start < len(recording):
-            time = recording.si("time")
-            warnings.append(
-                f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
-                f"{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"
-            )
-    reference = np.zeros((stop - start, len(elements.axes))) if truth is None else truth[start:stop]
-    error = readings[start:stop] - reference[:, :, None]
-    lost = ~np.isfinite(readings).any(axis=2)
-    figures: dict[str, tuple[Figures, ...] | str] = {}
-    rates: dict[str, Fused] = {}
-    halves: dict[str, list[float | None]] = {}
-    response: dict[str, list[Response]] = {}
-    for method in METHODS:
-        try:
-            options = FuseOptions(method=method, memory=memory, start=count_from, calibration=calibration, rate=rate)
-            fused = fuse(recording, options, weights=method == "robust", flags=method == "robust")
-            spoilt = (np.isnan(fused.rate) & ~lost).any(axis=1)
-            if spoilt.any():
-                figures[method] = (
-                    f"its output is no number from {fused.time[int(np.argmax(spoilt))]:.6g} s on: a reading that is "
-                    "none spoils it"
-                )
-                continue
-            halves[method] = _halves(readings, elements, options, start, stop)
-            response[method] = responses(logged[start:stop], elements, options, calibration, rate)
-            rates[method] = fused
-        except ImulabError as problem:
-            figures[method] = str(problem)
-    known = rates["robust"].flags if "robust" in rates else None
-    singles = [
-        single_gyros(error[:, a], None if known is None else known[start:stop, a]) for a in range(len(elements.axes))
-    ]
-    off = {method: fused.rate[start:stop] - reference for method, fused in rates.items()}
-    for method, wrong in off.items():
-        figures[method] = tuple(
-            _figures(wrong[:, a], rate, singles[a], response[method][a].bandwidth, halves[method][a])
-            for a in range(len(elements.axes))
+    start, stop = (0, len(recording)) if truth is not None else _longest_quiet(recording, readings, rate)
+    if stop - start < len(recording):
+        time = recording.si("time")
+        warnings.append(
+            f"{recording.name}: no truth_rate: the figures are of the longest stretch at rest, "
+            f"{time[start]:.6g} to {time[stop - 1]:.6g} s, with 0 as the truth"
         )
-    figures = {method: figures[method] for method in METHODS}
-    curves: dict[str, Any] = {m: [_curve(wrong[:, a], rate) for a in range(wrong.shape[1])] for m, wrong in off.items()}
-    curves["single gyro"] = [_curve(error[:, a, singles[a].middle], rate) for a in range(len(elements.axes))]
-    angles = {
-        m: [_trace(np.cumsum(np.nan_to_num(wrong[:, a])) / rate) for a in range(wrong.shape[1])]
-        for m, wrong in off.items()
-    }
-    health = _health(rates["robust"], recording) if "robust" in rates else {}
-    warnings += _filtering(figures, response, rate)
+    reference = np.zeros((stop - start, len(elements.axes))) if truth is None else truth[start:stop]
+    options = partial(FuseOptions, memory=memory, start=count_from, rate=rate)
+    runs = _run_methods(recording, elements, logged, readings, options, calibration, slice(start, stop))
+    figures, data = _evaluate(recording, elements, runs, readings, reference, rate, slice(start, stop))
+    warnings += _filtering(figures, runs.response, rate)
     if not isinstance(figures["feedback"], str):
         warnings += [type(line)(f"{recording.name}: {line}") for line in feedback_notes(elements.count, rate)]
-    data = {
-        "figures": {m: f if isinstance(f, str) else [asdict(x) for x in f] for m, f in figures.items()},
-        "allan": curves,
-        "angle": angles,
-        "trace_time": _trace(recording.si("time")[start:stop]),
-        "health": health,
-        "single": [single.noise for single in singles],
-        "limit": [single.limit for single in singles],
-        "working": [
-            [name for name, works in zip(row, single.working, strict=True) if works]
-            for row, single in zip(elements.names, singles, strict=True)
-        ],
-        "readings_names": [list(row) for row in elements.names],
-    }
     record = Calibration(
         procedure="gyro_array",
         parameters={},
@@ -197,6 +146,77 @@ def compare_methods(
         warnings=tuple(warnings),
     )
     return Comparison(figures, elements, record, tuple(warnings))
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """What each method made of a recording, the difference of its halves and its response, or why it cannot run."""
+
+    rates: dict[str, Fused] = field(default_factory=dict)
+    halves: dict[str, list[float | None]] = field(default_factory=dict)
+    response: dict[str, list[Response]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+def _run_methods(
+    recording: Recording, elements: Elements, logged: Array, readings: Array, options: Callable[..., FuseOptions],
+    calibration: Calibration | None, part: slice,
+) -> _Runs:  # fmt: skip
+    """Run all methods over a recording; halves and response are of a part of it."""
+    runs = _Runs()
+    lost = ~np.isfinite(readings).any(axis=2)
+    for method in METHODS:
+        try:
+            chosen = options(method=method, calibration=calibration)
+            fused = fuse(recording, chosen, weights=method == "robust", flags=method == "robust")
+            spoilt = (np.isnan(fused.rate) & ~lost).any(axis=1)
+            if spoilt.any():
+                runs.failed[method] = (
+                    f"its output is no number from {fused.time[int(np.argmax(spoilt))]:.6g} s on: a reading that is "
+                    "none spoils it"
+                )
+                continue
+            runs.halves[method] = _halves(readings, elements, chosen, part)
+            runs.response[method] = responses(logged[part], elements, chosen, calibration, chosen.rate or 1.0)
+            runs.rates[method] = fused
+        except ImulabError as problem:
+            runs.failed[method] = str(problem)
+    return runs
+
+
+def _evaluate(
+    recording: Recording, elements: Elements, runs: _Runs, readings: Array, reference: Array, rate: float, part: slice
+) -> tuple[dict[str, tuple[Figures, ...] | str], dict[str, Any]]:
+    """Return the figures of each method against the truth of a part, and the data of the record."""
+    axes = range(len(elements.axes))
+    error = readings[part] - reference[:, :, None]
+    known = runs.rates["robust"].flags if "robust" in runs.rates else None
+    singles = [single_gyros(error[:, a], None if known is None else known[part, a]) for a in axes]
+    off = {method: fused.rate[part] - reference for method, fused in runs.rates.items()}
+    found: dict[str, tuple[Figures, ...] | str] = {
+        m: tuple(
+            _figures(wrong[:, a], rate, singles[a], runs.response[m][a].bandwidth, runs.halves[m][a]) for a in axes
+        )
+        for m, wrong in off.items()
+    }
+    found |= runs.failed
+    figures = {method: found[method] for method in METHODS}
+    curves: dict[str, Any] = {m: [_curve(wrong[:, a], rate) for a in axes] for m, wrong in off.items()}
+    curves["single gyro"] = [_curve(error[:, a, singles[a].middle], rate) for a in axes]
+    return figures, {
+        "figures": {m: f if isinstance(f, str) else [asdict(x) for x in f] for m, f in figures.items()},
+        "allan": curves,
+        "angle": {m: [_trace(np.cumsum(np.nan_to_num(wrong[:, a])) / rate) for a in axes] for m, wrong in off.items()},
+        "trace_time": _trace(recording.si("time")[part]),
+        "health": _health(runs.rates["robust"], recording) if "robust" in runs.rates else {},
+        "single": [single.noise for single in singles],
+        "limit": [single.limit for single in singles],
+        "working": [
+            [name for name, works in zip(row, single.working, strict=True) if works]
+            for row, single in zip(elements.names, singles, strict=True)
+        ],
+        "readings_names": [list(row) for row in elements.names],
+    }
 
 
 def rate_figures(error: Array, rate: float) -> tuple[float, float, float, float]:
@@ -276,7 +296,7 @@ def _moving(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
     return bool(len(steps)) and bool((np.median(steps, axis=0) > 10 * usual / math.sqrt(size) + 0.5 * usual).any())
 
 
-def _halves(readings: Array, elements: Elements, options: FuseOptions, start: int, stop: int) -> list[float | None]:
+def _halves(readings: Array, elements: Elements, options: FuseOptions, kept: slice) -> list[float | None]:
     """Standard deviation of the difference of the two halves of the array (odd and even elements), each axis."""
     if elements.count < _HALVES or options.method == "covariance":
         return [None] * len(elements.axes)
@@ -286,7 +306,7 @@ def _halves(readings: Array, elements: Elements, options: FuseOptions, start: in
         half = replace(elements, names=tuple(row[first::2] for row in elements.names))
         part = np.ascontiguousarray(readings[:, :, first::2])
         stream = open_stream(plain, half, options.rate or 1.0, part[:10_000])
-        rates.append(stream.process(part, flags=False).rate[start:stop])
+        rates.append(stream.process(part, flags=False).rate[kept])
     apart: Array = rates[0] - rates[1]
     return [float(np.nanstd(column)) if np.isfinite(column).any() else None for column in apart.T]
 
