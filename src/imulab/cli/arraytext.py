@@ -10,6 +10,7 @@ from imulab.cli.columns import aligned
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.experiments import ExperimentRow
 from imulab.procedures.gyro_array.model import unit_of_angle
+from imulab.procedures.gyro_array.traces import method_texts
 from imulab.report.elements import plain_number
 
 _TITLE = {
@@ -58,12 +59,7 @@ def comparison(found: Comparison) -> str:
                 body.append([method, *["–"] * (len(titles) - 1)])
                 reasons.append(f"({method} cannot run: {rows})")
                 continue
-            row = rows[a]
-            values = [
-                row.rate_std, row.rate_max, factor * row.angle_std, factor * row.angle_max, row.reduction,
-                row.over_limit, row.bandwidth, *([row.split_half] if halves else []),
-            ]  # fmt: skip
-            body.append([method, *("–" if v is None else plain_number(v, 4) for v in values)])
+            body.append([method, *method_texts(rows[a], factor, 4, halves=halves)])
         lines += ["", *([f"axis {axis}"] if axis else []), *aligned(titles, body), *reasons]
         lines.append(
             f"single gyro, mean of {_those(found.elements.names[a], data['working'][a])}: "

@@ -20,6 +20,7 @@ from imulab.procedures.gyro_array.clocks import on_one_clock
 from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
 from imulab.procedures.gyro_array.memory import memory_text
 from imulab.procedures.gyro_array.model import FEWEST_ROBUST, Elements, array_calibration, feedback_notes, find_elements
+from imulab.procedures.gyro_array.sections import MethodRow
 from imulab.procedures.gyro_array.single import Singles, single_gyros
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance
@@ -35,40 +36,20 @@ _HALVES = 2 * FEWEST_ROBUST
 
 
 @dataclass(frozen=True)
-class Figures:
-    """The figures of one method on one axis; rates in the unit of the readings, angles in that unit times s.
-
-    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean of
-    rate_std over the single gyros that work, over this one (None where the output does not change at all);
-    ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; ``bandwidth`` in Hz at -3 dB, half the
-    sampling rate where nothing is filtered; ``split_half`` the standard deviation of the difference of the two halves.
-    """
-
-    rate_std: float
-    rate_max: float
-    angle_std: float
-    angle_max: float
-    reduction: float | None
-    over_limit: float
-    bandwidth: float
-    split_half: float | None = None
-
-
-@dataclass(frozen=True)
 class Comparison:
     """Every method over one recording.
 
     Attributes
     ----------
     figures
-        Method to one `Figures` per axis, or to the reason why it cannot run.
+        Method to one `MethodRow` per axis, or to the reason why it cannot run.
     record
         All of it with curves and traces, as a record that a report can be drawn from.
     warnings
         What a reader must know.
     """
 
-    figures: dict[str, tuple[Figures, ...] | str]
+    figures: dict[str, tuple[MethodRow, ...] | str]
     elements: Elements
     record: Calibration
     warnings: tuple[str, ...]
@@ -186,14 +167,14 @@ def _run_methods(
 
 def _evaluate(
     recording: Recording, elements: Elements, runs: _Runs, readings: Array, reference: Array, rate: float, part: slice
-) -> tuple[dict[str, tuple[Figures, ...] | str], dict[str, Any]]:
+) -> tuple[dict[str, tuple[MethodRow, ...] | str], dict[str, Any]]:
     """Return the figures of each method against the truth of a part, and the data of the record."""
     axes = range(len(elements.axes))
     error = readings[part] - reference[:, :, None]
     known = runs.rates["robust"].flags if "robust" in runs.rates else None
     singles = [single_gyros(error[:, a], None if known is None else known[part, a]) for a in axes]
     off = {method: fused.rate[part] - reference for method, fused in runs.rates.items()}
-    found: dict[str, tuple[Figures, ...] | str] = {
+    found: dict[str, tuple[MethodRow, ...] | str] = {
         m: tuple(
             _figures(wrong[:, a], rate, singles[a], runs.response[m][a].bandwidth, runs.halves[m][a]) for a in axes
         )
@@ -225,13 +206,13 @@ def rate_figures(error: Array, rate: float) -> tuple[float, float, float, float]
     return float(np.nanstd(error)), float(np.nanmax(np.abs(error))), float(angle.std()), float(np.abs(angle).max())
 
 
-def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split_half: float | None) -> Figures:
+def _figures(error: Array, rate: float, single: Singles, bandwidth: float, split_half: float | None) -> MethodRow:
     std, largest, angle_std, angle_max = rate_figures(error, rate)
     noise = float(np.diff(error[np.isfinite(error)]).std() / math.sqrt(2))
     if std <= _NOTHING * single.noise:  # rounding alone: it follows a dead gyro
         std = noise = 0.0
     limit = single.limit
-    return Figures(
+    return MethodRow(
         rate_std=std,
         rate_max=largest,
         angle_std=angle_std,
@@ -341,7 +322,7 @@ def _health(fused: Fused, recording: Recording) -> dict[str, Any]:
 
 
 def _filtering(
-    figures: dict[str, tuple[Figures, ...] | str], response: dict[str, list[Response]], rate: float
+    figures: dict[str, tuple[MethodRow, ...] | str], response: dict[str, list[Response]], rate: float
 ) -> list[str]:
     """Warn where less noise is bought by not following the motion: its fast part (a low-pass filter), or all of it."""
     found = []

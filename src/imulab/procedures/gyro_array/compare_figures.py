@@ -10,7 +10,7 @@ from imulab.errors import RecordError
 from imulab.procedures.gyro_array.health import JUMPED, NON_FINITE, STUCK
 from imulab.procedures.gyro_array.model import unit_of_angle
 from imulab.procedures.gyro_array.sections import ComparisonRecord, comparison_of
-from imulab.procedures.gyro_array.traces import allan_trace, curves, of_axis
+from imulab.procedures.gyro_array.traces import allan_trace, curves, method_texts, of_axis
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, Exhibits, Figure, ReportTable, plain_number
 from imulab.report.traces import DASHES, axis, log_axis, scatter
@@ -92,12 +92,7 @@ def _methods_table(record: ComparisonRecord, a: int) -> ReportTable:
         if isinstance(found, str):
             rows.append([method, *["–"] * (7 + halves)])
             continue
-        row = found[a]
-        values = [
-            row.rate_std, row.rate_max, factor * row.angle_std, factor * row.angle_max, row.reduction,
-            row.over_limit, row.bandwidth, *([row.split_half] if halves else []),
-        ]  # fmt: skip
-        rows.append([method, *("–" if v is None else plain_number(v, 3) for v in values)])
+        rows.append([method, *method_texts(found[a], factor, 3, halves=halves)])
     return ReportTable(
         title=f"Methods{of_axis(model.axes[a])}",
         caption=f"Rates in {unit}, angles in {angle}. Rate error (standard deviation with the mean removed) and angle "

@@ -137,7 +137,13 @@ class ArrayRecord(Part):
 
 
 class MethodRow(Part):
-    """What a method reaches on one axis; None where it has no such number."""
+    """The figures of one method on one axis; rates in the unit of the readings, angles in that unit times s.
+
+    ``rate_std`` has the mean removed; ``angle_*`` are of the integral of the rate error; ``reduction`` is the mean of
+    rate_std over the single gyros that work, over this one (None where the output does not change at all);
+    ``over_limit`` the noise from sample to sample over (1' C^-1 1)^-1/2; ``bandwidth`` in Hz at -3 dB, half the
+    sampling rate where nothing is filtered; ``split_half`` the standard deviation of the difference of the two halves.
+    """
 
     rate_std: float
     rate_max: float

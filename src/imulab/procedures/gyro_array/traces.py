@@ -1,11 +1,11 @@
-"""What the figures of an array have in common: titles of axes, a figure of curves, a curve of Allan deviation."""
+"""What the figures of an array have in common: titles of axes, rows of numbers, curves."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from imulab.procedures.gyro_array.sections import AllanCurve
-from imulab.report.elements import LEGEND, Figure
+from imulab.procedures.gyro_array.sections import AllanCurve, MethodRow
+from imulab.report.elements import LEGEND, Figure, plain_number
 from imulab.report.traces import DASHES, MARGIN, SYMBOLS, scatter
 
 
@@ -37,3 +37,12 @@ def allan_trace(
         name=name,
         hovertemplate=f"{name}<br>%{{x:.3g}} s: %{{y:.3g}}<extra></extra>",
     )
+
+
+def method_texts(row: MethodRow, factor: float, digits: int, *, halves: bool) -> list[str]:
+    """Return the figures of a method as cells of a table, angles times a factor, with or without that of the halves."""
+    values = [
+        row.rate_std, row.rate_max, factor * row.angle_std, factor * row.angle_max, row.reduction, row.over_limit,
+        row.bandwidth, *([row.split_half] if halves else []),
+    ]  # fmt: skip
+    return ["–" if value is None else plain_number(value, digits) for value in values]
