@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import resource
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +16,9 @@ from imulab.procedures.warmup.cycles import find_power_cycle
 from imulab.procedures.warmup.fit import WarmupFit
 from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable, evaluate
 from imulab.procedures.warmup.simulate import LAWS, warmup_truth
-from imulab.procedures.warmup.table import evaluate_float32, to_int16
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from few_bits import evaluate_float32, to_int16
 
 HOUR = np.pi / 180 / 3600
 END = 300.0

@@ -18,7 +18,6 @@ from imulab.recording import Array
 Force = TypeVar("Force", float, Array)
 
 K_UNIT = "rad/s/(m/s^2)"
-CURVE_TERMS = ("c1", "c2")
 CURVE_UNITS = {"K0": K_UNIT, "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2"}
 CROSS_UNIT = "rad/s/(m/s^2)^2"
 EARTH_RATE = 7.292115e-5

@@ -23,7 +23,6 @@ _DEG_H = np.pi / 180 / 3600
 _DEG_ROOT_H = np.pi / 180 / 60
 _PER_G = 1 / STANDARD_GRAVITY
 _BLOCK = 65536
-_TERMS = ("x", "y", "fog", "rig")
 
 
 @dataclass(frozen=True)
