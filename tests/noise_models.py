@@ -46,10 +46,17 @@ TRUTHS = {
     "N G, T = 1000 s": values(white=1, gm1_sigma=0.1, gm1_time=1000),
 }
 """White noise of 1; corners at 100 or 1000 s with a walk, 30 s with 1/f; a Gauss-Markov density of 20 at 0."""
-AUTO = {"N": values(white=1), **TRUTHS}
+AUTO = {
+    "N": values(white=1),
+    "N B, corner at 3 s": values(white=1, flicker=CORNER / np.sqrt(3)),
+    "N G, T = 3 s": values(white=1, gm1_sigma=np.sqrt(10 / 3), gm1_time=3),
+    **TRUTHS,
+}
 IN_TIME = {
     "N K": {"N": 1, "K": np.sqrt(3) / 100},
     "N B": {"N": 1, "B": CORNER / np.sqrt(30)},
+    "N B, corner at 3 s": {"N": 1, "B": CORNER / np.sqrt(3)},
+    "N G, T = 3 s": {"N": 1, "G": (np.sqrt(10 / 3), 3)},
     "N B K": {"N": 1, "B": CORNER / np.sqrt(30), "K": np.sqrt(3) / 200},
     "N G, T = 100 s": {"N": 1, "G": (np.sqrt(0.1), 100)},
 }
