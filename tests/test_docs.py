@@ -14,6 +14,7 @@ import imulab
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"<!-- tested -->\n+```(\w*)\n(.*?)```", re.DOTALL)
+EXAMPLES = ("allan_deviation", "apply", "check_tumble", "find_attitudes", "fit_tumble", "normal_gravity", "read")
 PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
 
 
@@ -40,7 +41,9 @@ def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
 
 
-@pytest.mark.parametrize("name", ["allan_deviation", "apply", "fit_tumble", "normal_gravity", "read"])
+@pytest.mark.parametrize(
+    "name", ["allan_deviation", "apply", "check_tumble", "find_attitudes", "fit_tumble", "normal_gravity", "read"]
+)
 def test_the_example_of_a_public_function_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(imulab, name), name)

@@ -1,5 +1,7 @@
 """Data as people have it: arrays and data frames of pandas and polars, and what is refused of them in one line."""
 
+import re
+
 import numpy as np
 import pandas
 import polars
@@ -8,6 +10,7 @@ import pytest
 import imulab as il
 from imulab.errors import DataError, ImulabError, OptionError, UnitError
 
+G = 9.80665
 TRIAD = np.arange(12.0).reshape(4, 3)
 FRAMES = pytest.mark.parametrize("library", [pandas, polars], ids=["pandas", "polars"])
 
@@ -145,3 +148,140 @@ def test_a_frame_has_the_library_that_is_asked_for():
     assert isinstance(made.to_frame("polars"), polars.DataFrame)
     with pytest.raises(OptionError, match="library 'dask': expected one of pandas polars"):
         made.to_frame("dask")
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    """One recording as a file, and what people make of it."""
+    path = tmp_path_factory.mktemp("front") / "rec.csv"
+    il.write_csv(il.simulate_tumble(order=2, gravity=G, seed=4), path)
+    recording = il.read(path)
+    head = {"metadata": dict(recording.metadata)}
+    time, accel = recording.column("time"), recording.triad("accel")
+    return {
+        "path": (path, {}),
+        "text": (str(path), {}),
+        "recording": (recording, {}),
+        "pandas": (recording.to_frame("pandas"), {}),
+        "polars": (recording.to_frame("polars"), {}),
+        "untitled": (pandas.DataFrame(accel, columns=["accel_x", "accel_y", "accel_z"]).assign(time=time), {
+            "unit": "m/s^2", "units": {"time": "s"},
+        }),
+        "array": (accel, {"time": time, "unit": "m/s^2"}),
+        "list": (accel.tolist(), {"time": time, "unit": "m/s^2"}),
+        "mapping": ({"time": time, "accel [m/s^2]": accel}, {}),
+        "made": (il.Recording.from_arrays(accel=accel, time=time, unit="m/s^2", **head), {}),
+        "attitudes": (il.find_attitudes(recording), {}),
+    }  # fmt: skip
+
+
+FORMS = ("path", "text", "recording", "pandas", "polars", "untitled", "array", "list", "mapping", "made", "attitudes")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_tumble_test_is_fitted_in_every_form_to_the_same_bits(logged, form):
+    data, reading = logged[form]
+    found = il.fit_tumble(data, order=2, gravity=G, **reading).calibration
+    by_hand = il.fit_tumble(il.find_attitudes(il.read(logged["path"][0])), order=2, gravity=G).calibration
+    # The temperature of the test is in the file alone; no parameter depends on it.
+    assert found.parameters == by_hand.parameters
+    assert found.covariance == by_hand.covariance
+    assert bool(found.sources) == (form in ("path", "text", "recording", "attitudes"))
+
+
+def test_the_rate_of_an_array_stands_for_its_times(logged):
+    accel = logged["array"][0]
+    found = il.find_attitudes(accel, rate=100.0, unit="m/s^2", window=1.0)
+    np.testing.assert_allclose(found.mean, logged["attitudes"][0].mean, rtol=1e-12)
+
+
+def test_a_check_and_a_correction_take_files_frames_and_arrays(logged, tmp_path):
+    path, recording = logged["path"][0], logged["recording"][0]
+    il.fit_tumble(path, order=2, gravity=G).save(tmp_path / "rec.json")
+    record = il.load(tmp_path / "rec.json")
+    expected = il.check_tumble(record, il.find_attitudes(recording), gravity=G)
+    for data, reading in (logged["pandas"], logged["array"]):
+        assert il.check_tumble(tmp_path / "rec.json", data, gravity=G, **reading).probability == expected.probability
+    corrected = il.apply(record, recording).triad("accel")
+    for data, reading in (logged[form] for form in ("path", "polars", "array", "mapping")):
+        np.testing.assert_array_equal(il.apply(tmp_path / "rec.json", data, **reading).triad("accel"), corrected)
+
+
+def test_a_window_and_an_imu_of_several_are_cut_out_of_everything(logged):
+    path, recording = logged["path"][0], logged["recording"][0]
+    expected = il.find_attitudes(il.read(path, window=(20.0, 90.0)))
+    for data, reading in (logged["recording"], logged["pandas"], logged["array"]):
+        for window in ("20:90", (20.0, 90.0)):
+            fit = il.fit_tumble(data, order=1, gravity=G, window=window, **reading)
+            assert len(fit.residuals) == len(expected)
+    titled = recording.to_frame().rename(columns=lambda title: re.sub("^(accel|gyro)_(.)", r"\1_\2_7", title))
+    one = il.find_attitudes(titled, element=7)
+    np.testing.assert_array_equal(one.mean, il.find_attitudes(recording).mean)
+    with pytest.raises(DataError, match="no column accel_x, but one of each of 1 IMUs"):
+        il.find_attitudes(titled)
+
+
+def test_means_of_attitudes_may_have_covariances():
+    rng = np.random.default_rng(5)
+    directions = rng.normal(size=(30, 3))
+    means = directions / np.linalg.norm(directions, axis=1)[:, None] + rng.normal(0, 1e-4, (30, 3)) + [0.01, 0.02, 0.03]
+    columns = {f"accel_{axis}": means[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"std_accel_{axis}": np.full(30, 1e-4) for axis in "xyz"}
+    table = il.Recording.from_arrays(unit="g", **columns)
+    stated = il.fit_tumble(table, order=1, gravity=G).calibration
+    for covariance in (1e-8 * np.eye(3), np.broadcast_to(1e-8 * np.eye(3), (30, 3, 3))):
+        given = il.fit_tumble(means, unit="g", order=1, gravity=G, covariance=covariance).calibration
+        for name, parameter in stated.parameters.items():
+            assert given.parameters[name].value == pytest.approx(parameter.value, rel=1e-12)
+            assert given.parameters[name].standard_uncertainty == pytest.approx(parameter.standard_uncertainty)
+    without = il.fit_tumble(means, unit="g", order=1, gravity=G).calibration
+    assert without.fit["noise"] != stated.fit["noise"]
+
+
+@pytest.mark.parametrize(
+    ("covariance", "words"),
+    [
+        (np.eye(2), r"covariance: expected the shape \(3, 3\) or \(9, 3, 3\), found \(2, 2\)"),
+        (np.ones((3, 3)), "covariance: expected positive definite"),
+        (np.triu(np.ones((3, 3))), "covariance: expected symmetric"),
+        (np.full((3, 3), np.nan), "covariance: expected symmetric matrices of finite numbers"),
+        ("1e-8", r"covariance: expected the shape"),
+        (["a"], "covariance: expected numbers"),
+    ],
+)
+def test_covariances_that_cannot_be_are_refused(covariance, words):
+    with pytest.raises(DataError, match=words):
+        il.fit_tumble(np.random.default_rng(1).normal(size=(9, 3)), unit="g", covariance=covariance)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda r, a: il.fit_tumble(r, gravty=9.8), "fit_tumble: unknown option 'gravty'.*did you mean 'gravity'"),
+        (lambda r, a: il.fit_tumble(r, unit="g"), "fit_tumble: unit does not go with such data: a recording has its"),
+        (lambda r, a: il.fit_tumble(r, layout="x.toml"), "fit_tumble: layout does not go with such data: only files"),
+        (lambda r, a: il.fit_tumble("rec.csv", rate=100), "fit_tumble: rate does not go with such data: a file says"),
+        (lambda r, a: il.fit_tumble(a, rate=100), "fit_tumble: rate does not go with attitudes"),
+        (lambda r, a: il.fit_tumble(a, covariance=np.eye(3)), "covariance: the recording itself says how certain"),
+        (lambda r, a: il.fit_tumble(r.triad("accel")), "arrays: column accel_x has no unit; expected units="),
+        (lambda r, a: il.fit_tumble(r.triad("accel")[:, 0], unit="g"), "data: expected an array of numbers, a row for"),
+        (lambda r, a: il.fit_tumble(None), "data: expected a file name, a Recording, .*, found NoneType None"),
+        (lambda r, a: il.fit_tumble(lambda: 3), "data: expected a file name, a Recording, .*, found function"),
+        (lambda r, a: il.fit_tumble("no.csv"), "no.csv: no such file"),
+        (lambda r, a: il.fit_tumble(r.to_frame(), time=r.time), "time does not go with such data: a data frame has it"),
+        (lambda r, a: il.fit_tumble(r, window=10), r"window 10: expected \(FROM, TO\) in s"),
+        (lambda r, a: il.fit_tumble(r, window="10"), "fit_tumble: window '10': expected FROM:TO"),
+        (lambda r, a: il.fit_tumble(r, window=(1e6, 2e6)), "nothing in the window"),
+        (lambda r, a: il.fit_tumble(r, element="2"), "element '2': expected a whole number"),
+        (lambda r, a: il.fit_tumble(r, element=2), "no columns of several IMUs"),
+        (lambda r, a: il.fit_tumble(r, prior=r), "fit_tumble: prior: expected a record .*wrong order"),
+        (lambda r, a: il.check_tumble(r, a), "check_tumble: expected a record .*, found the recording"),
+        (lambda r, a: il.apply(r, r), "apply: expected a record .*, found the recording"),
+        (lambda r, a: il.find_attitudes(r, windw=2), "find_attitudes: unknown option 'windw'.*did you mean 'window'"),
+        (lambda r, a: il.find_attitudes(a), "find_attitudes: data: expected a file name.*found Attitudes"),
+    ],
+)
+def test_a_call_that_cannot_be_is_refused_in_a_line(logged, call, words):
+    with pytest.raises(ImulabError, match=words) as refused:
+        call(logged["recording"][0], logged["attitudes"][0])
+    assert "\n" not in str(refused.value)

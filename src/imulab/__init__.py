@@ -13,7 +13,7 @@ The way through the package::
 
     import imulab as il
     recording = il.read("tumble.csv")
-    fit = il.fit_tumble(il.find_attitudes(recording), order="auto", gravity=9.81362)
+    fit = il.fit_tumble(recording, order="auto", gravity=9.81362)
     print(fit.calibration)
     fit.calibration.save("sn42.json")
     il.write_report(fit.calibration, "sn42.html")

@@ -6,11 +6,14 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from typing import Any
+from os import PathLike, fspath
+from typing import Any, Unpack
 
 from imulab.device.blob import Blob
 from imulab.device.unit import DeviceUnit
-from imulab.errors import DataError, RecordError
+from imulab.errors import DataError, OptionError, RecordError
+from imulab.procedures.inputs import Data, Reading, as_recording, described
+from imulab.procedures.loading import load_any
 from imulab.procedures.procedure import Section
 from imulab.procedures.registry import procedure_of, section
 from imulab.procedures.unit_tables import tables_of
@@ -87,11 +90,29 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
     return Loaded(DeviceUnit.of(*tables), chain, called, (record.sealed()[0],), again)
 
 
-def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: bool = False) -> Recording:
-    """Return the recording corrected by a record; columns that it does not touch pass unchanged.
+def apply(
+    record: Calibration | Blob | Loaded | str | PathLike[str],
+    data: Data,
+    *,
+    again: bool = False,
+    **reading: Unpack[Reading],
+) -> Recording:
+    """Return data corrected by a record; columns that it does not touch pass unchanged.
 
     The result names the record and its SHA-256 in `corrected_by`, which its file will hold. A recording that the same
     record corrected before is refused, unless `again`.
+
+    Parameters
+    ----------
+    record
+        A record, a blob, or the file of one.
+    data
+        What is corrected: a file, recording, data frame or arrays.
+    again
+        Whether to correct it though the same record corrected it before.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `window`, `element`.
 
     Raises
     ------
@@ -106,11 +127,16 @@ def apply(record: Calibration | Blob | Loaded, recording: Recording, *, again: b
     --------
     >>> import imulab as il
     >>> recording = il.simulate_tumble(gravity=9.81)
-    >>> record = il.fit_tumble(il.find_attitudes(recording), order=1, gravity=9.81).calibration
+    >>> record = il.fit_tumble(recording, order=1, gravity=9.81).calibration
     >>> truth = recording.column("truth_accel_x")
     >>> [round(abs(float((r.column("accel_x") - truth).mean())), 1) for r in (recording, il.apply(record, recording))]
     [0.4, 0.0]
     """
+    if isinstance(record, str | PathLike):
+        record = load_any(fspath(record))
+    if not isinstance(record, Calibration | Blob | Loaded):
+        raise OptionError(f"apply: expected a record or the name of its file, found {described(record)}")
+    recording = as_recording(data, reading, apply)
     ready = record if isinstance(record, Loaded) else loaded(record, again=again)
     before = {entry.rpartition("sha256:")[2] for entry in recording.corrected_by}
     if not ready.again and before.intersection(ready.holds):

@@ -24,7 +24,7 @@ Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mappi
 Window: TypeAlias = str | tuple[float | None, float | None]
 
 
-class Reading(TypedDict, total=False):
+class Sampling(TypedDict, total=False):
     """How data are to be understood: `time` to `units` of arrays and data frames, `layout` to `instance` of files.
 
     Attributes
@@ -39,8 +39,6 @@ class Reading(TypedDict, total=False):
         Units by sensor or column.
     layout, topic, instance
         As for `imulab.read`.
-    window
-        First and last time, s, as ``(10, 60)`` or ``"10:60"``.
     element
         One IMU of several, from 1.
     """
@@ -52,8 +50,13 @@ class Reading(TypedDict, total=False):
     layout: str | os.PathLike[str] | Layout | None
     topic: str | None
     instance: int | None
-    window: Window | None
     element: int | None
+
+
+class Reading(Sampling, total=False):
+    """The same, and which part of them: `window`, first and last time, s, as ``(10, 60)`` or ``"10:60"``."""
+
+    window: Window | None
 
 
 _OF_ARRAYS = ("rate", "time", "unit", "units")
@@ -63,7 +66,7 @@ _EXPECTED = "a file name, a Recording, a data frame of pandas or polars, or arra
 
 def as_recording(
     data: Data,
-    reading: Mapping[str, Any] | Reading,
+    reading: Mapping[str, Any] | Reading | Sampling,
     function: Callable[..., Any],
     columns: Callable[[NDArray[Any]], Mapping[str, ArrayLike]] | None = None,
     name: str = "data",
@@ -141,7 +144,7 @@ def check_keywords(given: Iterable[str], function: Callable[..., Any]) -> None:
         There is one; the message says which was meant.
     """
     own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
-    known = [*own, *Reading.__annotations__]
+    known = dict.fromkeys([*own, *Sampling.__annotations__, *Reading.__annotations__])
     for key in given:
         if key not in known:
             raise OptionError(f"{function.__name__}: unknown option {key!r}; known: {listed(known, key)}")

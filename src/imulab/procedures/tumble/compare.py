@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Unpack
 
 import numpy as np
 
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import chi_square_probability, median
 from imulab.gravity import Gravity, local_gravity
+from imulab.procedures.inputs import Reading, as_record
 from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
+from imulab.procedures.tumble.given import TumbleData, as_attitudes
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of, scatter
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
@@ -65,11 +69,12 @@ class Check:
 
 
 def check_tumble(
-    record: Calibration,
-    attitudes: Attitudes,
+    record: Calibration | str | PathLike[str],
+    data: TumbleData,
     *,
     limit: float | None = None,
     gravity: float | str | Gravity | None = None,
+    **reading: Unpack[Reading],
 ) -> Check:
     """Test whether fresh attitudes contradict an existing record, without refitting.
 
@@ -79,13 +84,16 @@ def check_tumble(
     Parameters
     ----------
     record
-        Of procedure tumble.
-    attitudes
-        From `find_attitudes`. Where nothing is known of their noise, that of the record's own attitudes counts.
+        Of procedure tumble, or its file.
+    data
+        A file, recording, data frame, arrays or attitudes, as for `fit_tumble`. Where nothing is known of their noise,
+        that of the record's own attitudes counts.
     limit
         Largest ``| |f| - g |`` that passes, m/s^2, beside the test.
     gravity
         Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
+    reading
+        How arrays and files are to be understood, as for `fit_tumble`.
 
     Raises
     ------
@@ -97,7 +105,18 @@ def check_tumble(
         The limit is not above 0, or gravity cannot be.
     DataError
         The magnitudes are nowhere near gravity.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first = il.simulate_tumble(gravity=9.81)
+    >>> truth = {key[6:]: float(text) for key, text in first.metadata.items() if key.startswith("truth_")}
+    >>> second = il.simulate_tumble(gravity=9.81, truth=truth, seed=2)
+    >>> il.check_tumble(il.fit_tumble(first, gravity=9.81).calibration, second, gravity=9.81).passed
+    True
     """
+    record = as_record(record, "check_tumble")
+    attitudes = as_attitudes(data, reading, check_tumble)
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")
     if model_of(record).cross:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from imulab.errors import DataError, ObservabilityError, OptionError
 from imulab.estimation.least_squares import (
@@ -15,6 +18,7 @@ from imulab.estimation.least_squares import (
     observability,
 )
 from imulab.gravity import Gravity, local_gravity
+from imulab.procedures.inputs import Reading, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.advice import helpful_attitudes
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -23,6 +27,7 @@ from imulab.procedures.tumble.blend import Blended, blend_orders, with_known_spr
 from imulab.procedures.tumble.checks import check_attitudes, check_residuals
 from imulab.procedures.tumble.choices import FROM_DATA
 from imulab.procedures.tumble.findings import Estimate, Found, Stated
+from imulab.procedures.tumble.given import TumbleData, as_attitudes
 from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold, solve_linearised
 from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.montecarlo import propagate
@@ -65,19 +70,21 @@ class TumbleFit(Result):
 
 
 def fit_tumble(
-    attitudes: Attitudes,
+    data: TumbleData,
     *,
     order: int | str = "auto",
     gravity: float | str | Gravity | None = None,
     method: str = "norm",
     loss: str = "auto",
     nonlinearity: tuple[float, float] | None = None,
-    prior: Calibration | None = None,
+    prior: Calibration | str | PathLike[str] | None = None,
     ageing: Sequence[float] = (),
     monte_carlo: int | None = None,
     cross: bool = False,
     threshold: Sequence[float] | None = None,
+    covariance: ArrayLike | None = None,
     progress: Callable[[int], None] = lambda _: None,
+    **reading: Unpack[Reading],
 ) -> TumbleFit:
     """Calibrate an accelerometer triad from static attitudes.
 
@@ -86,8 +93,9 @@ def fit_tumble(
 
     Parameters
     ----------
-    attitudes
-        From `find_attitudes`.
+    data
+        A file, recording, data frame or arrays with columns ``accel_x``, ``_y``, ``_z``; the triad alone, shape (n, 3);
+        or attitudes from `find_attitudes`. Without a time each row is an attitude.
     order
         1 to 5; ``"auto"``: the order that predicts best among those that the attitudes can see, with an uncertainty
         that holds whatever the order; ``"blend"``: all of them, each as far as the data support it.
@@ -102,9 +110,9 @@ def fit_tumble(
     nonlinearity
         Standard deviations of k2 and k3 about zero, in units of 1/g and 1/g^2, if known; order auto or blend.
     prior
-        Earlier tumble record of the same unit, taken as a normal distribution of the parameters, which is widened by
-        what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square and stated
-        or measured noise.
+        Earlier tumble record of the same unit, or its file, taken as a normal distribution of the parameters, which is
+        widened by what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square
+        and stated or measured noise.
     ageing
         Standard deviations of what biases (m/s^2), scale factors (1) and misalignments (rad) changed since the prior
         was made, as many as are known; the attitudes tell the others.
@@ -115,8 +123,13 @@ def fit_tumble(
     threshold
         Changes of scale factors (1), biases (m/s^2) and misalignments (rad) from one pass to the next below which
         method linearised rests; the source's 5 ppm, 2 ug and 3 arcsec if not given.
+    covariance
+        Of means of attitudes without a time, in their squared unit, shape (3, 3) or (n, 3, 3).
     progress
         Called with the number of trials done so far.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `window`, `element`.
 
     Raises
     ------
@@ -135,19 +148,25 @@ def fit_tumble(
 
     >>> import imulab as il
     >>> recording = il.simulate_tumble(gravity=9.81)
-    >>> fit = il.fit_tumble(il.find_attitudes(recording), order=1, gravity=9.81)
+    >>> fit = il.fit_tumble(recording, order=1, gravity=9.81)
     >>> abs(fit.calibration.parameters["bias_x"].value - float(recording.metadata["truth_bias_x"])) < 1e-3
     True
+
+    The same of an array, with the text for people:
+
+    >>> il.fit_tumble(recording.triad("accel"), rate=100.0, unit="m/s^2", order=1, gravity=9.81).save("unit.json")
     """
     check_options(
         order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
         nonlinearity=nonlinearity, cross=cross, threshold=threshold,
     )  # fmt: skip
+    attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = _scaling(attitudes, local.value)
-    if prior is not None:
-        order = _prior_order(prior, order, attitudes)
+    known = None if prior is None else as_record(prior, "fit_tumble: prior")
+    if known is not None:
+        order = _prior_order(known, order, attitudes)
     rest = None
     if method == "linearised":
         rest = SOURCE_THRESHOLD
@@ -155,7 +174,7 @@ def fit_tumble(
             rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
     estimate = _estimate(
         attitudes, local, scaling, order, loss, rest,
-        nonlinearity=nonlinearity, prior=prior, ageing=ageing, cross=cross,
+        nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross,
     )  # fmt: skip
     trials = None
     if monte_carlo is not None:

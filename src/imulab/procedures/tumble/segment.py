@@ -11,12 +11,14 @@ Source: Tedaldi, Pretto, Menegatti, ICRA 2014 (threshold sweep).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import SegmentError
 from imulab.estimation.rows import leave_out
+from imulab.procedures.inputs import Data, Sampling, as_recording
 from imulab.procedures.tumble import _segment
 from imulab.procedures.tumble.attitude_table import attitude_table
 from imulab.procedures.tumble.attitudes import Attitudes, Trace
@@ -59,12 +61,13 @@ class _Pieces:
 
 
 def find_attitudes(
-    recording: Recording,
+    data: Data,
     *,
     sensor: str = "accel",
     window: float = 1.0,
     settling: float = 0.3,
     shortest: float = 1.0,
+    **reading: Unpack[Sampling],
 ) -> Attitudes:
     """Find the static attitudes of a tumble recording, with the covariance of each mean.
 
@@ -73,8 +76,9 @@ def find_attitudes(
 
     Parameters
     ----------
-    recording
-        Columns ``<sensor>_x``, ``_y``, ``_z``, and ``time`` unless it is a table.
+    data
+        A file, recording, data frame or arrays with columns ``<sensor>_x``, ``_y``, ``_z``, and ``time`` unless it is a
+        table; or the triad alone, shape (n, 3).
     sensor
         Stem of the triad's columns.
     window
@@ -83,6 +87,9 @@ def find_attitudes(
         Discarded at both ends of each static stretch, s.
     shortest
         Shortest static stretch to use after that, s.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `element`.
 
     Returns
     -------
@@ -96,8 +103,15 @@ def find_attitudes(
     SegmentError
         No static stretch was found.
     UnitError
-        The three columns have different units.
+        The three columns have different units, or none.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.find_attitudes(il.simulate_tumble(attitudes=24).triad("accel"), rate=100.0, unit="m/s^2")
+    Attitudes(24 of arrays, in m/s^2)
     """
+    recording = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples})
     unit = recording.triad_unit(sensor)
     names = [f"{sensor}_{axis}" for axis in "xyz"]
     if not len(recording):
