@@ -1,0 +1,165 @@
+"""Up to which frequency a noise model is held against a spectrum, and how exactly: no spectrum is quite the model's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.estimation.noise.cosine import frequencies
+from imulab.estimation.noise.spectrum import Spectrum
+from imulab.recording import Array
+
+_AGREE, _SIGMAS = 0.03, 3.0
+_FULL = 0.999
+_MANY, _FEWEST = 200, 16
+"""Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
+_OFF_SIGMAS, _OFF = 5.0, 0.10
+_BOUND, _EXPECTED = 6.635, 0.9819
+"""Of the squared deviation of a bin in terms of its variance: at most so much counts, and what is then expected."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """The usable band of a spectrum.
+
+    Attributes
+    ----------
+    highest
+        f_max, Hz: half the sampling rate where the band is full.
+    full
+        Whether that is the whole band of the samples.
+    flat
+        Whether there is white noise at its end: where no two octaves agree, the band is full and this is False.
+    """
+
+    highest: float
+    full: bool
+    flat: bool = True
+
+
+def usable_band(spectra: Sequence[Spectrum]) -> Band:
+    """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do.
+
+    They agree within 3 % + 3 sigma. Quantisation of an angle rises with frequency: where white noise and quantisation
+    together, ``a + b s^2``, bring the three highest octaves to agreement, the band is full too.
+    """
+    nyquist = 0.5 / spectra[0].interval
+    f, p, d = (np.concatenate(each) for each in zip(*((frequencies(s), s.power, s.freedom) for s in spectra)))  # noqa: B905
+    highest = nyquist
+    if not _agree(f, p, d, highest, 2) and _rising(f, p, d, nyquist):
+        return Band(nyquist, True)
+    while d[f <= highest / 4].sum() > 2 * _MANY:
+        if _agree(f, p, d, highest, 2):
+            return Band(highest, highest > _FULL * nyquist)
+        highest /= 2
+    return Band(nyquist, True, False)
+
+
+def _agree(f: Array, p: Array, d: Array, highest: float, octaves: int) -> bool:
+    """Whether the highest octaves have the same level, each against the highest."""
+    level, freedom = [], []
+    for k in range(octaves):
+        inside = (f <= highest / 2**k * (1 + 1e-9)) & (f > highest / 2 ** (k + 1)) & (d > 0)
+        freedom.append(float(d[inside].sum()))
+        level.append(float((p * d)[inside].sum()) / max(freedom[-1], 1.0))
+    if min(freedom) <= 0 or min(level) <= 0:
+        return False
+    far = np.abs(np.log(np.array(level[1:]) / level[0]))
+    u = np.sqrt(2 / np.array(freedom[1:]) + 2 / freedom[0])
+    return bool((far <= _AGREE + _SIGMAS * u).all())
+
+
+def _rising(f: Array, p: Array, d: Array, nyquist: float) -> bool:
+    """Whether white noise and quantisation of an angle explain the three highest octaves."""
+    top = (f > nyquist / 8) & (d > 0)
+    square = 4 * np.sin(np.pi / 2 * f[top] / nyquist) ** 2
+    weight = d[top] / p[top] ** 2
+    basis = np.column_stack([np.ones_like(square), square])
+    a, b = np.linalg.solve(basis.T * weight @ basis, basis.T * weight @ p[top])
+    if b <= 0 or a <= 0:
+        return False
+    return _agree(f[top], p[top] / (a + b * square), d[top], nyquist, 3)
+
+
+def within(spectrum: Spectrum, highest: float) -> Spectrum:
+    """Return a spectrum whose bins beyond a frequency, Hz, count nothing."""
+    inside = spectrum.last / (2 * spectrum.length) <= highest * (1 + 1e-9)
+    return replace(spectrum, freedom=np.where(inside, spectrum.freedom, 0.0))
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What a spectrum may be off its model, and where it is farther off.
+
+    Attributes
+    ----------
+    ripple
+        eps, the relative standard deviation of the level of bins beyond their scatter.
+    spectra
+        With the freedom that this leaves, and nothing for the bins that are off.
+    off
+        Lowest and highest frequency of each run of bins that were left out, Hz, and by which factor they are off.
+    """
+
+    ripple: float
+    spectra: tuple[Spectrum, ...]
+    off: tuple[tuple[float, float, float], ...]
+
+
+def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
+    """Return spectra that count no more than they agree with the variances of a model in their bins, shapes (b,).
+
+    ``eps^2`` is the variance of ``ln(P/lambda)`` beyond 2/d over bins with d > 200, by maximum likelihood with bounded
+    influence: the bins that count most decide, where a median over all bins would find ripple of 1 to 4 % in noise that
+    has none. d becomes ``d/(1 + d eps^2/2)``. Bins that are then off by 5 sigma and 10 % are left out.
+    """
+    logarithm = [
+        np.log(np.maximum(s.power, 1e-300) / v) + 1 / np.maximum(s.freedom, 1)
+        for s, v in zip(spectra, variances, strict=True)
+    ]
+    log = np.concatenate(logarithm)
+    freedom = np.concatenate([s.freedom for s in spectra])
+    ripple = _ripple(log, freedom)
+    far = _far(log, freedom, ripple)
+    ripple = _ripple(log[~far], freedom[~far])  # what is left out is no ripple
+    far = _far(log, freedom, ripple)
+    edges = np.cumsum([len(s.power) for s in spectra])[:-1]
+    parts, off = [], []
+    for spectrum, part, out in zip(spectra, logarithm, np.split(far, edges), strict=True):
+        left = spectrum.freedom / (1 + spectrum.freedom * ripple**2 / 2)
+        parts.append(replace(spectrum, freedom=np.where(out, 0.0, left)))
+        runs = np.flatnonzero(np.diff(np.concatenate([[0], out.astype(int), [0]]))).reshape(-1, 2)
+        for start, stop in runs.tolist():
+            low, high = (each / (2 * spectrum.length) for each in (spectrum.first[start], spectrum.last[stop - 1]))
+            off.append((float(low), float(high), float(np.exp(part[start:stop].mean()))))
+    return Allowance(ripple, tuple(parts), tuple(off))
+
+
+def _far(logarithm: Array, freedom: Array, ripple: float) -> NDArray[np.bool_]:
+    """Which bins are off by 5 sigma and 10 %, the ripple allowed for."""
+    u = np.sqrt(2 / np.maximum(freedom, 1) + ripple**2)
+    size = np.abs(logarithm)
+    return np.asarray((freedom > _FEWEST) & (size > np.log1p(_OFF)) & (size > _OFF_SIGMAS * u))
+
+
+def _ripple(logarithm: Array, freedom: Array) -> float:
+    """Scatter of the levels of bins beyond what their numbers of coefficients explain."""
+    many = freedom > _MANY
+    if np.count_nonzero(many) < _FEWEST:
+        return 0.0
+    square, chance = logarithm[many] ** 2, 2 / freedom[many]
+
+    def beyond(eps: float) -> float:
+        spread = chance + eps**2
+        return float(np.sum((np.minimum(square / spread, _BOUND) - _EXPECTED) / spread))
+
+    if beyond(0.0) <= 0:
+        return 0.0
+    low, high = 0.0, float(np.sqrt(square.max()))
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if beyond(middle) > 0 else (low, middle)
+    return high
