@@ -9,7 +9,7 @@ from imulab.estimation.noise.duration import accuracy, length_for, visible
 from imulab.estimation.noise.intervals import profile
 from imulab.estimation.noise.likelihood import deviance, fit, information, time_limits
 from imulab.estimation.noise.terms import NAMES, Bins, allan_variance, letters, prepare, terms
-from imulab.estimation.noise.use import bias_square, walk_square, white_square
+from imulab.estimation.noise.use import at_band_edge, bias_square, walk_square, white_square
 from imulab.estimation.special import ndtr, ndtri
 from noise_models import AUTO, IN_TIME, LONG, TRUTHS, drawn, empty, intervals, transformed, values
 from reference import noise as reference
@@ -61,6 +61,28 @@ def test_quantisation_joins_where_it_shows():
     assert not partial.models[:, :, 3].any()
 
 
+@pytest.mark.parametrize("name", ["N", "N K", "N B", "N G, T = 100 s"])
+@pytest.mark.parametrize("size", [1e-9, 1e6])
+def test_units_do_not_matter_nor_bins_that_are_left_out(name, size):
+    spectrum = empty(600, 10.0)
+    freedom = np.where(np.arange(len(spectrum.freedom)) % 7 == 3, 0.0, spectrum.freedom)
+    power = drawn(np.random.default_rng(17), spectrum, AUTO[name], 3)
+    outliers = np.where(freedom == 0, 1e9, power)
+    frame, limits = prepare([spectrum]), time_limits([spectrum])
+    kept = np.broadcast_to(freedom, power.shape)
+    one, other = (choose(frame, limits, each, kept) for each in (power, outliers * size**2))
+    assert one.chosen.tolist() == other.chosen.tolist()
+    best, again = (each.values[np.arange(3), each.chosen] for each in (one, other))
+    sizes = [0, 1, 2, 3, 4, 6]
+    np.testing.assert_allclose(again[:, sizes], size * best[:, sizes], rtol=1e-3, atol=1e-6 * size)
+    models = one.models[np.arange(3), one.chosen]
+    ends, scaled = (
+        np.array(profile(frame, values, models, limits, p, kept))
+        for values, p in ((best, power), (again, outliers * size**2))
+    )
+    np.testing.assert_allclose(scaled[..., sizes], size * ends[..., sizes], rtol=0.02, atol=1e-6 * size)
+
+
 def test_quantiles_of_a_mixture_are_those_of_its_draws():
     rng = np.random.default_rng(13)
     centre, spread, weights = np.array([0.0, 1.0, 3.0]), np.array([0.1, 0.5, 0.2]), np.array([0.3, 0.5, 0.2])
@@ -85,6 +107,8 @@ def test_a_filter_gets_white_noise_for_what_is_fast_to_it():
     assert walk_square(edge, h, dt, shortest=18) == 0
     assert walk_square(edge, h, dt) > 0
     assert white_square(edge, h, shortest=18) == pytest.approx(1 + 2 * 4 * 20)
+    assert at_band_edge(edge, 18).tolist() == [True, False]
+    assert not at_band_edge(edge, 1).any()
     # A pure walk and pure white noise come back as they are.
     assert walk_square(values(walk=0.3), h, dt) == pytest.approx(0.09, rel=1e-5)
     assert white_square(values(white=0.3), h) == pytest.approx(0.09)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.estimation.noise.terms import SIGMA, TIME, allan_terms, mean_terms
 from imulab.recording import Array
@@ -62,5 +63,14 @@ def bias_square(values: Array, duration: Array, interval: float) -> Array:
     return np.asarray(mean_terms(values, duration, interval).sum(axis=-2))
 
 
-def _fast(values: Array, k: int, horizon: Array, shortest: float) -> Array:
-    return np.asarray(values[..., TIME[k], None] <= np.maximum(_AT_BOUND * shortest, horizon / _WHITE_TO_FILTER))
+def at_band_edge(values: Array, shortest: float) -> NDArray[np.bool_]:
+    """Return which Gauss-Markov terms, shape (..., 2), lie at the shortest time constant that the fit allowed, s.
+
+    Such a term is the roll-off of the sensor's filter at the end of the band, and no slow noise.
+    """
+    return np.asarray((values[..., SIGMA] > 0) & (values[..., TIME] <= _AT_BOUND * shortest))
+
+
+def _fast(values: Array, k: int, horizon: Array, shortest: float) -> NDArray[np.bool_]:
+    edge = at_band_edge(values, shortest)[..., k, None]
+    return np.asarray(edge | (values[..., TIME[k], None] <= horizon / _WHITE_TO_FILTER))
