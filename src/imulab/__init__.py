@@ -37,12 +37,12 @@ if TYPE_CHECKING:
     from imulab.procedures.centrifuge.fit import fit_centrifuge as fit_centrifuge
     from imulab.procedures.centrifuge.manifest import load_manifest as load_manifest
     from imulab.procedures.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
-    from imulab.procedures.gyro_array.compare import compare_methods as compare_methods
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
-    from imulab.procedures.gyro_array.fit import calibrate_array as calibrate_array
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
-    from imulab.procedures.gyro_array.fuse import fuse as fuse
+    from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
+    from imulab.procedures.gyro_array.public import compare_methods as compare_methods
+    from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.loading import load as load
     from imulab.procedures.reports import write_report as write_report
@@ -69,10 +69,10 @@ _HOME = {
     "FuseOptions": "procedures.gyro_array.fuse",
     "Fused": "procedures.gyro_array.fuse",
     "allan_deviation": "estimation.allan",
-    "calibrate_array": "procedures.gyro_array.fit",
+    "calibrate_array": "procedures.gyro_array.public",
     "check_tumble": "procedures.tumble.compare",
-    "compare_methods": "procedures.gyro_array.compare",
-    "fuse": "procedures.gyro_array.fuse",
+    "compare_methods": "procedures.gyro_array.public",
+    "fuse": "procedures.gyro_array.public",
     "simulate_array": "procedures.gyro_array.simulate",
     "Attitudes": "procedures.tumble.attitudes",
     "Calibration": "records.calibration",

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from hashlib import file_digest
+from os import PathLike, fspath
+from pathlib import Path
 
 import numpy as np
 
-from imulab.errors import DataError, OptionError, listed
+from imulab.errors import DataError, OptionError, ReadError, listed, quoted
 from imulab.procedures.centrifuge.budget import error_budget
 from imulab.procedures.centrifuge.choices import CURVES, METHODS
 from imulab.procedures.centrifuge.corrections import corrected, find_corrections
 from imulab.procedures.centrifuge.levels import Levels, level_numbers, pool_levels
-from imulab.procedures.centrifuge.manifest import Manifest, Run
+from imulab.procedures.centrifuge.manifest import Manifest, Run, load_manifest
 from imulab.procedures.centrifuge.parameters import Estimates, estimate
 from imulab.procedures.centrifuge.record import make_record
 from imulab.procedures.centrifuge.run import LoadedRun, reduce_run
 from imulab.procedures.centrifuge.static import StaticRun, reduce_static
 from imulab.procedures.result import Result
+from imulab.readers import read_blocks
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
 
@@ -33,11 +37,12 @@ class CentrifugeFit(Result):
 
 
 def fit_centrifuge(
-    manifest: Manifest,
-    recording_of: Callable[[Run], Iterable[Recording]],
+    manifest: Manifest | str | PathLike[str],
+    recording_of: Callable[[Run], Iterable[Recording]] | None = None,
     *,
     method: str = "least-squares",
     curve: str = "auto",
+    layout: str | PathLike[str] | None = None,
     sources: Callable[[], Sequence[Source]] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> CentrifugeFit:
@@ -50,13 +55,16 @@ def fit_centrifuge(
     Parameters
     ----------
     manifest
-        The test.
+        The test, or the file that states it.
     recording_of
-        Gives the consecutive blocks of a run's recording; `functools.partial(il.read_blocks, ...)` or a simulation.
+        Gives the consecutive blocks of a run's recording, such as a simulation's; read beside the manifest's file where
+        that is given.
     method
         ``least-squares`` or ``fourier``.
     curve
         Terms of K(a): ``auto``, ``constant``, ``c1``, ``c2`` or ``c1+c2``.
+    layout
+        Where the columns of foreign files are.
     sources
         Called when all is read; returns the files that the record is made from.
     progress
@@ -78,6 +86,13 @@ def fit_centrifuge(
     CN102636185A; IEEE Std 813, 836, 1057.
     """
     check_options(method, curve)
+    if isinstance(manifest, str | PathLike):
+        manifest, beside, read_from = _beside(fspath(manifest), layout)
+        recording_of, sources = recording_of or beside, sources or read_from
+    if not isinstance(manifest, Manifest):
+        raise OptionError(f"fit_centrifuge: expected a manifest or its file, found {quoted(manifest)}")
+    if not callable(recording_of):
+        raise OptionError("fit_centrifuge: a manifest without its file needs recording_of, a function of a run")
     seen = _Seen(recording_of)
     statics: list[StaticRun] = []
     runs: list[LoadedRun] = []
@@ -113,6 +128,30 @@ def fit_centrifuge(
         temperature=float(np.mean(seen.temperatures)) if seen.temperatures else None,
     )
     return CentrifugeFit(record, tuple(runs), levels, estimates)
+
+
+def _beside(
+    file: str, layout: str | PathLike[str] | None
+) -> tuple[Manifest, Callable[[Run], Iterable[Recording]], Callable[[], list[Source]]]:
+    """Return a manifest, what reads the recordings beside it, and what states the files."""
+    test, folder = load_manifest(file), Path(file).parent
+    paths = {run.file: folder / run.file for run in test.runs}
+    for index, run in enumerate(test.runs):  # what is missing is said before hours of data are read
+        if not paths[run.file].is_file():
+            raise ReadError(f"{test.place(index)}: no such file")
+
+    def blocks(run: Run) -> Iterable[Recording]:
+        return read_blocks(paths[run.file], None if layout is None else fspath(layout), window=run.window)
+
+    def sources() -> list[Source]:
+        return [_source(called, path) for called, path in ((file, Path(file)), *paths.items())]
+
+    return test, blocks, sources
+
+
+def _source(called: str, path: Path) -> Source:
+    with path.open("rb") as stream:
+        return Source(called, file_digest(stream, "sha256").hexdigest())
 
 
 def check_options(method: str, curve: str) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
+from typing import Any, Unpack
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
+from imulab.frames import is_frame
+from imulab.procedures.inputs import Data, Reading, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS
 from imulab.procedures.warmup.curves import Curves, make_curves
@@ -61,7 +65,7 @@ class WarmupFit(Result):
 
 
 def fit_warmup(
-    cycles: Sequence[Cycle | Recording],
+    cycles: Sequence[Cycle | Data],
     *,
     model: str = "auto",
     temperatures: Sequence[float] = SOURCE_TEMPERATURES,
@@ -73,6 +77,7 @@ def fit_warmup(
     pool: str = "unit",
     axes: Sequence[str] | None = None,
     beyond: str = "zero",
+    **reading: Unpack[Reading],
 ) -> WarmupFit:
     """Fit the curve of an output's zero after power-on, ``Z(t; T)``, to power cycles at several temperatures.
 
@@ -81,7 +86,8 @@ def fit_warmup(
     Parameters
     ----------
     cycles
-        One per power cycle; recordings are averaged first.
+        One per power cycle: files, recordings, data frames or arrays by name, with ``power_on_temperature`` in their
+        heads (``metadata=`` of `Recording.from_frame`), or what `find_power_cycle` returned.
     model
         ``interval-cubic`` (the source's), ``knot-cubic``, ``knot-log-cubic``, ``exponential``, or ``auto``: the one
         that best predicts cycles and temperatures left out of the fit.
@@ -101,6 +107,8 @@ def fit_warmup(
         Columns to fit; all gyro_* and accel_* if not given.
     beyond
         What the unit does at power-on temperatures beyond the outer ones: ``zero``, nothing; ``hold``, as there.
+    reading
+        How arrays and files are to be understood, of all cycles alike: `units`, `layout`, `window` ...
 
     Raises
     ------
@@ -115,9 +123,13 @@ def fit_warmup(
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
     """
     at = check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool, beyond)
-    if not cycles:
+    single = isinstance(cycles, str | PathLike | Recording | Mapping | np.ndarray) or is_frame(cycles)
+    if single or not isinstance(cycles, Iterable):
+        raise DataError("fit_warmup: expected a list of power cycles, one for each test, found a single one")
+    given = list(cycles)
+    if not given:
         raise DataError("no power cycles: expected at least one file for each calibration temperature")
-    found = [find_power_cycle(item) if isinstance(item, Recording) else item for item in cycles]
+    found = [item if isinstance(item, Cycle) else _averaged(item, reading) for item in given]
     if axes is not None:
         found = [with_axes(cycle, tuple(axes)) for cycle in found]
     order = common_axes(found)
@@ -155,6 +167,11 @@ def fit_warmup(
         },
     )
     return WarmupFit(record, table, tuple(rows), spread, curves)
+
+
+def _averaged(data: Data, reading: Mapping[str, Any]) -> Cycle:
+    """Return one power cycle, averaged over bins of a second."""
+    return find_power_cycle(as_recording(data, reading, fit_warmup, name="cycles"))
 
 
 def _covariance(curves: Curves, chosen: Judged, by_unit: bool) -> Array | None:

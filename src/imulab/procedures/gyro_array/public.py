@@ -1,0 +1,264 @@
+"""The functions of the gyro array as people call them: data as they have them, options as keywords."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from os import PathLike, fspath
+from typing import Any, TypeAlias, Unpack, cast
+
+from numpy.typing import NDArray
+
+from imulab.device.blob import Blob, is_blob, load_blob
+from imulab.errors import DataError, OptionError, quoted
+from imulab.procedures.gyro_array import compare, fit
+from imulab.procedures.gyro_array.compare import Comparison
+from imulab.procedures.gyro_array.fit import ArrayFit
+from imulab.procedures.gyro_array.fuse import Fused, FuseOptions
+from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
+from imulab.procedures.gyro_array.kalman import RATE_WALK
+from imulab.procedures.gyro_array.memory import carried, fusion_text
+from imulab.procedures.inputs import Data, Reading, as_record, as_recording
+from imulab.recording import Recording
+from imulab.records.calibration import Calibration
+
+Record: TypeAlias = Calibration | str | PathLike[str]
+_LABEL = "array: {}"
+
+
+def calibrate_array(
+    still: Data,
+    moving: Data | None = None,
+    *,
+    averaging_time: float = 1.0,
+    serial: str | None = None,
+    method: str | None = None,
+    memory: str | float | None = None,
+    **reading: Unpack[Reading],
+) -> ArrayFit:
+    """Calibrate the elements of an array from data at rest and, if there are some, data in motion.
+
+    At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
+    come from its Allan curve, and so does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance
+    matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    covariance; Vaccaro and Zaki 2017). In motion: scale factors, or a 3 x 3 alignment of each element.
+
+    Parameters
+    ----------
+    still, moving
+        A file, recording, data frame or arrays with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h; or
+        the readings of n gyros, shape (m, n) or (m, n, 3).
+    averaging_time
+        Of the covariance matrix, s.
+    serial
+        Of the array, for the record.
+    method, memory
+        What `fuse` and `export` take from the record; robust and growing where not given.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `window` (of `still` alone).
+
+    Raises
+    ------
+    DataError
+        Samples that are not finite, a dead element, too few samples, no stretch at rest.
+    UnitError
+        The elements have different units, or none of rate.
+    ObservabilityError
+        The motion does not excite every axis.
+    OptionError
+        An option has a value that cannot be.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> still = il.simulate_array(experiment="static", duration=60.0)
+    >>> sorted(il.calibrate_array(still).calibration.parameters)[:2]
+    ['bias_1', 'bias_2']
+    """
+    at_rest = _timed(as_recording(still, reading, calibrate_array, gyros_of, "still"), "calibrate_array")
+    in_motion = None
+    if moving is not None:
+        rest: dict[str, Any] = {key: value for key, value in reading.items() if key != "window"}
+        in_motion = as_recording(moving, _fitting(moving, rest), calibrate_array, gyros_of, "moving")
+    fusion = None
+    if method is not None or memory is not None:
+        fusion = fusion_text(method, None if memory is None else str(memory), _LABEL)
+    return fit.calibrate_array(at_rest, in_motion, averaging_time=averaging_time, serial=serial, fusion=fusion)
+
+
+def fuse(
+    data: Data,
+    options: FuseOptions | None = None,
+    *,
+    method: str | None = None,
+    memory: str | float | None = None,
+    initial_bias: Record = "first",
+    calibration: Record | Blob | None = None,
+    rate_walk: float | None = None,
+    still: tuple[float, float] | None = None,
+    weights: bool = False,
+    flags: bool = True,
+    **reading: Unpack[Reading],
+) -> Fused:
+    """Fuse the readings of an array into one rate.
+
+    Parameters
+    ----------
+    data
+        A file, recording, data frame or arrays with the columns gyro_1 .. (or gyro_x_1 ..); or the readings of n gyros,
+        shape (m, n) or (m, n, 3).
+    options
+        All of the following as one object, instead of them.
+    method
+        One of ``mean support least-squares feedback robust covariance kalman``; that of `calibration`, or robust.
+    memory
+        ``growing``, ``growing:COUNT``, or a gain between 0 and 1; that of `calibration`, or growing.
+    initial_bias
+        ``first``, ``zero``, or the record, or its file, whose biases the recursion starts from.
+    calibration
+        Record of `calibrate_array` or blob, or its file: its biases are taken off, its noise gives the weights.
+    rate_walk
+        Process noise of `kalman`, rad/s/sqrt(s).
+    still
+        From when to when the unit is known to be at rest, s.
+    weights, flags
+        Whether to keep the weight and the state of each gyro in each sample.
+    reading
+        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
+        `window`. For what has a time of its own `rate` is the nominal one.
+
+    Raises
+    ------
+    DataError
+        No elements, too few for the method, no time, or time that does not rise.
+    UnitError
+        The elements of an axis have different units, or others than the record.
+    RecordError
+        The record is not of this array.
+    OptionError
+        An option has a value that cannot be.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> board = il.simulate_array(duration=20.0)
+    >>> il.fuse(board, method="mean").rate.shape == (len(board), 1)
+    True
+    """
+    given: dict[str, Any] = dict(reading)
+    nominal = given.pop("rate", None) if _has_time(data) else None
+    recording = _timed(as_recording(data, given, fuse, gyros_of), "fuse")
+    named = (method, memory, calibration, rate_walk, still, None if initial_bias == "first" else initial_bias, nominal)
+    if options is None:
+        options = _options(method, memory, initial_bias, calibration, rate_walk, still)
+        options = options if nominal is None else replace(options, rate=nominal)
+    elif any(value is not None for value in named):
+        raise OptionError("fuse: options together with other keywords: expected one or the other")
+    elif not isinstance(options, FuseOptions):
+        raise OptionError(f"fuse: options {quoted(options)}: expected keywords, as in fuse(data, method='mean')")
+    return fuse_recording(recording, options, weights=weights, flags=flags)
+
+
+def compare_methods(
+    data: Data,
+    *,
+    calibration: Record | None = None,
+    memory: str | float | None = None,
+    count_from: int | None = None,
+    **reading: Unpack[Reading],
+) -> Comparison:
+    """Run all seven methods over one recording: errors, limit, Allan curves, bandwidth.
+
+    The truth is the column ``truth_rate`` (or ``truth_rate_x`` ..); without it the unit must be still, or still for a
+    stretch of 5 s or more: the figures are then of the longest such stretch, and the truth there is 0. With six gyros
+    or more the two halves of the array (odd and even elements) are also fused apart; half of the standard deviation of
+    their difference estimates the noise of the whole without any truth.
+
+    Parameters
+    ----------
+    data
+        As for `fuse`.
+    calibration
+        Record of `calibrate_array`, or its file.
+    memory
+        ``growing``, ``growing:COUNT``, or a gain between 0 and 1; that of `calibration`, or growing.
+    count_from
+        Count of the first sample under growing memory; that of `memory` if not given.
+    reading
+        How arrays and files are to be understood, as for `fuse`.
+
+    Raises
+    ------
+    DataError
+        No elements, no time, an axis without a finite reading, or neither truth nor a stretch at rest.
+    OptionError
+        An option has a value that cannot be.
+    """
+    recording = _timed(as_recording(data, reading, compare_methods, gyros_of), "compare_methods")
+    record = None if calibration is None else as_record(calibration, "compare_methods: calibration")
+    by = fusion_text(None, None if memory is None else str(memory), _LABEL, carried(record))
+    gain: str | float = "growing" if by.memory is None else by.memory
+    count = by.start if count_from is None else count_from
+    return compare.compare_methods(recording, calibration=record, memory=gain, count_from=count)
+
+
+def gyros_of(readings: NDArray[Any]) -> Mapping[str, NDArray[Any]]:
+    """Return the columns of readings of shape (m, n), single axes, or (m, n, 3), triads.
+
+    Raises
+    ------
+    DataError
+        They have another shape.
+    """
+    if readings.ndim == 2:
+        return {f"gyro_{number + 1}": readings[:, number] for number in range(readings.shape[1])}
+    if readings.ndim == 3 and readings.shape[2] == 3:
+        pairs = [(axis, number) for axis in range(3) for number in range(readings.shape[1])]
+        return {f"gyro_{'xyz'[axis]}_{number + 1}": readings[:, number, axis] for axis, number in pairs}
+    raise DataError(f"arrays: expected readings of shape (m, n) or (m, n, 3), found {readings.shape}")
+
+
+def _timed(recording: Recording, called: str) -> Recording:
+    """Return a recording, refused where arrays came without their rate."""
+    if recording.source is None and "time" not in recording and len(recording):
+        raise DataError(f"{called}: {recording.name}: no time: expected rate=, time= or a column 'time'")
+    return recording
+
+
+def _has_time(data: object) -> bool:
+    """Return whether data bring a time of their own, beside which a rate is the nominal one."""
+    columns = data if isinstance(data, Mapping) else getattr(data, "columns", ())
+    return isinstance(data, str | PathLike) or any(str(name).partition("[")[0].strip() == "time" for name in columns)
+
+
+def _fitting(data: object, reading: dict[str, Any]) -> dict[str, Any]:
+    """Return what was said of the data at rest as far as it goes with those in motion."""
+    ours = ("layout", "topic", "instance") if isinstance(data, str | PathLike) else ("rate", "time", "unit", "units")
+    ours = ("element",) if hasattr(data, "corrected_by") else (*ours, "element")
+    return {key: value for key, value in reading.items() if key in ours and key != "time"}
+
+
+def _options(
+    method: str | None,
+    memory: str | float | None,
+    initial_bias: Record,
+    calibration: Record | Blob | None,
+    rate_walk: float | None,
+    still: tuple[float, float] | None,
+) -> FuseOptions:
+    """Return keywords as the options that they are."""
+    known: Calibration | Blob | None = None
+    if isinstance(calibration, Blob):
+        known = calibration
+    elif isinstance(calibration, str | PathLike) and is_blob(fspath(calibration)):
+        known = load_blob(fspath(calibration))
+    elif calibration is not None:
+        known = as_record(calibration, "fuse: calibration")
+    start = cast(Any, initial_bias)
+    if not isinstance(initial_bias, str) or initial_bias not in ("first", "zero"):
+        start = as_record(initial_bias, "fuse: initial_bias")
+    by = fusion_text(method, None if memory is None else str(memory), _LABEL, carried(known))
+    gain: str | float = "growing" if by.memory is None else by.memory
+    walk = RATE_WALK if rate_walk is None else rate_walk
+    return FuseOptions(by.method, gain, by.start, start, known, rate_walk=walk, still=still)
