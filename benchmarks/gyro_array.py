@@ -197,7 +197,7 @@ def _memory() -> list[tuple[str, str, str]]:
         begin = time.perf_counter()
         done = subprocess.run([sys.executable, "-c", asking, *command], check=True, capture_output=True, text=True)
         took = time.perf_counter() - begin
-    peak = int(done.stdout) / 1024
+    peak = int(done.stdout.split()[-1]) / 1024
     return [(f"fuse a CSV of {written / 1e9:.1f} GB: peak memory", f"{peak:.0f} MB ({took:.0f} s)", "< 400 MB")]
 
 

@@ -112,10 +112,12 @@ static void find_small_jumps(const il_array *a, const il_robust_terms *t, il_arr
     const il_real usual = median_of(a->elements, p->learns, s->fast, &scatter);
     trust(a, s, p); /* the sample has changed the variances */
     uint64_t young = (uint64_t)a->quiet * (il_forming(a, p->learnt) ? IL_FORMING : 1);
+    /* of the median that all are held against: a quiet gyro among noisy ones is no surer than they are */
+    const il_real middle = IL_C(2.0) * t->share * p->mean_variance;
     for (int32_t i = 0; i < a->elements; i++) {
         if (!p->learns[i] || s->seen[i] < young) continue;
         /* variances: (8 sqrt(f / 2))^2 */
-        il_real limit = il_larger(il_sqrt(IL_C(4.0) * t->jump * p->trust[i]), IL_C(8.0) * scatter);
+        il_real limit = il_larger(il_sqrt(IL_C(4.0) * t->jump * il_larger(p->trust[i], middle)), IL_C(8.0) * scatter);
         limit = il_larger(limit, a->scale_tolerance * il_fabs(p->middle));
         if (il_fabs(s->fast[i] - usual) > limit) il_robust_jump(s, i);
     }

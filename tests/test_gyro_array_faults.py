@@ -122,6 +122,17 @@ def test_a_bias_jump(seed, jump):
     assert abs(late) < min(abs(jump), 0.3) / 6
 
 
+@pytest.mark.parametrize("noises", [(0.010, 0.042, 0.070), (0.01, 0.05, 0.05, 0.07)])
+def test_a_quiet_gyro_among_noisy_ones_has_not_jumped(noises):
+    # Held against the median of the others, which is as noisy as they are.
+    for seed in range(12):
+        readings = np.random.default_rng(seed).standard_normal((6000, len(noises))) * noises
+        fused = run(readings)
+        assert not (fused.flags[:, 0] & JUMPED).any(), f"seed {seed}"
+    readings[3000:, 0] += 1.0
+    assert (run(readings).flags[3000 : 3000 + 2 * RATE, 0, 0] & JUMPED).any(), "a jump of 15 sigma of the noisiest"
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_bursts_that_are_no_numbers(seed, value):
