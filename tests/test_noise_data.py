@@ -5,7 +5,8 @@ import pytest
 from scipy.fft import dct
 from scipy.signal import butter, lfilter
 
-from imulab.errors import OptionError
+import imulab as il
+from imulab.errors import DataError, OptionError
 from imulab.estimation.noise import cosine
 from imulab.estimation.noise.band import allow, usable_band, within
 from imulab.estimation.noise.cleaning import find_steps, spikes_removed, step_coefficients
@@ -19,6 +20,7 @@ from imulab.estimation.noise.cosine import (
 from imulab.estimation.noise.likelihood import fit, time_limits
 from imulab.estimation.noise.moments import test_of_fit as hold
 from imulab.estimation.noise.regression import ramp_coefficients, regress
+from imulab.estimation.noise.rest import at_rest
 from imulab.estimation.noise.simulate import flicker_sum, simulated
 from imulab.estimation.noise.terms import NAMES, prepare, terms
 from reference import noise as reference
@@ -252,3 +254,102 @@ def test_a_model_without_the_walk_does_not_fit_a_walk():
     assert poor.probability < 1e-6
     assert size(good.values, "white") == pytest.approx(size(likely, "white"), rel=0.01)
     assert size(good.values, "walk") == pytest.approx(size(likely, "walk"), rel=0.15)
+
+
+def recording(values, time=None, name="gyro_x"):
+    time = 0.01 * np.arange(len(values)) if time is None else time
+    return il.Recording({"time": time, name: values}, {"time": "s", name: "rad/s"}, name="log.csv")
+
+
+def noisy(count=20_000, seed=1):
+    return 1e-3 * np.random.default_rng(seed).standard_normal(count)
+
+
+def test_gaps_part_a_record_and_short_ones_are_bridged():
+    x, time = noisy(30_000), 0.01 * np.arange(30_000)
+    kept = np.ones(len(x), dtype=bool)
+    kept[4000:4004] = False
+    kept[12_000:12_500] = False
+    kept[28_000:28_200] = False
+    found = at_rest(recording(x[kept], time[kept]), ["gyro_x"])
+    assert found.bridged == 4
+    assert found.interval == pytest.approx(0.01)
+    assert [len(each) for each in found.samples("gyro_x")] == [12_000, 15_500, 1800]
+    whole = found.samples("gyro_x")[0]
+    np.testing.assert_allclose(whole[4000:4004], x[3999] + (x[4004] - x[3999]) * np.arange(1, 5) / 5, atol=1e-12)
+    np.testing.assert_allclose(np.delete(whole, np.s_[4000:4004]), np.delete(x[:12_000], np.s_[4000:4004]))
+    assert [note for note in found.notes if "bridged" in note] == [
+        "log.csv: 4 samples missing in short gaps are bridged by straight lines"
+    ]
+    stretches = found.stretches("gyro_x")
+    values, _, _ = fitted([each for stretch in stretches for each in stretch.spectra], "N")
+    assert size(values, "white") == pytest.approx(1e-4, rel=0.02)
+
+
+def test_rows_without_numbers_are_bridged_and_counted():
+    x = noisy()
+    x[[7, 900]] = np.nan
+    found = at_rest(recording(x), ["gyro_x"])
+    assert any("2 rows without numbers" in note for note in found.notes)
+    assert np.isfinite(found.samples("gyro_x")[0]).all()
+
+
+def moving():
+    return noisy() + np.sin(np.arange(20_000) / 500)
+
+
+def with_repeated_time():
+    time = 0.01 * np.arange(20_000)
+    time[300] = time[299]
+    return recording(noisy(), time)
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (lambda: recording(moving()), "log.csv: column gyro_x: .*did the unit move?"),
+        (lambda: recording(noisy(499)), "log.csv: 499 samples in a row; expected at least 500"),
+        (lambda: recording(np.full(20_000, 0.5)), "log.csv: column gyro_x: all samples are 0.5 rad/s"),
+        (lambda: recording(np.minimum(noisy(), 5e-4)), "samples are at its limit, 0.0005 rad/s"),
+        (lambda: recording(np.maximum(noisy(), -1e-3)), "samples are at its limit, -0.001 rad/s"),
+        (with_repeated_time, "row 301, column time: time stands still"),
+    ],
+)
+def test_what_is_no_record_of_noise_is_refused_in_one_line(made, message):
+    with pytest.raises(DataError, match=message) as refused:
+        at_rest(made(), ["gyro_x"]).stretches("gyro_x")
+    assert "\n" not in str(refused.value)
+
+
+def test_whole_counts_are_not_clipped():
+    for step in (3e-4, 1e-3, 3e-3):
+        at_rest(recording(step * np.round(noisy() / step)), ["gyro_x"]).stretches("gyro_x")
+
+
+def test_short_records_are_said_to_show_white_noise_only():
+    found = at_rest(recording(noisy(2000)), ["gyro_x"])
+    assert found.short
+    assert "20 s; below 100 s only white noise" in found.notes[-1]
+    assert not at_rest(recording(noisy()), ["gyro_x"]).short
+
+
+def test_the_white_noise_of_the_real_array(real_data):
+    """MIMU4444, the first 18.5 s: medians over eight gyros, deg/s/sqrt(Hz), with the lines that these gyros have."""
+    log = il.read(real_data / "mimu4444" / "exp_1.bin")
+    rows = log.time < 18.5
+    log = il.Recording({n: c[rows] for n, c in log.columns.items()}, log.units, name=log.name)
+    names = [f"gyro_{axis}_{k}" for axis in "xyz" for k in range(1, 9)]
+    found = at_rest(log, names)
+    assert found.short
+    level = {}
+    for name in names:
+        (stretch,) = found.stretches(name)
+        (spectrum,) = stretch.spectra
+        assert usable_band([spectrum]).full
+        white = size(fitted([spectrum], "N")[0], "white")
+        c = cosine_coefficients(found.samples(name)[0])
+        level[name] = np.degrees([np.sqrt(np.mean(c**2) * found.interval), white])
+        assert (level[name][1] < 0.995 * level[name][0]) == bool(stretch.lines)
+    medians = np.array([np.median([level[f"gyro_{axis}_{k}"] for k in range(1, 9)], axis=0) for axis in "xyz"])
+    assert medians[:, 0] == pytest.approx([0.022, 0.023, 0.014], rel=0.02)
+    assert ((medians[:, 1] > 0.85 * medians[:, 0]) & (medians[:, 1] < medians[:, 0])).all()

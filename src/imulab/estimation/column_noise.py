@@ -77,7 +77,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     if not 1 / _LARGEST < rate < _LARGEST:
         raise DataError(f"{recording.name}: column time: {rate:.3g} samples in a second; expected a rate of sensors")
     notes += [*more, *trimmed, *timing]
-    moved = _moved(recording, names, rate)
+    moved = moved_columns(recording, names, rate)
     columns: dict[str, Any] = {}
     noises: dict[str, ColumnNoise] = {}
     for name in names:
@@ -195,8 +195,8 @@ def _columns(names: list[str]) -> str:
     return f"column{'s' * (len(names) > 1)} {' '.join(names)}"
 
 
-def _moved(recording: Recording, names: list[str], rate: float) -> dict[str, str]:
-    """Columns whose means over a second range farther than any zero drifts and than noise explains, and why."""
+def moved_columns(recording: Recording, names: list[str], rate: float) -> dict[str, str]:
+    """Return the columns whose means over a second range farther than any zero drifts and than noise explains: why."""
     size = max(1, min(round(rate), len(recording)))
     moved: dict[str, float] = {}
     for name in names:

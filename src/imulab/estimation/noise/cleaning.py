@@ -13,6 +13,7 @@ _BLOCK, _SPIKE = 50, 6.0
 _CHUNK = 1 << 16  # samples whose deviations are looked at together
 _TO_SIGMA = 1.959964  # 95 % of |x| of a normal distribution
 _FALSE_ALARM, _FEWEST, _SKIRT = 1e-9, 16, 3
+_LEAST = 100  # coefficients whose median tells the level: that of 16 is off by a factor of 3 now and then
 _STEP = 5.0
 _MOST_STEPS = 5
 
@@ -83,8 +84,8 @@ def line_groups(
     """Find lines: squares of coefficients that stand out of their bin, and what is beside them.
 
     A square, the mean of `averages`, is that of a line beyond the 1e-9 point of chi-square about the median of its bin,
-    in bins of 16 and more. Left out are three coefficients on both sides, and as many as stand out themselves: a strong
-    line leaks far.
+    in bins of 16 and more, with their neighbours up to 100. Left out are three coefficients on both sides, and as many
+    as stand out themselves: a strong line leaks far.
 
     Returns
     -------
@@ -99,7 +100,8 @@ def line_groups(
     level = np.zeros(len(squares))
     for start, stop in zip((first - 1).tolist(), last.tolist(), strict=True):
         if stop - start >= _FEWEST:
-            level[start:stop] = np.median(squares[start:stop])
+            beside = max(0, (_LEAST - (stop - start) + 1) // 2)
+            level[start:stop] = np.median(squares[max(start - beside, 0) : stop + beside])
     out = np.flatnonzero((squares > limit * level) & (level > 0))
     if not out.size:
         return fine, ()
