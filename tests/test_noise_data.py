@@ -19,7 +19,7 @@ from imulab.estimation.noise.cosine import (
 )
 from imulab.estimation.noise.likelihood import fit, time_limits
 from imulab.estimation.noise.moments import test_of_fit as hold
-from imulab.estimation.noise.regression import ramp_coefficients, regress
+from imulab.estimation.noise.regression import ramp_coefficients, regress, without
 from imulab.estimation.noise.rest import at_rest
 from imulab.estimation.noise.simulate import flicker_sum, simulated
 from imulab.estimation.noise.terms import NAMES, prepare, terms
@@ -118,6 +118,18 @@ def test_spikes_and_lines_leave_the_noise_as_it_is():
     assert np.abs(off).max(axis=0)[1] < 0.03
 
 
+def test_a_line_a_hundred_times_the_noise_leaves_the_noise_as_it_is():
+    x = samples(100_000, 0.01, 3, white=0.1, flicker=0.03)
+    t = 0.01 * np.arange(len(x))
+    y = x + 100 * np.sin(2 * np.pi * 7.31234 * t + 0.4) + 30 * np.sin(2 * np.pi * 23.456 * t)
+    clean, dirty = (fitted(transformed(each, 0.01).spectra, "NB")[0] for each in (x, y))
+    assert size(dirty, "white") == pytest.approx(size(clean, "white"), rel=0.003)
+    assert size(dirty, "flicker") == pytest.approx(size(clean, "flicker"), rel=0.02)
+    lines = transformed(y, 0.01).lines[:2]
+    assert [line.frequency for line in lines] == pytest.approx([7.31234, 23.456], abs=1e-5)
+    assert [line.amplitude for line in lines] == pytest.approx([100, 30], rel=1e-3)
+
+
 def test_a_step_has_its_time_and_size():
     x = samples(60_000, 0.1, 5, white=1.0, walk=0.01)
     clean = transformed(x, 0.1)
@@ -132,6 +144,14 @@ def test_a_step_has_its_time_and_size():
     unit = np.zeros(600)
     unit[77:] = 1
     np.testing.assert_allclose(step_coefficients(599, 77, 600), dct(unit, norm="ortho")[1:], atol=1e-12)
+
+
+def test_a_step_that_is_taken_out_leaves_the_record_as_it_was():
+    x = samples(50_000, 0.1, 15, white=1.0)
+    y = x + 3.0 * (np.arange(len(x)) >= 20_000)
+    clean, stepped = transformed(x, 0.1), transformed(y, 0.1)
+    left = without(stepped, 3.0 * step_coefficients(len(stepped.slow), 20_000, stepped.count))
+    np.testing.assert_allclose(left.spectra[0].power, clean.spectra[0].power, rtol=1e-6)
 
 
 def test_the_band_ends_where_the_sensor_filters():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ _CHUNK = 1 << 16  # samples whose deviations are looked at together
 _TO_SIGMA = 1.959964  # 95 % of |x| of a normal distribution
 _FALSE_ALARM, _FEWEST, _SKIRT = 1e-9, 16, 3
 _LEAST = 100  # coefficients whose median tells the level: that of 16 is off by a factor of 3 now and then
+_STRONG, _NEAR, _WANDERS, _MOST_STRONG, _ROUNDS = 1e5, 50, 0.01, 8, 14
+"""Lines so far above the median are fitted, by so many coefficients on both sides, if so little of them is left."""
 _STEP = 5.0
 _MOST_STEPS = 5
 
@@ -115,6 +118,54 @@ def line_groups(
         power = max(float((squares[span] - level[span] * noise).sum()), float(above.max()))
         lines.append(Line(f, float(np.sqrt(2 * power / count))))
     return fine, tuple(sorted(lines, key=lambda line: -line.amplitude))
+
+
+def strong_lines_removed(c: Array, lines: Sequence[Line], interval: float) -> tuple[Array, tuple[Line, ...]]:
+    """Return coefficients c_1 .. c_{n-1} without the lines that stand far out, and which these are.
+
+    What a sine leaks falls with the distance j alone: 100 sigma of it raise the white noise by a third. So a sine of
+    constant frequency is fitted to the coefficients next to its line, and taken out of all; of one that wanders, which
+    leaves more than 1 % of the power there, nothing is taken.
+    """
+    taken = []
+    for line in lines[:_MOST_STRONG]:
+        middle = round(2 * (len(c) + 1) * interval * line.frequency)
+        near = slice(max(middle - _NEAR, 0), middle + _NEAR)
+        power = c[near] ** 2
+        if power.max() < _STRONG * np.median(c[max(middle - 10 * _NEAR, 0) : middle + 10 * _NEAR] ** 2):
+            continue
+        j = np.arange(1, len(c) + 1, dtype=np.float64)
+        place, size = _sine(c[near], j[near], float(j[near][np.argmax(power)]), len(c) + 1)
+        left = c[near] - _sine_coefficients(j[near], place, len(c) + 1).T @ size
+        if float(np.sum(left**2)) < _WANDERS * float(power.sum()):
+            c = c - _sine_coefficients(j, place, len(c) + 1).T @ size
+            taken.append(Line(place / (2 * (len(c) + 1) * interval), float(np.hypot(*size))))
+    return c, tuple(taken)
+
+
+def _sine(c: Array, j: Array, start: float, count: int) -> tuple[float, Array]:
+    """Frequency, in units of j, and cosine and sine amplitudes that fit coefficients best, from next to it."""
+
+    def fitted(place: float) -> tuple[float, Array]:
+        basis = _sine_coefficients(j, place, count).T
+        size = np.asarray(np.linalg.lstsq(basis, c)[0], dtype=np.float64)
+        return float(np.sum((c - basis @ size) ** 2)), size
+
+    low, high = start - 1.5, start + 1.5
+    for _ in range(_ROUNDS):
+        grid = np.linspace(low, high, 11) + 1e-9  # next to whole numbers, where the formula is 0/0
+        best = int(np.argmin([fitted(place)[0] for place in grid.tolist()]))
+        low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, 10)])
+    place = (low + high) / 2
+    return place, fitted(place)[1]
+
+
+def _sine_coefficients(j: Array, place: float, count: int) -> Array:
+    """Coefficients of the cosine and the sine of ``w (i + 1/2)``, w = pi place/n, i = 0 .. n - 1, shape (2, ...)."""
+    below, above = np.pi * (place - j) / count, np.pi * (place + j) / count
+    cosine = np.sin(count * below) / np.sin(below / 2) + np.sin(count * above) / np.sin(above / 2)
+    sine = (1 - np.cos(count * below)) / np.sin(below / 2) + (1 - np.cos(count * above)) / np.sin(above / 2)
+    return np.asarray(np.stack([cosine, sine]) * np.sqrt(2 / count) / 4)
 
 
 def find_steps(slow: Array, variances: Array, count: int, interval: float) -> tuple[Step, ...]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.noise.cleaning import Line, line_groups, spikes_removed
+from imulab.estimation.noise.cleaning import Line, line_groups, spikes_removed, strong_lines_removed
 from imulab.estimation.noise.spectrum import Spectrum, bins
 from imulab.recording import Array
 
@@ -154,8 +154,12 @@ class Accumulator:
         count = smooth_count(len(samples))
         c = cosine_coefficients(self._cleaned(samples)[:count])
         first, last = bins(count)
+        fine, lines = line_groups(c * c, first, last, 1, count, self._interval)
+        c, strong = strong_lines_removed(c, lines, self._interval)
         squares = c * c
-        fine, lines = line_groups(squares, first, last, 1, count, self._interval)
+        if strong:
+            fine, weak = line_groups(squares, first, last, 1, count, self._interval)
+            lines = tuple(sorted([*strong, *weak], key=lambda line: -line.amplitude))
         spectrum = binned(squares, fine, (first, last), self._interval, count)
         return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes)
 
