@@ -14,7 +14,16 @@ import imulab
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"<!-- tested -->\n+```(\w*)\n(.*?)```", re.DOTALL)
-EXAMPLES = ("allan_deviation", "apply", "check_tumble", "find_attitudes", "fit_tumble", "normal_gravity", "read")
+EXAMPLES = (
+    "allan_deviation",
+    "apply",
+    "check_tumble",
+    "find_attitudes",
+    "fit_gyro",
+    "fit_tumble",
+    "normal_gravity",
+    "read",
+)
 PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
 
 
@@ -42,7 +51,8 @@ def test_every_procedure_has_a_worked_example(page):
 
 
 @pytest.mark.parametrize(
-    "name", ["allan_deviation", "apply", "check_tumble", "find_attitudes", "fit_tumble", "normal_gravity", "read"]
+    "name",
+    ["allan_deviation", "apply", "check_tumble", "find_attitudes", "fit_gyro", "fit_tumble", "normal_gravity", "read"],
 )
 def test_the_example_of_a_public_function_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -151,3 +151,55 @@ def test_a_manifest_that_cannot_be_is_refused_in_a_line(centrifuge):
         il.fit_centrifuge(3)
     with pytest.raises(ImulabError, match=r"no\.toml: no such manifest file"):
         il.fit_centrifuge("no.toml")
+
+
+def test_the_gyroscopes_are_fitted_in_every_form_as_by_the_command(tmp_path):
+    il.write_csv(il.simulate_tumble(gravity=9.81, seed=7), tmp_path / "rec.csv")
+    recording = il.read(tmp_path / "rec.csv")
+    il.fit_tumble(recording, order=1, gravity=9.81).save(tmp_path / "a.json")
+    given = [str(tmp_path / "rec.csv"), "--accel", str(tmp_path / "a.json"), "-o", str(tmp_path / "cli.json")]
+    assert main(["tumble", "gyro", *given]) == 0
+    expected = parameters(il.load(tmp_path / "cli.json"))
+    triads = {sensor: recording.triad(sensor) for sensor in ("accel", "gyro")}
+    units = {"accel": "m/s^2", "gyro": "deg/s"}
+    gyros = (triads["gyro"], {"time": recording.time, "unit": "deg/s", "accel_data": recording})
+    for data, reading in (
+        (tmp_path / "rec.csv", {}),
+        (recording.to_frame(), {}),
+        (triads, {"time": recording.time, "units": units}),
+        gyros,
+    ):
+        found = il.fit_gyro(tmp_path / "a.json", data, **reading)
+        # Sums over thousands of turns may differ in their last bit by where the arrays lie in memory.
+        for name, pair in parameters(found.calibration).items():
+            assert pair == pytest.approx(expected[name], rel=1e-11), name
+        assert len(repr(found).splitlines()) <= 12
+    with pytest.raises(ImulabError, match=r"fit_gyro: expected a record .*, found the recording"):
+        il.fit_gyro(recording, recording)
+
+
+def test_the_allan_deviation_takes_samples_or_a_column(array):
+    folder, still, readings = array
+    plain = il.allan_deviation(still.si("gyro_2"), rate=100.0)
+    for data, more in ((still, {}), (folder / "still.csv", {}), (still.to_frame("polars"), {})):
+        curve = il.allan_deviation(data, column="gyro_2", **more)
+        np.testing.assert_allclose(curve.deviation, plain.deviation, rtol=1e-9)
+    by_name = il.allan_deviation({"gyro_2": readings[:, 1]}, 100.0, unit=still.units["gyro_2"])
+    np.testing.assert_allclose(by_name.deviation, plain.deviation, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda s: il.allan_deviation(s), "several columns; expected column=, one of gyro_1"),
+        (lambda s: il.allan_deviation(s, column="gyro_9"), "no column 'gyro_9'; expected column=, one of gyro_1"),
+        (lambda s: il.allan_deviation(s.si("gyro_1")), "samples without a time: expected rate=, in Hz"),
+        (lambda s: il.allan_deviation(s, 100.0, column="gyro_1"), "rate does not go with such data"),
+        (lambda s: il.allan_deviation(3.0, 100.0), "expected samples, found the number 3.0"),
+        (lambda s: il.allan_deviation(None, 100.0), "data: expected a file name"),
+        (lambda s: il.allan_deviation(s.si("gyro_1"), 0.0), "sampling rate 0: expected a positive number"),
+    ],
+)
+def test_allan_deviations_that_cannot_be_are_refused_in_a_line(array, call, words):
+    with pytest.raises(ImulabError, match=words):
+        call(array[1])

@@ -29,9 +29,9 @@ from imulab._version import VERSION as __version__  # noqa: N811
 
 if TYPE_CHECKING:
     from imulab.errors import ImulabError as ImulabError
-    from imulab.estimation.allan import allan_deviation as allan_deviation
     from imulab.exporters import export as export
     from imulab.gravity import normal_gravity as normal_gravity
+    from imulab.procedures.allan import allan_deviation as allan_deviation
     from imulab.procedures.apply import apply as apply
     from imulab.procedures.centrifuge.fit import CentrifugeFit as CentrifugeFit
     from imulab.procedures.centrifuge.fit import fit_centrifuge as fit_centrifuge
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from imulab.procedures.tumble.compare import check_tumble as check_tumble
     from imulab.procedures.tumble.fit import TumbleFit as TumbleFit
     from imulab.procedures.tumble.fit import fit_tumble as fit_tumble
+    from imulab.procedures.tumble.gyrofit import fit_gyro as fit_gyro
     from imulab.procedures.tumble.segment import find_attitudes as find_attitudes
     from imulab.procedures.tumble.simulate import simulate_tumble as simulate_tumble
     from imulab.procedures.warmup.cycles import find_power_cycle as find_power_cycle
@@ -68,7 +69,7 @@ _HOME = {
     "ArrayFit": "procedures.gyro_array.fit",
     "FuseOptions": "procedures.gyro_array.fuse",
     "Fused": "procedures.gyro_array.fuse",
-    "allan_deviation": "estimation.allan",
+    "allan_deviation": "procedures.allan",
     "calibrate_array": "procedures.gyro_array.public",
     "check_tumble": "procedures.tumble.compare",
     "compare_methods": "procedures.gyro_array.public",
@@ -85,6 +86,7 @@ _HOME = {
     "export": "exporters",
     "find_attitudes": "procedures.tumble.segment",
     "find_power_cycle": "procedures.warmup.cycles",
+    "fit_gyro": "procedures.tumble.gyrofit",
     "fit_centrifuge": "procedures.centrifuge.fit",
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",

@@ -24,13 +24,11 @@ Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mappi
 Window: TypeAlias = str | tuple[float | None, float | None]
 
 
-class Sampling(TypedDict, total=False):
-    """How data are to be understood: `time` to `units` of arrays and data frames, `layout` to `instance` of files.
+class Part(TypedDict, total=False):
+    """How data are to be understood: arrays and data frames by `time` to `units`, files by `layout` to `instance`.
 
     Attributes
     ----------
-    rate
-        Sampling rate, Hz, of arrays without `time`.
     time
         Times of an array, s, shape (n,).
     unit
@@ -43,7 +41,6 @@ class Sampling(TypedDict, total=False):
         One IMU of several, from 1.
     """
 
-    rate: float | None
     time: ArrayLike | None
     unit: str | None
     units: Mapping[str, str] | None
@@ -51,6 +48,12 @@ class Sampling(TypedDict, total=False):
     topic: str | None
     instance: int | None
     element: int | None
+
+
+class Sampling(Part, total=False):
+    """The same, and `rate`: samples per second, Hz, of arrays without `time`."""
+
+    rate: float | None
 
 
 class Reading(Sampling, total=False):

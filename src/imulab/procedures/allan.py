@@ -1,0 +1,101 @@
+"""The Allan deviation of what people have: samples and their rate, or a column of a file, recording or data frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any, Unpack
+
+import numpy as np
+
+from imulab.errors import DataError, OptionError, listed
+from imulab.estimation import allan
+from imulab.estimation.allan import AllanCurve
+from imulab.estimation.sampling import sampling_rate
+from imulab.frames import is_frame
+from imulab.procedures.inputs import Data, Part, Window, as_recording
+from imulab.recording import Array, Recording, check_finite
+
+
+def allan_deviation(
+    data: Data,
+    rate: float | None = None,
+    taus: str | Array = "octave",
+    *,
+    column: str | None = None,
+    window: Window | None = None,
+    **reading: Unpack[Part],
+) -> AllanCurve:
+    """Compute the overlapping Allan deviation of evenly spaced samples.
+
+    ``sigma^2(m / rate) = sum_k (x_{k+2m} - 2 x_{k+m} + x_k)^2 / (2 (m / rate)^2 (N - 2m))``, x the integral of the
+    samples less their mean, N its length (NIST SP 1065).
+
+    Parameters
+    ----------
+    data
+        Rate or specific force, shape (n,), n >= 3, in any unit; or a file, recording, data frame or arrays by name, of
+        which one column is taken, in SI.
+    rate
+        Sampling rate, Hz, of samples without a time.
+    taus
+        ``octave`` (m = 1, 2, 4 ...), ``dense`` (24 a decade), or averaging times in s, shape (t,), which are rounded to
+        whole numbers of samples.
+    column
+        Which column of several.
+    window
+        First and last time to use, s.
+    reading
+        How arrays and files are to be understood: `time`, `unit` or `units`; `layout`, `topic`, `instance`, `element`.
+
+    Raises
+    ------
+    DataError
+        Fewer than 3 samples, or samples that are not finite.
+    OptionError
+        `taus` or `rate` cannot be used, or which column is meant is not said.
+
+    Examples
+    --------
+    Readings that alternate by 1 differ by 2 from one to the next, and not at all in pairs:
+
+    >>> import numpy as np
+    >>> import imulab as il
+    >>> curve = il.allan_deviation(np.tile([1.0, -1.0], 8), rate=10.0, taus=np.array([0.1, 0.2]))
+    >>> curve.tau.tolist(), [round(float(each), 6) for each in curve.deviation]
+    ([0.1, 0.2], [1.414214, 0.0])
+
+    A column of a recording, which knows its rate:
+
+    >>> still = il.simulate_array(experiment="static", duration=60.0)
+    >>> il.allan_deviation(still, column="gyro_1").tau[:3].round(3).tolist()
+    [0.01, 0.02, 0.04]
+    """
+    if not isinstance(data, str | PathLike | Recording | Mapping) and not is_frame(data) and _is_line(data):
+        if rate is None:
+            raise OptionError("allan_deviation: samples without a time: expected rate=, in Hz")
+        return allan.allan_deviation(np.asarray(data, dtype=np.float64), rate, taus)
+    given: dict[str, Any] = {**reading, "rate": rate, "window": window}
+    recording = as_recording(data, given, allan_deviation)
+    names = [name for name in recording.columns if name != "time"]
+    chosen = column or (names[0] if len(names) == 1 else None)
+    if chosen not in names:
+        found = "several columns" if column is None else f"no column {column!r}"
+        raise OptionError(
+            f"allan_deviation: {recording.name}: {found}; expected column=, one of {listed(names, column)}"
+        )
+    check_finite(recording, [chosen])
+    return allan.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
+
+
+def _is_line(data: object) -> bool:
+    """Return whether data are numbers one after the other."""
+    try:
+        found = np.asarray(data)
+    except ValueError:
+        return False
+    if found.dtype.kind not in "iufb":
+        return False
+    if found.ndim == 0:
+        raise DataError(f"allan_deviation: data: expected samples, found the number {found}")
+    return found.ndim == 1
