@@ -1,9 +1,11 @@
 """From samples to spectra that noise models are fitted to: transform, spikes, lines, steps, band, regression, test."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.fft import dct
-from scipy.signal import butter, lfilter
+from scipy.signal import butter, cheby1, lfilter
 
 import imulab as il
 from imulab.errors import DataError, OptionError
@@ -373,3 +375,52 @@ def test_the_white_noise_of_the_real_array(real_data):
     medians = np.array([np.median([level[f"gyro_{axis}_{k}"] for k in range(1, 9)], axis=0) for axis in "xyz"])
     assert medians[:, 0] == pytest.approx([0.022, 0.023, 0.014], rel=0.02)
     assert ((medians[:, 1] > 0.85 * medians[:, 0]) & (medians[:, 1] < medians[:, 0])).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "truth",
+    [
+        {"white": 1.0},
+        {"white": 1.0, "walk": 0.0173},
+        {"white": 1.0, "flicker": 0.3},
+        {"white": 1.0, "gm1_sigma": 0.3, "gm1_time": 100.0},
+    ],
+    ids=["N", "NK", "NB", "NG"],
+)
+def test_the_test_of_fit_rejects_2_to_6_percent_of_good_fits(truth, reduced):
+    rng, trials = np.random.default_rng(5), 200 if reduced else 2000
+    (spectrum,) = transformed(rng.standard_normal(100_000), 0.1).spectra
+    values = np.array([truth.get(name, 0.0) for name in NAMES])
+    lam, d = prepare([spectrum]).variances(values[None])[0], spectrum.freedom
+    power = lam * rng.chisquare(d, (trials, len(d))) / d
+    best = fit(prepare([spectrum]), (values > 0)[None], time_limits([spectrum]), power, np.tile(d, (trials, 1)))
+    rejected = [
+        hold([replace(spectrum, power=each)], found, 5.0).probability < 0.05
+        for each, found in zip(power, best.values, strict=True)
+    ]
+    slack = 0.02 if reduced else 0.004
+    assert 0.02 - slack <= np.mean(rejected) <= 0.06 + slack
+
+
+@pytest.mark.slow
+def test_a_sensor_filter_does_not_decide_about_slow_noise(reduced):
+    """Band and allowance on logs behind filters: the terms of the truth, not those of the roll-off or the ripple."""
+    right, without_band, total = 0, 0, 0
+    for form in (butter(2, 0.4), cheby1(4, 0.1, 0.7)):
+        for truth, model in (({"walk": 0.002}, "NK"), ({"flicker": 0.03}, "NB"), ({}, "N")):
+            for seed in range(2 if reduced else 10):
+                x = lfilter(*form, samples(200_000, 0.01, seed, white=0.1, **truth))
+                (spectrum,) = transformed(x, 0.01).spectra
+                inside = within(spectrum, usable_band([spectrum]).highest)
+                (allowed,) = allow([inside], fitted([inside], "NGGK")[1]).spectra
+                total += 1
+                right += best_model(allowed) == model
+                without_band += best_model(spectrum) == model
+    assert right > 0.9 * total
+    assert without_band < 0.6 * total
+
+
+def best_model(spectrum):
+    models = ("N", "NK", "NB", "NBK")
+    return min(models, key=lambda model: fitted([spectrum], model)[2] + 4 * len(model))
