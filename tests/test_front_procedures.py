@@ -203,3 +203,14 @@ def test_the_allan_deviation_takes_samples_or_a_column(array):
 def test_allan_deviations_that_cannot_be_are_refused_in_a_line(array, call, words):
     with pytest.raises(ImulabError, match=words):
         call(array[1])
+
+
+def test_other_results_show_themselves_in_a_few_lines(array):
+    _, still, _ = array
+    tumble = il.simulate_tumble(gravity=9.81)
+    check = il.check_tumble(il.fit_tumble(tumble, order=1, gravity=9.81).calibration, tumble, gravity=9.81)
+    assert repr(check).startswith("Check(pass, p = ")
+    assert f"number {check.worst + 1} by {1e6 * abs(check.residuals[check.worst]) / 9.80665:.3g} µg" in repr(check)
+    assert repr(il.fuse(still)) == "Fused(6000 samples of 6 gyros on 1 axes, in deg/s)"
+    assert "least deviation" in repr(il.allan_deviation(still, column="gyro_1"))
+    assert len(repr(il.compare_methods(still)).splitlines()) == 8

@@ -18,7 +18,7 @@ _DENSE_PER_DECADE = 24
 _FEWEST = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AllanCurve:
     """Overlapping Allan deviation over averaging time.
 
@@ -36,6 +36,13 @@ class AllanCurve:
     deviation: Array
     standard_uncertainty: Array
     freedom: Array
+
+    def __repr__(self) -> str:
+        least = int(np.argmin(self.deviation))
+        return (
+            f"AllanCurve({len(self.tau)} averaging times from {self.tau[0]:.4g} to {self.tau[-1]:.4g} s, "
+            f"least deviation {self.deviation[least]:.3g} at {self.tau[least]:.4g} s)"
+        )
 
 
 def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -> AllanCurve:

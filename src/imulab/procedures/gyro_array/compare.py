@@ -35,7 +35,7 @@ _NOTHING = 1e-9  # of a gyro's noise
 _HALVES = 2 * FEWEST_ROBUST
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """Every method over one recording.
 
@@ -53,6 +53,13 @@ class Comparison:
     elements: Elements
     record: Calibration
     warnings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        lines = [f"Comparison of {len(self.figures)} methods, rate std in {' '.join(self.elements.units)}"]
+        for method, found in self.figures.items():
+            told = found if isinstance(found, str) else " ".join(f"{axis.rate_std:.4g}" for axis in found)
+            lines.append(f"  {method:13}  {told[:120]}")
+        return "\n".join(lines)
 
 
 def compare_methods(

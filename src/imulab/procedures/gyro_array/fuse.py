@@ -102,7 +102,7 @@ class FuseOptions:
             raise OptionError(f"rate {self.rate:g}: expected a positive number of Hz")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fused:
     """The fused rate.
 
@@ -132,6 +132,10 @@ class Fused:
     health: Health
     notes: tuple[str, ...] = ()
     block: Recording | None = None
+
+    def __repr__(self) -> str:
+        gyros, axes = self.elements.count, len(self.elements.axes)
+        return f"Fused({len(self.time)} samples of {gyros} gyros on {axes} axes, in {' '.join(self.elements.units)})"
 
 
 def fuse(

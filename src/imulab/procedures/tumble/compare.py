@@ -22,10 +22,11 @@ from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.units import from_si
 from imulab.verdict import Note
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Check:
     """How well a record still holds.
 
@@ -55,6 +56,14 @@ class Check:
     gravity: Gravity
     limit: float | None
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        p = "" if self.probability is None else f", p = {self.probability:.2g}"
+        worst = from_si(abs(float(self.residuals[self.worst])), "ug")
+        return (
+            f"Check({'pass' if self.passed else 'fail'}{p}, {len(self.residuals)} attitudes, the farthest off is "
+            f"number {self.worst + 1} by {worst:.3g} µg)"
+        )
 
     @property
     def passed(self) -> bool:
