@@ -90,7 +90,7 @@ def _warmup(folder: Path, size: int) -> list[str]:
     for i, temperature in enumerate((-40, -30, -20, -10, 0, 40, 50, 60)):
         for cycle in range(2):
             names.append(f"c{i}{cycle}.csv")
-            recording = il.simulate_warmup(temperature, sample_rate=size / 16 / 600, seed=[i, cycle])
+            recording = il.simulate_power_cycle(temperature, sample_rate=size / 16 / 600, seed=[i, cycle])
             il.write_csv(recording, folder / names[-1])
     return ["warmup", "fit", *names, "--model", "knot-log-cubic", "-o", "out.json"]
 

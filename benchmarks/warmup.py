@@ -37,7 +37,7 @@ def rows() -> list[Row]:
 
 def _fit(law: str, seed: int = 1) -> WarmupFit:
     cycles = [
-        find_power_cycle(il.simulate_warmup(t, law=law, seed=[seed, i, c]))
+        find_power_cycle(il.simulate_power_cycle(t, law=law, seed=[seed, i, c]))
         for i, t in enumerate(SOURCE_TEMPERATURES)
         for c in range(3)
     ]
@@ -140,7 +140,7 @@ def _bits(fits: dict[str, WarmupFit]) -> list[Row]:
 def _large() -> list[Row]:
     """8 temperatures x 5 cycles x 6 axes at 200 Hz for 600 s: 28.8 million values, averaged and fitted."""
     recordings = [
-        il.simulate_warmup(t, sample_rate=200.0, seed=[2, i, c])
+        il.simulate_power_cycle(t, sample_rate=200.0, seed=[2, i, c])
         for i, t in enumerate(SOURCE_TEMPERATURES)
         for c in range(5)
     ]
@@ -159,7 +159,7 @@ def _large() -> list[Row]:
 def _apply(fit: WarmupFit) -> list[Row]:
     found = []
     for duration, what in ((600.0, "half of it warming up"), (300.0, "all of it warming up")):
-        recording = il.simulate_warmup(-12.3, sample_rate=3e6 / duration, duration=duration, seed=3)
+        recording = il.simulate_power_cycle(-12.3, sample_rate=3e6 / duration, duration=duration, seed=3)
         for label in ("interval-cubic", "knot-log-cubic", "exponential (2)"):
             row = next(r for r in fit.models if r.label == label)
             section = {"table": row.table.to_section()}

@@ -50,10 +50,7 @@ def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["allan_deviation", "apply", "check_tumble", "find_attitudes", "fit_gyro", "fit_tumble", "normal_gravity", "read"],
-)
+@pytest.mark.parametrize("name", [*EXAMPLES, "plan_warmup", "simulate_power_cycle", "simulate_warmup", "warmup_table"])
 def test_the_example_of_a_public_function_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(imulab, name), name)

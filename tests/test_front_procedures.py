@@ -105,7 +105,7 @@ def cycles(tmp_path_factory):
     folder = tmp_path_factory.mktemp("warmup")
     paths = [folder / f"{number}_{at:g}.csv" for number in (1, 2) for at in TEMPERATURES]
     for path, (number, at) in zip(paths, [(n, t) for n in (1, 2) for t in TEMPERATURES], strict=True):
-        il.write_csv(il.simulate_warmup(at, seed=(1, number)), path)
+        il.write_csv(il.simulate_power_cycle(at, seed=(1, number)), path)
     return paths
 
 

@@ -42,7 +42,7 @@ def array():
 
 def warmup():
     temperatures = (-40.0, 0.0, 60.0)
-    cycles = [il.simulate_warmup(at, seed=(1, number)) for number in (1, 2) for at in temperatures]
+    cycles = [il.simulate_power_cycle(at, seed=(1, number)) for number in (1, 2) for at in temperatures]
     return il.fit_warmup(cycles, temperatures=temperatures, model="exponential")
 
 

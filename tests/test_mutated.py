@@ -19,7 +19,7 @@ from imulab.procedures.loading import load_any, loads
 from imulab.procedures.reports import compare_records
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.procedures.unit_tables import tables_of_all
-from imulab.procedures.warmup.simulate import simulate_warmup
+from imulab.procedures.warmup.simulate import simulate_power_cycle
 from imulab.recording import Recording
 from imulab.records.json_text import content_sha256
 from test_centrifuge_apply import record_of
@@ -87,7 +87,7 @@ def real():
     array = {"elements": 3, "axes": 3}
     still = simulate_array(experiment="static", duration=20.0, **array)
     moving = simulate_array(experiment="moving", duration=20.0, **array)
-    starts = [simulate_warmup(at, seed=[k, at + 20]) for at in (-20, 0, 20) for k in (1, 2)]
+    starts = [simulate_power_cycle(at, seed=[k, at + 20]) for at in (-20, 0, 20) for k in (1, 2)]
     warmup = il.fit_warmup(starts, temperatures=[-20, 0, 20], settling_time=300.0).calibration
     time = np.arange(50) * 0.02
     flown = {"dtg_x": np.sin(time), "dtg_y": np.cos(time), "accel_x": 30 * np.sin(time), "accel_y": 30 * np.cos(time)}

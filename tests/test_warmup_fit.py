@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import binom
 
 import imulab as il
+from imulab import simulate_power_cycle
 from imulab.errors import DataError
 from imulab.procedures.warmup.curves import make_curves
 from imulab.procedures.warmup.cycles import find_power_cycle
@@ -41,7 +42,9 @@ def simulated():
     """Three cycles at each temperature, both laws."""
     return {
         law: [
-            find_power_cycle(il.simulate_warmup(t, law=law, seed=[1, i, c])) for i, t in enumerate(AT) for c in range(3)
+            find_power_cycle(simulate_power_cycle(t, law=law, seed=[1, i, c]))
+            for i, t in enumerate(AT)
+            for c in range(3)
         ]
         for law in ("smooth", "bent")
     }
@@ -111,7 +114,7 @@ def test_exponentials_find_their_time_constants_and_amplitudes():
 
 
 def test_binning_costs_nothing_against_the_raw_samples(simulated):
-    recording = il.simulate_warmup(-20, seed=[9])
+    recording = il.simulate_power_cycle(-20, seed=[9])
     cycles = [
         find_power_cycle(replace(recording, metadata=recording.metadata | {"power_on_temperature": t})) for t in "01"
     ]
@@ -181,7 +184,7 @@ def test_the_table_of_models_comes_out_as_stated(law):
     jumps = []
     for seed in range(TESTS):
         cycles = [
-            find_power_cycle(il.simulate_warmup(t, law=law, sample_rate=2.0, seed=[100 + seed, i, c]))
+            find_power_cycle(simulate_power_cycle(t, law=law, sample_rate=2.0, seed=[100 + seed, i, c]))
             for i, t in enumerate(AT)
             for c in range(3)
         ]
@@ -262,7 +265,9 @@ def test_the_settling_time_is_where_the_curves_stay_small(simulated):
 def test_units_of_a_type_are_told_apart_from_cycles():
     def many(spread):
         return [
-            find_power_cycle(il.simulate_warmup(t, serial=f"U{u}", unit_spread=spread, seed=[u, i, c], accel=False))
+            find_power_cycle(
+                il.simulate_power_cycle(t, serial=f"U{u}", unit_spread=spread, seed=[u, i, c], accel=False)
+            )
             for u in range(4)
             for i, t in enumerate((-40, -20, 0))
             for c in range(2)
@@ -283,7 +288,7 @@ def test_intervals_of_the_curve_cover(reduced):
     times = np.array([2.0, 20, 60, 120, 200, 290])
     for trial in range(trials):
         cycles = [
-            find_power_cycle(il.simulate_warmup(t, seed=[trial, i, c], sample_rate=2, scatter=0, accel=False))
+            find_power_cycle(simulate_power_cycle(t, seed=[trial, i, c], sample_rate=2, scatter=0, accel=False))
             for i, t in enumerate(at)
             for c in range(5)
         ]

@@ -57,7 +57,9 @@ if TYPE_CHECKING:
     from imulab.procedures.warmup.fit import WarmupFit as WarmupFit
     from imulab.procedures.warmup.fit import fit_warmup as fit_warmup
     from imulab.procedures.warmup.plan import plan_warmup as plan_warmup
+    from imulab.procedures.warmup.simulate import simulate_power_cycle as simulate_power_cycle
     from imulab.procedures.warmup.simulate import simulate_warmup as simulate_warmup
+    from imulab.procedures.warmup.spreadsheet import warmup_table as warmup_table
     from imulab.readers import read as read
     from imulab.readers import read_blocks as read_blocks
     from imulab.recording import Recording as Recording
@@ -97,8 +99,10 @@ _HOME = {
     "read": "readers",
     "read_blocks": "readers",
     "simulate_centrifuge": "procedures.centrifuge.simulate",
+    "simulate_power_cycle": "procedures.warmup.simulate",
     "simulate_tumble": "procedures.tumble.simulate",
     "simulate_warmup": "procedures.warmup.simulate",
+    "warmup_table": "procedures.warmup.spreadsheet",
     "write": "writers",
     "write_csv": "writers",
     "write_report": "procedures.reports",

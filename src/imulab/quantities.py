@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from numbers import Integral, Real
 from typing import Any
 
-from imulab.errors import OptionError, UnitError
+from imulab.errors import OptionError, UnitError, quoted
 from imulab.units import parse_unit, to_si
 
 _BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
+_FRACTIONS = {"1": 1.0, "%": 1e-2, "ppm": 1e-6}
+RANDOM_WALK = {"deg/sqrt(h)": 0.01745329251994329577 / 60, "deg/√h": 0.01745329251994329577 / 60, "rad/sqrt(s)": 1.0}
+"""Units of an angle random walk that texts have, in SI."""
 _BETWEEN = re.compile(r"\s+to\s+|[:,]")
 """What stands between the ends of an interval: a colon; a comma or "to" are read as well."""
 _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*)?")
@@ -38,6 +42,83 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     if unit.quantity != kind:
         raise OptionError(expected)
     return to_si(float(match[1]), unit.symbol)
+
+
+def in_si(value: float | str, option: str, kind: str, default_unit: str) -> float:
+    """Return a quantity in SI: a number is in SI already, a text is read as on the command line.
+
+    Raises
+    ------
+    OptionError
+        It is neither a number nor a text that `quantity` reads.
+    """
+    if isinstance(value, str):
+        return quantity(value, option, kind, default_unit)
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise OptionError(
+            f"{option} {quoted(value)}: expected a number in SI, or a text with a unit such as '1 {default_unit}'"
+        )
+    return float(value)
+
+
+def of_units(value: float | str, option: str, units: Mapping[str, float]) -> float:
+    """Return a quantity in SI as `in_si` does; a text has one of a few units, or the first of them where it has none.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    if not isinstance(value, str):
+        return in_si(value, option, "", next(iter(units)))
+    match = _QUANTITY.fullmatch(value)
+    unit = (match[2] or next(iter(units))).strip() if match else ""
+    if match is None or unit not in units:
+        raise OptionError(f"{option} {value!r}: expected a number with one of {', '.join(units)}")
+    return float(match[1]) * units[unit]
+
+
+def fraction(value: float | str, option: str, bare: str = "1") -> float:
+    """Return a fraction, given as a number or as a text such as ``1 %``; `bare` is the unit of a text without one.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    try:
+        return of_units(value, option, {bare: _FRACTIONS[bare], **_FRACTIONS})
+    except OptionError:
+        raise OptionError(f"{option} {quoted(value)}: expected a fraction such as 0.01 or 1 %") from None
+
+
+def temperature_list(values: Sequence[float] | str, option: str = "--temperatures") -> list[float]:
+    """Return temperatures, degC, given as numbers or as a text such as ``-40,-30,0``.
+
+    Raises
+    ------
+    OptionError
+        It is no such list.
+    """
+    try:
+        return [float(part) for part in (values.split(",") if isinstance(values, str) else values)]
+    except (TypeError, ValueError):
+        raise OptionError(f"{option} {quoted(values)}: expected numbers such as -40,-30,0") from None
+
+
+def whole(value: int | str, option: str) -> int:
+    """Return a whole number, given as one or as a text.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    if isinstance(value, str):
+        return whole_number(value, option)
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        raise OptionError(f"{option} {quoted(value)}: expected a whole number")
+    return int(value)
 
 
 def size(text: str, option: str) -> int:
@@ -114,7 +195,8 @@ def labelled(label: str, names: Iterable[str]) -> Iterator[None]:
         word = str(error).partition(" ")[0].rstrip(":")
         if word not in names:
             raise
-        raise OptionError(label.format(word) + str(error)[len(word) :]) from None
+        shown = word.strip("_").replace("_", "-") if label.startswith("--") else word
+        raise OptionError(label.format(shown) + str(error)[len(word) :]) from None
 
 
 def number(text: str, option: str) -> float:

@@ -61,9 +61,9 @@ def allan(
 
 def describe(found: dict[str, Any]) -> str:
     """Return coefficients and curves as tables."""
-    from imulab.cli.columns import aligned
     from imulab.report.elements import plain_number
     from imulab.report.noise_figures import coefficient_rows, shown_unit
+    from imulab.shown import aligned
 
     lines = [f"{printable(found['file'])}: {found['samples']} samples at {found['sample_rate']['value']:.6g} Hz", ""]
     lines += aligned(["column", "coefficient", "value", "u", "unit"], coefficient_rows(found))

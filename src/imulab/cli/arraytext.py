@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from json import dumps
 
-from imulab.cli.columns import aligned
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.experiments import ExperimentRow
 from imulab.procedures.gyro_array.model import unit_of_angle
 from imulab.procedures.gyro_array.traces import method_texts
 from imulab.report.elements import plain_number
+from imulab.shown import aligned
 
 _TITLE = {
     "static": "at rest, 100 Hz, 2000 s",

@@ -219,7 +219,7 @@ def _fraction(text: str, option: str) -> float:
 
 
 def _plan_text(result: Plan, wanted: float) -> str:
-    from imulab.cli.columns import aligned
+    from imulab.shown import aligned
     from imulab.units import from_si
 
     rows = [

@@ -7,22 +7,25 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from imulab.cli.speech import hold, speech
 from imulab.cli.speech import note as note
 from imulab.cli.speech import warn as warn
-from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.errors import ImulabError, OptionError
 from imulab.quantities import chosen as chosen
+from imulab.quantities import labelled
 from imulab.quantities import quantity as quantity
 from imulab.quantities import whole_number as whole_number
+from imulab.records.recognition import is_json as is_json
 
 if TYPE_CHECKING:
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
+Result = TypeVar("Result")
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
 LayoutFile = Annotated[
@@ -42,7 +45,6 @@ Window = Annotated[
 ]
 Element = Annotated[str | None, typer.Option("--element", metavar="N", help="One IMU of a file of several, from 1.")]
 _PAPER = (".pdf", ".png", ".svg", ".docx")
-_LARGEST_RECORD = 1 << 26
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
@@ -72,6 +74,12 @@ def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recor
     recording = read(file, layout, **part)
     list(with_notes([recording], notes=False, tell=hold))
     return recording
+
+
+def call(function: Callable[..., Result], *given: Any, **options: Any) -> Result:
+    """Call a public function with a command's options; a refusal names them as the command line does."""
+    with labelled("--{}", options):
+        return function(*given, **options)
 
 
 class GivenFiles:
@@ -126,25 +134,6 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
         if not target.parent.is_dir():
             raise OptionError(f"{name}: cannot be written: no such folder")
         taken[target] = name
-
-
-def is_json(file: str) -> bool:
-    """Return whether a file is a record rather than a recording: an object that holds one of two marks of records."""
-    from imulab.records.calibration import FORMAT
-
-    if file == "-" or (Path(file).exists() and not Path(file).is_file()):
-        return False  # a pipe can be read only once, as a recording
-    try:
-        with Path(file).open("rb") as stream:
-            if not stream.read(64).lstrip().startswith(b"{"):
-                return False
-            stream.seek(0)
-            content = stream.read(_LARGEST_RECORD)
-            return FORMAT.encode() in content or b'"content_sha256"' in content
-    except FileNotFoundError:
-        raise ReadError(f"{file}: no such file") from None
-    except OSError as error:
-        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
 
 
 @contextmanager

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from imulab.atomic_write import replacing
-from imulab.cli.columns import aligned
 from imulab.cli.options import check_outputs, is_json, quantity, whole_number
 from imulab.errors import ImulabError, OptionError, RecordError
 from imulab.procedures.loading import load
@@ -26,6 +25,7 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.json_text import json_text
 from imulab.report import render_plan
+from imulab.shown import aligned
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.writers import write_csv_to
 

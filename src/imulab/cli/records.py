@@ -187,9 +187,9 @@ def show(
 
 def _show_formats(names: list[str], *, json: bool) -> None:
     """Print what can be read, or the layouts of these names."""
-    from imulab.cli.columns import aligned
     from imulab.readers import formats, shipped
     from imulab.readers.layout import EXAMPLE, shipped_file, shipped_names
+    from imulab.shown import aligned
     from imulab.toml import load_toml
 
     tables = {}

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from imulab.cli.columns import aligned
 from imulab.cli.speech import coloured
 from imulab.errors import ReadError
 from imulab.printable import printable
@@ -18,6 +17,7 @@ from imulab.records.calibration import Calibration
 from imulab.records.comparison import Comparison
 from imulab.records.json_text import json_text
 from imulab.report.elements import ReportTable, format_uncertain, plain_number
+from imulab.shown import aligned
 from imulab.verdict import SENTENCES, Verdict
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,16 +12,14 @@ from imulab.cli.options import (
     GivenFiles,
     OutputFile,
     ReportFile,
+    call,
     check_outputs,
     naming,
-    quantity,
     warn,
-    whole_number,
 )
 from imulab.errors import OptionError
 from imulab.procedures.warmup.choices import TEMPERATURES
-from imulab.procedures.warmup.task import OPTIONS, temperature_list
-from imulab.quantities import number as _number
+from imulab.procedures.warmup.task import OPTIONS
 
 if TYPE_CHECKING:
     from imulab.procedures.warmup.plan import WarmupPlan
@@ -43,51 +40,33 @@ def plan(
     cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "5",
     soak: Annotated[str, typer.Option(help="Before each power-on, unit off, s, or with a unit.")] = "60 min",
     record: Annotated[str, typer.Option(help="Recording from power-on on, s, or with a unit.")] = "10 min",
-    ramp: Annotated[str, typer.Option(metavar="K/MIN", help="Of the chamber, K/min.")] = "2",
-    noise: Annotated[str, typer.Option(metavar="N", help="Angle random walk, deg/sqrt(h).")] = "0.3",
-    repeatability: Annotated[str, typer.Option(help="Of the curve from cycle to cycle, percent.")] = "2",
+    ramp: Annotated[str, typer.Option(metavar="K/MIN", help="Of the chamber, K/min.")] = "2 K/min",
+    noise: Annotated[str, typer.Option(metavar="N", help="Angle random walk, deg/sqrt(h).")] = "0.3 deg/sqrt(h)",
+    repeatability: Annotated[str, typer.Option(help="Of the curve from cycle to cycle, percent.")] = "2 %",
     output: Annotated[
         str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Programme to write.")
     ] = None,
     json: AsJson = False,
 ) -> None:
     """Write the chamber programme and its duration; say which temperatures are missing."""
-    from math import sqrt
-
-    from imulab.cli.columns import aligned
-    from imulab.procedures.warmup.plan import plan_warmup, programme
-    from imulab.writers import write_csv
+    from imulab.procedures.warmup.plan import plan_warmup
+    from imulab.units import from_si
 
     check_outputs([output], [])
-    seconds = quantity(record, "--record", "time", "s")
-    result = plan_warmup(
-        temperatures=temperature_list(temperatures),
-        cycles=whole_number(cycles, "--cycles"),
-        soak=quantity(soak, "--soak", "time", "s"),
-        record=seconds,
-        ramp=_number(ramp, "--ramp") / 60,
-    )
-    share = _number(repeatability, "--repeatability")
+    result = call(
+        plan_warmup, temperatures=temperatures, cycles=cycles, soak=soak, record=record, ramp=ramp, noise=noise,
+        repeatability=repeatability,
+    )  # fmt: skip
     if output:
-        write_csv(programme(result), output)
-    white = result.curve_uncertainty(60 * _number(noise, "--noise"), seconds, min(300.0, seconds / 2))
+        result.save(output)
     if json:
-        _print_plan(result, white, share / sqrt(result.cycles))
+        _print_plan(result)
         return
-    total = len(result.temperatures) * result.cycles
+    print(result)
     print(
-        f"{total} power cycles: {len(result.temperatures)} temperatures, {result.cycles} at each; "
-        f"the chamber is busy for {_hours(result.duration)}"
-    )
-    rows = []
-    for at in result.temperatures:
-        steps = [step for step in result.steps if step.cycle and step.set_point == at]
-        end = steps[-1].start + steps[-1].duration
-        rows.append([f"{at:g}", str(result.cycles), _hours(steps[0].start), _hours(end)])
-    print("\n".join(aligned(["set point, degC", "cycles", "from, h:min", "to, h:min"], rows)))
-    print(
-        f"standard uncertainty of a curve at its temperature: {white:.2g} deg/h from noise, and "
-        f"{share / sqrt(result.cycles):.2g} % of the curve from repeatability"
+        "standard uncertainty of a curve at its temperature: "
+        f"{from_si(result.curve_uncertainty, 'deg/h'):.2g} deg/h from noise, and "
+        f"{100 * result.repeatability_uncertainty:.2g} % of the curve from repeatability"
     )
     for message in result.warnings:
         warn(message)
@@ -97,11 +76,10 @@ def plan(
         print(f"plan: {output}")
 
 
-def _print_plan(result: WarmupPlan, white: float, share: float) -> None:
+def _print_plan(result: WarmupPlan) -> None:
     from dataclasses import asdict
 
     from imulab.records.json_text import json_text
-    from imulab.units import to_si
 
     print(
         json_text(
@@ -110,8 +88,8 @@ def _print_plan(result: WarmupPlan, white: float, share: float) -> None:
                 "cycles": result.cycles,
                 "duration": {"value": result.duration, "unit": "s"},
                 "steps": [asdict(step) for step in result.steps],
-                "curve_uncertainty": {"value": to_si(white, "deg/h"), "unit": "rad/s"},
-                "repeatability": {"value": share / 100, "unit": "1"},
+                "curve_uncertainty": {"value": result.curve_uncertainty, "unit": "rad/s"},
+                "repeatability": {"value": result.repeatability_uncertainty, "unit": "1"},
                 "proposal": list(result.proposal),
                 "warnings": list(result.warnings),
             }
@@ -134,35 +112,13 @@ def simulate(
 ) -> None:
     """Simulate the power cycles of a warm-up test, a file each, into a folder."""
     from imulab.procedures.warmup.simulate import simulate_warmup
-    from imulab.writers import write_csv
 
-    at = temperature_list(temperatures)
-    number, many = whole_number(cycles, "--cycles"), whole_number(units, "--units")
-    start = whole_number(seed, "--seed")
-    for name, value, low in (("--cycles", number, 1), ("--units", many, 1), ("--seed", start, 0)):
-        if value < low:
-            raise OptionError(f"{name} {value}: expected a whole number from {low}")
-    options: dict[str, Any] = {
-        "duration": quantity(duration, "--duration", "time", "s"),
-        "sample_rate": quantity(rate, "--rate", "frequency", "Hz"),
-    }
-    spread = 0.0 if many == 1 else 0.05
-    simulate_warmup(at[0], law=law, seed=start, unit_spread=spread, **options)  # refuses before a folder is made
-    folder = Path(output)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OptionError(f"{output}: the folder cannot be made: {error.strerror}") from None
-    for unit in range(many):
-        serial = f"SIM-{start + unit:04d}"
-        for i, temperature in enumerate(at):
-            for cycle in range(number):
-                recording = simulate_warmup(
-                    temperature, law=law, serial=serial, unit_spread=spread, seed=[start, unit, i, cycle], **options
-                )
-                middle = f"{serial}_" if many > 1 else ""
-                write_csv(recording, folder / f"cycle_{middle}{temperature:+g}_{cycle + 1}.csv")
-    print(f"{output}: {many * len(at) * number} recordings of {options['duration']:g} s, law {law}")
+    made = call(
+        simulate_warmup, temperatures=temperatures, cycles=cycles, law=law, duration=duration, rate=rate, units=units,
+        seed=seed,
+    )  # fmt: skip
+    made.save(output)
+    print(f"{output}: {len(made)} recordings of {made.duration:g} s, law {law}")
 
 
 @with_options(OPTIONS)
@@ -192,30 +148,22 @@ def table(
     ] = False,
 ) -> None:
     """Write a record's table as CSV for a spreadsheet, or make a record of such a table."""
-    from imulab.atomic_write import write_text
     from imulab.cli.options import is_json
     from imulab.device.blob import is_blob
-    from imulab.procedures.loading import load
-    from imulab.procedures.warmup.spreadsheet import read_table, record_of_table, write_table
-    from imulab.quantities import labelled
+    from imulab.procedures.warmup.spreadsheet import warmup_table
 
     check_outputs([output], [file])
-    if is_json(file) or is_blob(file):  # a blob is refused by `load`, with the reason
-        with naming(file), labelled("--{}", ["per-second"]):
-            text = write_table(load(file), per_second=per_second)
+    if is_json(file) or is_blob(file):  # a blob is refused as a record, with the reason
+        with naming(file):
+            sheet = call(warmup_table, file, per_second=per_second)
         if not output.lower().endswith(".csv"):
             raise OptionError(f"{output}: expected a name that ends in .csv")
-        write_text(output, text)
+        sheet.save(output)
         print(f"table: {output}")
         return
     if output.lower().endswith(".csv"):
         raise OptionError(f"{output}: a table makes a record; expected a name such as unit.json")
     if per_second:
         raise OptionError(f"{file}: --per-second writes a table; how a table that is read counts, its titles say")
-    record_of_table(read_table(file), file).save(output)
+    warmup_table(file).save(output)
     print(f"record: {output}")
-
-
-def _hours(seconds: float) -> str:
-    minutes = round(seconds / 60)
-    return f"{minutes // 60}:{minutes % 60:02d} h"

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from html import escape
 from pathlib import Path
@@ -27,11 +27,9 @@ from imulab.records.calibration import Calibration
 from imulab.report.channels import channel_figures
 from imulab.report.elements import Figure, format_uncertain
 from imulab.report.plots import Plot, Plots
+from imulab.shown import LINES, WIDTH, html_table
 from imulab.verdict import SENTENCES
 
-LINES = 12
-"""Of a result, as Python shows it."""
-_WIDTH = 150
 _COLOURS = {"good": "#1f6f8b", "look": "#b58a1b", "bad": "#c8553d"}
 _STYLE = "border-left: 4px solid {}; padding: 2px 10px; margin: 6px 0"
 
@@ -68,7 +66,7 @@ def html(record: Calibration) -> str:
         f'<div style="{_STYLE.format(_COLOURS[verdict.state])}">{escape(verdict.state)}: '
         f"{escape(SENTENCES[verdict.state])}<ul>{reasons}</ul></div>"
         f"<p>{escape(_headline(record))}</p>"
-        f"{_table(['parameter', 'value', 'standard uncertainty', 'unit'], rows)}</div>"
+        f"{html_table(['parameter', 'value', 'standard uncertainty', 'unit'], rows)}</div>"
     )
 
 
@@ -106,7 +104,7 @@ def recording_html(recording: Recording) -> str:
     head = "".join(f"<br>{escape(key)}: {escape(value)}" for key, value in recording.metadata.items())
     return (
         f"<div><strong>{escape(recording.name)}</strong>: {len(recording)} samples{length}{head}"
-        f"{_table(['column', 'unit', 'min', 'mean', 'max', 'missing'], rows)}</div>"
+        f"{html_table(['column', 'unit', 'min', 'mean', 'max', 'missing'], rows)}</div>"
     )
 
 
@@ -135,10 +133,4 @@ def _number(row: Row) -> tuple[str, str]:
 
 
 def _short(line: str) -> str:
-    return line if len(line) <= _WIDTH else line[: _WIDTH - 4] + " ..."
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{escape(title)}</th>" for title in titles)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return line if len(line) <= WIDTH else line[: WIDTH - 4] + " ..."

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from imulab.errors import OptionError
-from imulab.procedures.warmup.model import SOURCE_TEMPERATURES
+from imulab.procedures.warmup.choices import TEMPERATURES
+from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, temperature_list, whole
 from imulab.recording import Recording
+from imulab.shown import Shown
+from imulab.writers import write_csv
 
 WIDEST = 20.0
 """Intervals of power-on temperature wider than this are warned about, K."""
@@ -28,8 +33,8 @@ class Step:
     cycle: int
 
 
-@dataclass(frozen=True)
-class WarmupPlan:
+@dataclass(frozen=True, repr=False)
+class WarmupPlan(Shown):
     """A chamber programme.
 
     Attributes
@@ -46,6 +51,10 @@ class WarmupPlan:
         What is wrong with the temperatures, and what would be better.
     proposal
         Temperatures with the wide intervals divided; the same where none is wide.
+    record
+        Duration of a recording, s.
+    noise, repeatability
+        Angle random walk, rad/sqrt(s), and how well cycles repeat, as a fraction of the curve.
     """
 
     steps: tuple[Step, ...]
@@ -54,23 +63,58 @@ class WarmupPlan:
     cycles: int
     warnings: tuple[str, ...]
     proposal: tuple[float, ...]
+    record: float
+    noise: float
+    repeatability: float
 
-    def curve_uncertainty(self, random_walk: float, record: float, settling_time: float) -> float:
-        """Return what white noise alone adds to a curve at its temperature, `random_walk` per root second.
+    @property
+    def curve_uncertainty(self) -> float:
+        """What white noise alone adds to a curve at its temperature, rad/s.
 
         ``N sqrt(p / T_M + 1 / (t_end - T_M)) / sqrt(n)`` for p = 4 coefficients, n cycles and the settled reference.
         """
-        rest = max(record - settling_time, record / 2)
-        return float(random_walk * np.sqrt(_FREE / settling_time + 1 / rest) / np.sqrt(self.cycles))
+        settling = min(300.0, self.record / 2)
+        rest = max(self.record - settling, self.record / 2)
+        return float(self.noise * np.sqrt(_FREE / settling + 1 / rest) / np.sqrt(self.cycles))
+
+    @property
+    def repeatability_uncertainty(self) -> float:
+        """What cycles that do not repeat add to it, as a fraction of the curve."""
+        return self.repeatability / math.sqrt(self.cycles)
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return how long the programme takes, and when each temperature has its turn."""
+        head = (
+            f"{len(self.temperatures) * self.cycles} power cycles: {len(self.temperatures)} temperatures, "
+            f"{self.cycles} at each; the chamber is busy for {_hours(self.duration)}"
+        )
+        rows = []
+        for at in self.temperatures:
+            steps = [step for step in self.steps if step.cycle and step.set_point == at]
+            end = steps[-1].start + steps[-1].duration
+            rows.append([f"{at:g}", str(self.cycles), _hours(steps[0].start), _hours(end)])
+        return head, ["set point, degC", "cycles", "from, h:min", "to, h:min"], rows
+
+    def save(self, path: str | Path) -> None:
+        """Write the programme as CSV.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        write_csv(programme(self), path)
 
 
 def plan_warmup(
+    temperatures: Sequence[float] | str = TEMPERATURES,
     *,
-    temperatures: Sequence[float] = SOURCE_TEMPERATURES,
-    cycles: int = 5,
-    soak: float = 3600.0,
-    record: float = 600.0,
-    ramp: float = 2.0 / 60,
+    cycles: int | str = 5,
+    soak: float | str = "60 min",
+    record: float | str = "10 min",
+    ramp: float | str = "2 K/min",
+    noise: float | str = "0.3 deg/sqrt(h)",
+    repeatability: float | str = "2 %",
     start: float = 23.0,
 ) -> WarmupPlan:
     """Write the chamber programme of a warm-up test.
@@ -90,6 +134,10 @@ def plan_warmup(
         From power-on, s.
     ramp
         Of the chamber, K/s.
+    noise
+        Angle random walk, rad/sqrt(s).
+    repeatability
+        Of the curve from cycle to cycle, a fraction of it.
     start
         Chamber temperature at the beginning, degC.
 
@@ -97,12 +145,33 @@ def plan_warmup(
     ------
     OptionError
         A value is out of range.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> plan = il.plan_warmup([-40, -20, 0, 20, 40, 60], cycles=3, soak="30 min")
+    >>> print(plan)
+    18 power cycles: 6 temperatures, 3 at each; the chamber is busy for 13:40 h
+    set point, degC  cycles  from, h:min  to, h:min
+                -40       3       0:32 h     2:32 h
+                -20       3       2:42 h     4:42 h
+                  0       3       4:52 h     6:52 h
+                 20       3       7:02 h     9:02 h
+                 40       3       9:12 h    11:12 h
+                 60       3      11:22 h    13:22 h
     """
-    at = tuple(map(float, temperatures))
+    at = tuple(temperature_list(temperatures, "temperatures"))
+    count, soak, record = (
+        whole(cycles, "cycles"),
+        in_si(soak, "soak", "time", "s"),
+        in_si(record, "record", "time", "s"),
+    )
+    ramp = of_units(ramp, "ramp", {"K/min": 1 / 60, "K/s": 1.0})
+    walk, share = of_units(noise, "noise", RANDOM_WALK), fraction(repeatability, "repeatability", "%")
     if len(at) < 2 or not (np.diff(at) > 0).all():
         raise OptionError(f"temperatures {' '.join(f'{t:g}' for t in at)}: expected two or more, ascending, in degC")
     for name, value, low, high in (
-        ("cycles", cycles, 1, 1000),
+        ("cycles", count, 1, 1000),
         ("soak", soak, 0, 1e6),
         ("record", record, 60, 1e6),
         ("ramp", ramp, 1e-4, 10),
@@ -120,7 +189,7 @@ def plan_warmup(
 
     for set_point in at:
         add(abs(set_point - here) / ramp, set_point, "ramp, unit off", 0)
-        for cycle in range(1, cycles + 1):
+        for cycle in range(1, count + 1):
             add(soak, set_point, "soak, unit off", cycle)
             add(record, set_point, "power on and record", cycle)
         here = set_point
@@ -135,14 +204,19 @@ def plan_warmup(
         f"measure also at {' '.join(f'{t:g}' for t in proposal if low < t < high)} degC"
         for low, high in wide
     )
-    if cycles < 2:
+    if count < 2:
         warnings += ("one cycle at each temperature does not show how well cycles repeat: expected two or more",)
     if record < 330:
         warnings += (
             f"recordings of {record:g} s: warm-up takes about 300 s, and 30 s more make the settled reference: "
             "record longer",
         )
-    return WarmupPlan(tuple(steps), clock, at, cycles, warnings, tuple(proposal))
+    return WarmupPlan(tuple(steps), clock, at, count, warnings, tuple(proposal), record, walk, share)
+
+
+def _hours(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes // 60}:{minutes % 60:02d} h"
 
 
 def _pieces(low: float, high: float) -> int:

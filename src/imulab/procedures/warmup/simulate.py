@@ -8,12 +8,19 @@ package and housing: ``x(t) = T + sum_j h_j (1 - exp(-t / tau_j))``. What is see
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import overload
 
 import numpy as np
 
 from imulab.errors import OptionError, listed
+from imulab.procedures.warmup.choices import TEMPERATURES
+from imulab.quantities import in_si, temperature_list, whole
 from imulab.recording import Array, Recording
+from imulab.shown import Shown
 from imulab.units import STANDARD_GRAVITY
+from imulab.writers import write_csv
 
 LAWS = ("smooth", "bent")
 GYRO_AXES = ("gyro_x", "gyro_y", "gyro_z")
@@ -74,7 +81,7 @@ def warmup_truth(time: Array, temperature: float, law: str = "smooth", *, stages
     )
 
 
-def simulate_warmup(
+def simulate_power_cycle(
     temperature: float,
     *,
     law: str = "smooth",
@@ -123,6 +130,12 @@ def simulate_warmup(
     ------
     OptionError
         A value is out of range.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.simulate_power_cycle(-20.0, accel=False).metadata["serial"]
+    'SIM-0001'
     """
     _check(temperature, law, duration, sample_rate, repeatability, scatter)
     rng = np.random.default_rng(seed)
@@ -152,6 +165,128 @@ def simulate_warmup(
         "law": law,
     }
     return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated cycle at {temperature:g} degC")
+
+
+def simulate_warmup(
+    temperatures: Sequence[float] | str = TEMPERATURES,
+    *,
+    cycles: int | str = 3,
+    law: str = "smooth",
+    duration: float | str = "600 s",
+    rate: float | str = "10 Hz",
+    units: int | str = 1,
+    seed: int | str = 1,
+) -> PowerCycles:
+    """Simulate the power cycles of a warm-up test, a recording each; see `simulate_power_cycle`.
+
+    Parameters
+    ----------
+    temperatures
+        Set points of the chamber, degC.
+    cycles
+        Power cycles at each.
+    law
+        How the zeros depend on temperature: ``smooth`` or ``bent``.
+    duration, rate
+        Of each recording, s, and its samples per second, Hz; or texts with a unit.
+    units
+        Number of units of one type; several differ by 5 % in their self-heating.
+    seed
+        Of the random numbers.
+
+    Raises
+    ------
+    OptionError
+        A value is out of range.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> cycles = il.simulate_warmup([-40, 0, 60], cycles=2, duration="400 s")
+    >>> len(cycles), cycles[0].metadata["set_point"], len(cycles[0])
+    (6, '-40', 4000)
+    """
+    at = temperature_list(temperatures, "temperatures")
+    number, many, start = whole(cycles, "cycles"), whole(units, "units"), whole(seed, "seed")
+    for name, value, low in (("cycles", number, 1), ("units", many, 1), ("seed", start, 0)):
+        if value < low:
+            raise OptionError(f"{name} {value}: expected a whole number from {low}")
+    seconds, per_second = in_si(duration, "duration", "time", "s"), in_si(rate, "rate", "frequency", "Hz")
+    made = PowerCycles(tuple(at), number, law, seconds, per_second, many, start)
+    for temperature in at:
+        _check(temperature, law, seconds, per_second, 0.0, 0.0)
+    return made
+
+
+@dataclass(frozen=True, repr=False)
+class PowerCycles(Shown, Sequence[Recording]):
+    """The recordings of a simulated warm-up test, each made when it is asked for.
+
+    Attributes
+    ----------
+    temperatures
+        Set points, degC.
+    cycles
+        At each.
+    law, duration, rate, units, seed
+        As for `simulate_warmup`, in SI.
+    """
+
+    temperatures: tuple[float, ...]
+    cycles: int
+    law: str
+    duration: float
+    rate: float
+    units: int
+    seed: int
+
+    def __len__(self) -> int:
+        return self.units * len(self.temperatures) * self.cycles
+
+    @overload
+    def __getitem__(self, index: int) -> Recording: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Recording]: ...
+
+    def __getitem__(self, index: int | slice) -> Recording | list[Recording]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        number = range(len(self))[index]
+        which, cycle = divmod(number, self.cycles)
+        unit, i = divmod(which, len(self.temperatures))
+        serial, at = f"SIM-{self.seed + unit:04d}", self.temperatures[i]
+        made = simulate_power_cycle(
+            at, law=self.law, serial=serial, unit_spread=0.0 if self.units == 1 else 0.05,
+            seed=[self.seed, unit, i, cycle], duration=self.duration, sample_rate=self.rate,
+        )  # fmt: skip
+        middle = f"{serial}_" if self.units > 1 else ""
+        return replace(made, name=f"cycle_{middle}{at:+g}_{cycle + 1}")
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return what they are in a sentence."""
+        at = " ".join(f"{t:g}" for t in self.temperatures)
+        head = f"{len(self)} simulated power cycles of {self.duration:g} s at {at} degC, law {self.law}"
+        return head, [], []
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write a CSV file for each into a folder, which is made if it is not there.
+
+        Raises
+        ------
+        OptionError
+            The folder cannot be made, or a file cannot be written.
+        """
+        home = Path(folder)
+        try:
+            home.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OptionError(f"{folder}: the folder cannot be made: {error.strerror}") from None
+        files: list[Path] = []
+        for recording in self:
+            write_csv(recording, home / f"{recording.name}.csv")
+            files.append(home / f"{recording.name}.csv")
+        return files
 
 
 def _check(

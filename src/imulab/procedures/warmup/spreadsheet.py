@@ -4,21 +4,108 @@ from __future__ import annotations
 
 import csv
 import io
+import os
+from dataclasses import dataclass
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from imulab.atomic_write import write_text
+from imulab.device.blob import is_blob
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
 from imulab.procedures.warmup.choices import MODELS
 from imulab.procedures.warmup.model import WarmupTable, check_table, record_table
 from imulab.procedures.warmup.solve import amplitude_slopes
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.recognition import is_json
+from imulab.shown import Shown
 from imulab.units import conversion_factor, parse_unit
 
 _CUBIC = ("interval-cubic", "knot-cubic")
 _SI = {"rate": "rad/s", "acceleration": "m/s^2"}
+
+
+@dataclass(frozen=True, repr=False)
+class TableSheet(Shown):
+    """The table of a warm-up record as CSV, and the record.
+
+    Attributes
+    ----------
+    text
+        Of the CSV file.
+    record
+        The record that was given, or one that holds the table that was given.
+    """
+
+    text: str
+    record: Calibration
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """Titles, then a row per interval or knot and axis."""
+        return [line.split(",") for line in self.text.splitlines() if not line.startswith("#")]
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return the settings and the rows."""
+        titles, *rows = self.rows
+        head = ", ".join(line.removeprefix("# ") for line in self.text.splitlines() if line.startswith("#"))
+        return f"warm-up table: {head}", titles, rows
+
+    def save(self, path: str | Path) -> None:
+        """Write the table where the name ends in .csv, else the record.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        if str(path).lower().endswith(".csv"):
+            write_text(path, self.text)
+        else:
+            self.record.save(path)
+
+
+def warmup_table(data: Calibration | str | PathLike[str], *, per_second: bool = False) -> TableSheet:
+    """Return the table of a warm-up record as CSV, or a record made of such a table, which was edited.
+
+    Parameters
+    ----------
+    data
+        A warm-up record, its file, or the CSV file of a table.
+    per_second
+        Whether cubics are in powers of t in s, not of t / settling time.
+
+    Raises
+    ------
+    RecordError, ReadError
+        The file is neither, or the record is of another procedure.
+    OptionError
+        The table is no cubic in t, which has no powers of t.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> cycles = il.simulate_warmup([-40, 0, 60], cycles=2)
+    >>> fit = il.fit_warmup(cycles, temperatures=(-40, 0, 60), model="knot-cubic")
+    >>> sheet = il.warmup_table(fit.calibration, per_second=True)
+    >>> sheet.rows[0][:4]
+    ['temperature [degC]', 'axis', 'unit', 'c0']
+    >>> sheet.save("table.csv")
+    >>> il.warmup_table("table.csv").record.procedure
+    'warmup'
+    """
+    if not isinstance(data, Calibration):
+        from imulab.procedures.inputs import as_record
+
+        file = os.fspath(data) if isinstance(data, str | PathLike) else None
+        if file is not None and not (is_json(file) or is_blob(file)):  # a blob is refused as a record, with the reason
+            made = record_of_table(read_table(file), file)
+            return TableSheet(write_table(made, per_second=per_second), made)
+        data = as_record(data, "warmup_table")
+    return TableSheet(write_table(data, per_second=per_second), data)
 
 
 def write_table(record: Calibration, *, per_second: bool = False) -> str:
@@ -57,7 +144,7 @@ def write_table(record: Calibration, *, per_second: bool = False) -> str:
     if per_second:
         if table.model not in _CUBIC:
             raise OptionError(
-                f"per-second: a table of model {table.model} has no powers of t; expected one of {' '.join(_CUBIC)}"
+                f"per_second: a table of model {table.model} has no powers of t; expected one of {' '.join(_CUBIC)}"
             )
         coefficients = coefficients / table.settling_time ** np.arange(4)
     titles = _titles(table.model, table.coefficients.shape[2], per_second)

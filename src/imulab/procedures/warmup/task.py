@@ -19,7 +19,7 @@ from imulab.procedures.options import (
 )
 from imulab.procedures.procedure import Files, Task, source_of
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, TEMPERATURES
-from imulab.quantities import number, quantity
+from imulab.quantities import number, quantity, temperature_list
 
 if TYPE_CHECKING:
     from imulab.procedures.warmup.cycles import Cycle
@@ -41,20 +41,6 @@ def _fit(
         )
 
     return fit_warmup([cycle(name) for name in files], **values["fit"]).calibration
-
-
-def temperature_list(text: str, option: str = "--temperatures") -> list[float]:
-    """Return ``-40,-30,...`` as numbers.
-
-    Raises
-    ------
-    OptionError
-        It is no such list.
-    """
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise OptionError(f"{option} {text!r}: expected numbers such as -40,-30,0") from None
 
 
 def _names(text: str, option: str) -> list[str]:

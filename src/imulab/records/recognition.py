@@ -1,0 +1,28 @@
+"""Whether a file is a record, told by its first bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from imulab.errors import ReadError
+
+_LARGEST_RECORD = 1 << 26
+
+
+def is_json(file: str) -> bool:
+    """Return whether a file is a record rather than a recording: an object that holds one of two marks of records."""
+    from imulab.records.calibration import FORMAT
+
+    if file == "-" or (Path(file).exists() and not Path(file).is_file()):
+        return False  # a pipe can be read only once, as a recording
+    try:
+        with Path(file).open("rb") as stream:
+            if not stream.read(64).lstrip().startswith(b"{"):
+                return False
+            stream.seek(0)
+            content = stream.read(_LARGEST_RECORD)
+            return FORMAT.encode() in content or b'"content_sha256"' in content
+    except FileNotFoundError:
+        raise ReadError(f"{file}: no such file") from None
+    except OSError as error:
+        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
