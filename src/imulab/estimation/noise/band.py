@@ -12,7 +12,8 @@ from imulab.estimation.noise.cosine import frequencies
 from imulab.estimation.noise.spectrum import Spectrum
 from imulab.recording import Array
 
-_AGREE, _SIGMAS = 0.03, 3.0
+_AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.05
+"""How far two octaves may be apart, beyond so many sigma; up to where these sigma tell the agreement well."""
 _FULL = 0.999
 _MANY, _FEWEST = 200, 16
 """Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
@@ -41,10 +42,12 @@ class Band:
 
 
 def usable_band(spectra: Sequence[Spectrum]) -> Band:
-    """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do.
+    """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do, and once more.
 
-    They agree within 3 % + 3 sigma. Quantisation of an angle rises with frequency: where white noise and quantisation
-    together, ``a + b s^2``, bring the three highest octaves to agreement, the band is full too.
+    They agree within 3 % + 3 sigma. Of these 3 % a long record makes a term of its own, and N comes out too small: so
+    the band ends an octave lower, unless 3 sigma are more than 5 %. Quantisation of an angle rises with frequency:
+    where white noise and quantisation together, ``a + b s^2``, bring the three highest octaves to agreement, or the
+    highest octave is plainly above the next, the band is full.
     """
     nyquist = 0.5 / spectra[0].interval
     f, p, d = (np.concatenate(each) for each in zip(*((frequencies(s), s.power, s.freedom) for s in spectra)))  # noqa: B905
@@ -53,32 +56,40 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
         return Band(nyquist, True)
     while d[f <= highest / 4].sum() > 2 * _MANY:
         if _agree(f, p, d, highest, 2):
-            return Band(highest, highest > _FULL * nyquist)
+            far, u = _apart(f, p, d, highest, 2)
+            full = highest > _FULL * nyquist
+            if _SIGMAS * u[0] > _SHARP or (full and far[0] < -_SIGMAS * u[0]):
+                return Band(highest, full)
+            return Band(highest / 2, False)
         highest /= 2
     return Band(nyquist, True, False)
 
 
 def _agree(f: Array, p: Array, d: Array, highest: float, octaves: int) -> bool:
     """Whether the highest octaves have the same level, each against the highest."""
+    far, u = _apart(f, p, d, highest, octaves)
+    return bool((np.abs(far) <= _AGREE + _SIGMAS * u).all())
+
+
+def _apart(f: Array, p: Array, d: Array, highest: float, octaves: int) -> tuple[Array, Array]:
+    """Logarithms of the levels of octaves in terms of the highest one, and their uncertainties; inf where one is 0."""
     level, freedom = [], []
     for k in range(octaves):
         inside = (f <= highest / 2**k * (1 + 1e-9)) & (f > highest / 2 ** (k + 1)) & (d > 0)
         freedom.append(float(d[inside].sum()))
         level.append(float((p * d)[inside].sum()) / max(freedom[-1], 1.0))
     if min(freedom) <= 0 or min(level) <= 0:
-        return False
-    far = np.abs(np.log(np.array(level[1:]) / level[0]))
+        return np.full(octaves - 1, np.inf), np.zeros(octaves - 1)
     u = np.sqrt(2 / np.array(freedom[1:]) + 2 / freedom[0])
-    return bool((far <= _AGREE + _SIGMAS * u).all())
+    return np.asarray(np.log(np.array(level[1:]) / level[0])), np.asarray(u)
 
 
 def _rising(f: Array, p: Array, d: Array, nyquist: float) -> bool:
     """Whether white noise and quantisation of an angle explain the three highest octaves."""
-    top = (f > nyquist / 8) & (d > 0)
+    top = (f > nyquist / 8) & (d > 0) & (p > 0)
     square = 4 * np.sin(np.pi / 2 * f[top] / nyquist) ** 2
-    weight = d[top] / p[top] ** 2
-    basis = np.column_stack([np.ones_like(square), square])
-    a, b = np.linalg.solve(basis.T * weight @ basis, basis.T * weight @ p[top])
+    root = np.sqrt(d[top]) / p[top]
+    a, b = np.linalg.lstsq(np.column_stack([root, root * square]), root * p[top])[0]
     if b <= 0 or a <= 0:
         return False
     return _agree(f[top], p[top] / (a + b * square), d[top], nyquist, 3)
