@@ -65,7 +65,7 @@ def _apply(folder: Path, size: int) -> list[str]:
 
 
 def _tumble(folder: Path, size: int) -> list[str]:
-    il.write_csv(il.simulate_tumble(order=1, attitudes=24, sample_rate=size / 170, gravity=G), folder / "in.csv")
+    il.write_csv(il.simulate_tumble(order=1, attitudes=24, rate=size / 170, gravity=G), folder / "in.csv")
     return ["tumble", "fit", "in.csv", "--gravity", str(G), "-o", "out.json"]
 
 

@@ -24,6 +24,14 @@ EXAMPLES = (
     "normal_gravity",
     "read",
 )
+OF_COMMANDS = (
+    "plan_tumble",
+    "plan_warmup",
+    "simulate_power_cycle",
+    "simulate_tumble",
+    "simulate_warmup",
+    "warmup_table",
+)
 PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
 
 
@@ -50,7 +58,7 @@ def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
 
 
-@pytest.mark.parametrize("name", [*EXAMPLES, "plan_warmup", "simulate_power_cycle", "simulate_warmup", "warmup_table"])
+@pytest.mark.parametrize("name", [*EXAMPLES, *OF_COMMANDS])
 def test_the_example_of_a_public_function_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (example,) = doctest.DocTestFinder(recurse=False).find(getattr(imulab, name), name)

@@ -154,7 +154,7 @@ def test_a_manifest_that_cannot_be_is_refused_in_a_line(centrifuge):
 
 
 def test_the_gyroscopes_are_fitted_in_every_form_as_by_the_command(tmp_path):
-    il.write_csv(il.simulate_tumble(gravity=9.81, seed=7), tmp_path / "rec.csv")
+    il.write_csv(il.simulate_tumble(order=1, gravity=9.81, seed=7), tmp_path / "rec.csv")
     recording = il.read(tmp_path / "rec.csv")
     il.fit_tumble(recording, order=1, gravity=9.81).save(tmp_path / "a.json")
     given = [str(tmp_path / "rec.csv"), "--accel", str(tmp_path / "a.json"), "-o", str(tmp_path / "cli.json")]
@@ -207,7 +207,7 @@ def test_allan_deviations_that_cannot_be_are_refused_in_a_line(array, call, word
 
 def test_other_results_show_themselves_in_a_few_lines(array):
     _, still, _ = array
-    tumble = il.simulate_tumble(gravity=9.81)
+    tumble = il.simulate_tumble(order=1, gravity=9.81)
     check = il.check_tumble(il.fit_tumble(tumble, order=1, gravity=9.81).calibration, tumble, gravity=9.81)
     assert repr(check).startswith("Check(pass, p = ")
     assert f"number {check.worst + 1} by {1e6 * abs(check.residuals[check.worst]) / 9.80665:.3g} µg" in repr(check)

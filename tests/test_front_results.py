@@ -33,7 +33,7 @@ def fit(recording):
 
 
 def tumble():
-    return il.fit_tumble(il.find_attitudes(il.simulate_tumble(gravity=G)), order=5, gravity=G)
+    return il.fit_tumble(il.find_attitudes(il.simulate_tumble(order=1, gravity=G)), order=5, gravity=G)
 
 
 def array():

@@ -137,8 +137,8 @@ def test_the_command_plans_for_the_linearised_method_and_says_when_attitudes_are
     (warning,) = json.loads(shown.stdout)["warnings"]
     assert warning.startswith(few.partition(": ")[2])
     for arguments, message in (
-        (["--method", "linearized"], "method 'linearized': expected one of norm linearised"),
-        (["--method", "linearised", "--order", "0"], "order 0 needs method norm, found method linearised"),
+        (["--method", "linearized"], "--method 'linearized': expected one of norm linearised"),
+        (["--method", "linearised", "--order", "0"], "--order 0 needs method norm, found method linearised"),
     ):
         refused = imulab(*plan, "--attitudes", "13", *arguments)
         assert refused.returncode == 2

@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from imulab.procedures.tumble.fit import TumbleFit as TumbleFit
     from imulab.procedures.tumble.fit import fit_tumble as fit_tumble
     from imulab.procedures.tumble.gyrofit import fit_gyro as fit_gyro
+    from imulab.procedures.tumble.planning import plan_tumble as plan_tumble
     from imulab.procedures.tumble.segment import find_attitudes as find_attitudes
     from imulab.procedures.tumble.simulate import simulate_tumble as simulate_tumble
     from imulab.procedures.warmup.cycles import find_power_cycle as find_power_cycle
@@ -95,6 +96,7 @@ _HOME = {
     "load": "procedures.loading",
     "load_manifest": "procedures.centrifuge.manifest",
     "normal_gravity": "gravity",
+    "plan_tumble": "procedures.tumble.planning",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",
     "read_blocks": "readers",

@@ -18,6 +18,7 @@ from imulab.cli.options import (
     ReportFile,
     Topic,
     Window,
+    call,
     check_outputs,
     chosen,
     progress_bar,
@@ -82,18 +83,9 @@ def plan(
     from imulab.cli.plan import run
 
     run(
-        order=order,
-        attitudes=attitudes,
-        output=output,
-        noise=noise,
-        criterion=criterion,
-        source=source,
-        add=add,
-        report=report,
-        method=method,
-        distinct_verticals=distinct_verticals,
-        json=json,
-    )
+        output=output, report=report, json=json, attitudes=attitudes, noise=noise, order=order, criterion=criterion,
+        from_=source, add=add, method=method, distinct_verticals=distinct_verticals,
+    )  # fmt: skip
 
 
 def simulate(
@@ -114,18 +106,10 @@ def simulate(
     from imulab.writers import check_writable, write
 
     check_writable(output)
-    recording = simulate_tumble(
-        attitudes=whole_number(attitudes, "--attitudes"),
-        order=whole_number(order, "--order"),
-        sample_rate=quantity(rate, "--rate", "frequency", "Hz"),
-        hold=quantity(hold, "--hold", "time", "s"),
-        move=quantity(move, "--move", "time", "s"),
-        noise=quantity(noise, "--noise", "acceleration", "mg"),
-        unit=unit,
-        gravity=quantity(gravity, "--gravity", "acceleration", "m/s^2"),
-        knock=None if knock is None else whole_number(knock, "--knock"),
-        seed=whole_number(seed, "--seed"),
-    )
+    recording = call(
+        simulate_tumble, attitudes=attitudes, order=order, rate=rate, hold=hold, move=move, noise=noise, unit=unit,
+        gravity=gravity, knock=knock, seed=seed,
+    )  # fmt: skip
     write(recording, output)
     print(f"{output}: {len(recording)} samples, {attitudes} attitudes, serial {recording.metadata['serial']}")
 

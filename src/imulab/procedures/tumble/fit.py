@@ -147,7 +147,7 @@ def fit_tumble(
     A simulated unit, whose true bias stands in the recording's head:
 
     >>> import imulab as il
-    >>> recording = il.simulate_tumble(gravity=9.81)
+    >>> recording = il.simulate_tumble(order=1, gravity=9.81)
     >>> fit = il.fit_tumble(recording, order=1, gravity=9.81)
     >>> abs(fit.calibration.parameters["bias_x"].value - float(recording.metadata["truth_bias_x"])) < 1e-3
     True

@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.errors import OptionError
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
 
@@ -38,21 +39,21 @@ class _Path:
 
 def simulate_tumble(
     *,
-    attitudes: int | Array = 24,
-    order: int = 1,
+    attitudes: int | str | Array = 24,
+    order: int | str = 2,
     truth: Mapping[str, float] | None = None,
-    gravity: float = STANDARD_GRAVITY,
-    sample_rate: float = 100.0,
-    hold: float = 5.0,
-    move: float = 2.0,
-    noise: float = 0.7e-3 * STANDARD_GRAVITY,
+    gravity: float | str = "9.80665 m/s^2",
+    rate: float | str = "100 Hz",
+    hold: float | str = "5 s",
+    move: float | str = "2 s",
+    noise: float | str = "0.7 mg",
     unit: str = "m/s^2",
     scale: float | None = None,
-    knock: int | None = None,
+    knock: int | str | None = None,
     knock_shift: float = 5e-3 * STANDARD_GRAVITY,
     gyro: bool = True,
     temperature: float = 24.0,
-    seed: int = 1,
+    seed: int | str = 1,
 ) -> Recording:
     """Simulate a tumble recording with columns time, accel_*, gyro_*, temperature, truth_accel_*.
 
@@ -69,8 +70,8 @@ def simulate_tumble(
         Parameters in SI by the names of a record; without it a random MEMS-size sensor.
     gravity
         m/s^2.
-    sample_rate
-        Hz.
+    rate
+        Samples per second, Hz.
     hold, move
         Duration of each static attitude and of the motion between two, s.
     noise
@@ -94,12 +95,26 @@ def simulate_tumble(
     ------
     OptionError
         A value is out of range.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.simulate_tumble(attitudes=12, hold="3 s", unit="g").units["accel_x"]
+    'g'
     """
+    order, seed = whole(order, "order"), whole(seed, "seed")
+    knock = None if knock is None else whole(knock, "knock")
+    sample_rate, gravity = in_si(rate, "rate", "frequency", "Hz"), in_si(gravity, "gravity", "acceleration", "m/s^2")
+    hold, move = in_si(hold, "hold", "time", "s"), in_si(move, "move", "time", "s")
+    noise = in_si(noise, "noise", "acceleration", "mg")
     _check(order, sample_rate, hold, move, noise, gravity)
     if seed < 0:
         raise OptionError(f"seed {seed}: expected a whole number from 0")
     rng = np.random.default_rng(seed)
-    directions = _spread(attitudes, rng) if isinstance(attitudes, int) else np.asarray(attitudes, dtype=np.float64)
+    if isinstance(attitudes, int | str):
+        directions = _spread(whole(attitudes, "attitudes"), rng)
+    else:
+        directions = np.asarray(attitudes, dtype=np.float64)
     if knock is not None and not 1 <= knock <= len(directions):
         raise OptionError(f"knock {knock}: expected the number of an attitude, 1 to {len(directions)}")
     nominal = _nominal_scale(unit, scale)
