@@ -311,7 +311,10 @@ def test_a_record_that_lacks_a_part_is_refused(key):
             {"parameters": {"bias_x": {"value": "much", "standard_uncertainty": 1, "unit": "g"}}},
             "parameters.bias_x.value",
         ),
-        ({"parameters": {"bias_x": {"value": 1.0, "unit": "g"}}}, "parameters.bias_x.standard_uncertainty"),
+        (
+            {"parameters": {"bias_x": {"value": 1.0, "unit": "g"}}},
+            "the record lacks parameters.bias_x.standard_uncertainty",
+        ),
         ({"parameters": {"bias_x": 3.5}}, "parameters.bias_x: "),
         ({"sensor": {"serial": 42}}, "sensor.serial: "),
         ({"sources": {"file": "tumble.csv"}}, "sources: "),

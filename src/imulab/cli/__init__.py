@@ -25,8 +25,6 @@ def main(arguments: Sequence[str] | None = None, *, project: bool = True) -> int
     """
     # Before NumPy is loaded: the matrices here are small, and threads for them cost more than they save.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Nor does anything here need plugins of pydantic, which looks for them in every package that is installed.
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     try:
         from imulab.cli.speech import begin
 

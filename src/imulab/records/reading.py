@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import fields, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,12 @@ from imulab.errors import RecordError
 from imulab.printable import first_hidden
 from imulab.records.calibration import BLOB_MAGIC, FORMAT, SCHEMA_VERSION, Calibration
 from imulab.records.json_text import content_sha256
-from imulab.records.sections import check_sizes
+from imulab.records.sections import check_sizes, read
 from imulab.verdict import as_judged
 
 _CREATED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)", re.ASCII)
 _ROUNDING = 1.0 + 1e-6
+_NEEDED = ("procedure", "sensor", "created", "software", "sources", "model", "parameters", "covariance", "fit")
 
 
 def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
@@ -70,39 +70,17 @@ def parsed(data: bytes, name: str) -> tuple[Calibration, str]:
     return _validated(content, name), found
 
 
-@cache
-def _adapter() -> Any:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(Calibration)
-
-
 def _validated(content: dict[str, Any], name: str) -> Calibration:
-    from pydantic import ValidationError
-
     known = {f.name for f in fields(Calibration)} - {"sections"}
     sections = {key: value for key, value in content.items() if key not in known and key != "format"}
-    for key in (
-        "procedure",
-        "sensor",
-        "created",
-        "software",
-        "sources",
-        "model",
-        "parameters",
-        "covariance",
-        "fit",
-    ):
+    for key in _NEEDED:
         if key not in content:
             raise RecordError(f"{name}: the record lacks {key!r}")
     try:
-        record: Calibration = _adapter().validate_python(
-            {key: value for key, value in content.items() if key in known} | {"sections": sections}
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise RecordError(f"{name}: {where}: {first['msg']}, found {_short(first['input'])}") from None
+        check_sizes(content)
+        record = read(Calibration, {key: content[key] for key in known & content.keys()} | {"sections": sections})
+    except RecordError as error:
+        raise RecordError(f"{name}: {error}") from None
     if place := first_hidden(content):
         raise RecordError(f"{name}: {place} holds a control or bidirectional character; expected plain text")
     if not _CREATED.fullmatch(record.created):
@@ -112,7 +90,6 @@ def _validated(content: dict[str, Any], name: str) -> Calibration:
         raise RecordError(f"{name}: covariance: expected a {size} x {size} matrix")
     try:
         _check_numbers(record)
-        check_sizes(content)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
     return replace(record, warnings=as_judged(record.warnings, record.verdict))
@@ -145,8 +122,3 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _refuse_constant(text: str) -> None:
     raise ValueError(f"{text} is not a finite number")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

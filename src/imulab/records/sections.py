@@ -1,9 +1,10 @@
 """Typed parts of a record: dataclasses that say what a procedure's code reads, and their reading from plain values.
 
 The annotation of a field says what its value must be: ``float`` (any number), ``int`` (0 or more), ``str``, ``bool``,
-one of the kinds below, another `Part`, or ``list[X]``, ``dict[str, X]`` and ``X | None`` of these.
-``Annotated[list[X], 3]`` has three entries, and ``Annotated[list[X], "axes"]`` as many as every other list of that name
-in the part that is read. Keys that no field names are ignored. A field whose name is a word of Python ends with ``_``.
+``Literal`` words, one of the kinds below, another `Part`, or ``list[X]``, ``tuple[X, ...]``, ``dict[str, X]`` and
+``X | None`` of these. ``Annotated[list[X], 3]`` has three entries, and ``Annotated[list[X], "axes"]`` as many as every
+other list of that name in the part that is read. Keys that no field names are ignored. A field whose name is a word of
+Python ends with ``_``. Other dataclasses are made by calling them, so that a record must hold all that they need.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import (
     Annotated,
     Any,
     ClassVar,
+    Literal,
     TypeVar,
     dataclass_transform,
     get_args,
@@ -32,6 +34,7 @@ LARGEST = 1e100
 """No quantity of a sensor is larger; squares and cubes of what is not are numbers."""
 
 P = TypeVar("P", bound="Part")
+T = TypeVar("T")
 _Counts = dict[str, tuple[int, str]]
 
 
@@ -127,9 +130,9 @@ def part(record: Calibration, kind: type[P], place: str = "") -> P:
     return read(kind, value, place)
 
 
-def read(kind: type[P], value: Any, place: str = "") -> P:
-    """Return plain values as a part; errors as for `part`."""
-    found: P = _read(value, kind, place, {})
+def read(kind: type[T], value: Any, place: str = "") -> T:
+    """Return plain values as a part or another dataclass; errors as for `part`."""
+    found: T = _read(value, kind, place, {})
     return found
 
 
@@ -154,44 +157,64 @@ def check_sizes(value: Any, where: str = "") -> None:
 
 
 @cache
-def _fields(kind: Any) -> list[tuple[str, Any, Any]]:
-    """Name, annotation and default factory of each field."""
+def _fields(kind: Any) -> list[tuple[str, Any, Field[Any]]]:
+    """Name and annotation of each field, and the field."""
     hints = get_type_hints(kind, include_extras=True)
-    return [(field.name, hints[field.name], field.default_factory) for field in fields(kind)]
+    return [(field.name, hints[field.name], field) for field in fields(kind)]
 
 
 def _read(value: Any, kind: Any, where: str, counts: _Counts) -> Any:
     origin, given = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
     if kind in _PLAIN:
-        return _tested(value, _PLAIN[kind], where)
+        plain = _tested(value, _PLAIN[kind], where)
+        return float(plain) if kind is float else plain
+    if origin is Literal:
+        return _tested(value, Kind(f"one of {' '.join(given)}", lambda word: word in given), where)
     if origin is Annotated and isinstance(given[1], Kind):
         return _tested(value, given[1], where)
     if origin is Annotated:
         return _read_list(value, get_args(given[0])[0], where, counts, given[1])
     if origin is list:
         return _read_list(value, given[0], where, counts, None)
-    if origin is dict:
+    if origin is tuple:
+        return tuple(_read_list(value, given[0], where, counts, None))
+    if origin in (dict, Mapping):
         held = {key: _read(item, given[1], _at(where, key), counts) for key, item in _named(value, where).items()}
-        return Named(held, where)
+        return Named(held, where) if origin is dict else held
     if given:  # X | None, or a list or else a plain value
         others = [other for other in given if other is not type(None)]
         if value is None and len(others) < len(given):
             return None
         return _read(value, others[-1 if len(others) > 1 and not isinstance(value, list) else 0], where, counts)
-    return _read_part(_named(value, where), kind, where, counts)
+    if issubclass(kind, Part):
+        return _read_part(_named(value, where), kind, where, counts)
+    return _made(_named(value, where), kind, where, counts)
 
 
 def _read_part(value: Mapping[str, Any], kind: Any, where: str, counts: _Counts) -> Any:
     found = object.__new__(kind)
     held: dict[str, Any] = {"_place": where}
-    for name, hint, factory in _fields(kind):
+    for name, hint, known in _fields(kind):
         key = name.rstrip("_")
         if key in value:
             held[name] = _read(value[key], hint, _at(where, key), counts)
-        elif factory is not MISSING:
-            held[name] = factory()
+        elif known.default_factory is not MISSING:
+            held[name] = known.default_factory()
     found.__dict__.update(held)
     return found
+
+
+def _made(value: Mapping[str, Any], kind: Any, where: str, counts: _Counts) -> Any:
+    """A dataclass that is no `Part`, from the values of its fields."""
+    held = {}
+    for name, hint, known in _fields(kind):
+        if name in value:
+            held[name] = _read(value[name], hint, _at(where, name), counts)
+        elif known.default is MISSING and known.default_factory is MISSING:
+            raise RecordError(f"the record lacks {_at(where, name)}")
+    return kind(**held)
 
 
 def _read_list(value: Any, kind: Any, where: str, counts: _Counts, count: int | str | None) -> list[Any]:
@@ -205,7 +228,7 @@ def _read_list(value: Any, kind: Any, where: str, counts: _Counts, count: int | 
         if not value:
             raise _wrong(where, "1 entry or more", value)
     if kind is float and set(map(type, value)) <= {float, int}:
-        return list(value)
+        return list(map(float, value))
     return [_read(item, kind, f"{where}[{index}]", counts) for index, item in enumerate(value)]
 
 
