@@ -1,0 +1,217 @@
+"""Bytes of a stream to blocks with named columns and units: what it is, is recognised from its first two seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from imulab.errors import ReadError, quoted
+from imulab.live.guess import Guess, guess_layout
+from imulab.live.lines import Laid, MotionCal, Native, XImu3, is_titles
+from imulab.live.packets import Mavlink, Msp, looks_like_mavlink, looks_like_msp
+from imulab.live.stamps import ArrivalClock, Counts, DeviceClock
+from imulab.printable import printable
+from imulab.readers.layout import Layout
+from imulab.recording import Array, Recording
+
+FIRST = 2.0
+"""So many seconds of a stream say what it is."""
+_MOST = 1 << 18
+_SILENT = 0.5
+_POLL_EVERY, _POLL_AGAIN = 0.005, 0.1
+_TEXT = bytes(range(32, 127)) + b"\r\n\t"
+_MOSTLY = 0.9
+STRAIGHTENED = "arrival time, straightened by a robust line"
+"""What the head of a recording says of times without a device's stamps."""
+
+
+class UnknownFormatError(ReadError):
+    """A stream is none of the known; `lines` are its first, `guess` a layout to start from where there is one."""
+
+    def __init__(self, message: str, lines: tuple[str, ...] = (), guess: Guess | None = None) -> None:
+        super().__init__(message)
+        self.lines = lines
+        self.guess = guess
+
+
+class Decoder(Protocol):
+    """Bytes to rows of numbers: what is recognised ends in one of these."""
+
+    name: str
+    metadata: dict[str, str]
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Columns and their units; ``time`` where the device stamps its samples."""
+
+    def rows(self, data: bytes) -> Array:
+        """Return the rows that these bytes complete, shape (n, columns)."""
+
+    def finish(self) -> Array:
+        """Return the rows that are left at the end."""
+
+
+class Stream:
+    """One stream: bytes and when they came to recordings of some rows each.
+
+    Parameters
+    ----------
+    source
+        What messages call where it comes from.
+    layout
+        Where the columns of a foreign stream are.
+    polled
+        Whether the other side may have to be asked before it speaks (serial ports and TCP).
+    """
+
+    def __init__(self, source: str, layout: Layout | None = None, *, polled: bool = False) -> None:
+        self.counts = Counts()
+        self.format = ""
+        self.to_send = b""
+        self._source, self._layout, self._polled = source, layout, polled
+        self._held: list[tuple[bytes, float]] = []
+        self._first: float | None = None
+        self._asked: float | None = None
+        self._decoder: Decoder | None = None
+        self._device: DeviceClock | None = None
+        self._arrival: ArrivalClock | None = None
+
+    def feed(self, data: bytes, arrival: float) -> list[Recording]:
+        """Return what these bytes complete; no bytes tell how time passes.
+
+        Raises
+        ------
+        UnknownFormatError
+            Two seconds have passed, and the stream is none of the known.
+        """
+        self._poll(data, arrival)
+        if self._decoder is not None:
+            return self._blocks([(data, arrival)])
+        if data:
+            self._first = arrival if self._first is None else self._first
+            self._held.append((data, arrival))
+        if self._first is None or (arrival - self._first < FIRST and sum(len(d) for d, _ in self._held) < _MOST):
+            return []
+        return self._begin()
+
+    def finish(self) -> list[Recording]:
+        """Return what is left at the end of the stream.
+
+        Raises
+        ------
+        UnknownFormatError
+            It ended before it was recognised, and is none of the known.
+        """
+        blocks = self._begin() if self._decoder is None and self._held else []
+        if self._decoder is None:
+            return blocks
+        return blocks + self._timed([(self._decoder.finish(), self._held[-1][1])])
+
+    def _begin(self) -> list[Recording]:
+        head = b"".join(data for data, _ in self._held)
+        self._decoder = decoder = self._recognised(head)
+        self.format = decoder.name
+        self._polled = self._polled and isinstance(decoder, Msp)
+        if "time" in decoder.units:
+            self._device = DeviceClock(decoder.units["time"], self.counts)
+        else:
+            self._arrival = ArrivalClock(self.counts)
+        held, self._held = self._held, self._held[-1:]
+        return self._blocks(held)
+
+    def _blocks(self, pieces: list[tuple[bytes, float]]) -> list[Recording]:
+        assert self._decoder is not None
+        self._held = pieces[-1:]
+        return self._timed([(self._decoder.rows(data), arrival) for data, arrival in pieces])
+
+    def _timed(self, pieces: list[tuple[Array, float]]) -> list[Recording]:
+        pieces = [(rows, arrival) for rows, arrival in pieces if len(rows)]
+        if self._arrival is not None and len(pieces) > 1:
+            self._arrival.begin([len(rows) for rows, _ in pieces], [arrival for _, arrival in pieces])
+        blocks = [self._recording(rows, arrival) for rows, arrival in pieces]
+        return [block for block in blocks if len(block)]
+
+    def _recording(self, rows: Array, arrival: float) -> Recording:
+        assert self._decoder is not None
+        units = dict(self._decoder.units)
+        columns = dict(zip(units, rows.T, strict=True))
+        metadata = {"format": self.format, **self._decoder.metadata}
+        if self._device is not None:
+            times, kept = self._device.times(columns["time"], arrival)
+            columns = {name: np.ascontiguousarray(column[kept]) for name, column in columns.items()}
+            columns["time"] = times[kept]
+        elif self._arrival is not None:
+            columns = {"time": self._arrival.times(len(rows), arrival)} | columns
+            units = {"time": "s"} | units
+            metadata["time"] = STRAIGHTENED
+        return Recording(columns, units, metadata, self._source)
+
+    def _poll(self, data: bytes, now: float) -> None:
+        """Ask a flight controller for its readings: where nothing comes unasked, and again after each answer."""
+        self.to_send = b""
+        if not self._polled:
+            return
+        if self._asked is None:
+            self._asked = now + _SILENT - _POLL_AGAIN  # what speaks by itself is given the time to do so
+        waited = now - self._asked
+        silent = not self._held or all(looks_like_msp(d) or d[:1] == b"$" for d, _ in self._held)
+        if silent and waited >= (_POLL_EVERY if data else _POLL_AGAIN):
+            self.to_send, self._asked = Msp.poll, now
+
+    def _recognised(self, head: bytes) -> Decoder:
+        """Return the decoder of a stream by its first bytes."""
+        if self._layout is not None:
+            return Laid(self._layout, self.counts)
+        if looks_like_msp(head):
+            return Msp(self.counts)
+        if looks_like_mavlink(head):
+            mavlink = Mavlink(head, self.counts)
+            if mavlink.kinds:
+                return mavlink
+            raise UnknownFormatError(
+                f"{self._source}: MAVLink without an inertial message; expected one of RAW_IMU SCALED_IMU "
+                "HIGHRES_IMU: ask the autopilot for one (MAV_CMD_SET_MESSAGE_INTERVAL)"
+            )
+        lines = [line.strip() for line in head.decode("utf-8", "replace").split("\n")[:-1]]
+        titles = next((line for line in lines if is_titles(line)), None)
+        if titles is not None:
+            return Native(titles, self.counts)
+        kinds = {line[:1].encode() for line in lines if line[1:2] == ","}
+        if _share(lines, lambda line: line.startswith("Raw:") and line.count(",") == 8) > 0.5:
+            return MotionCal(self.counts)
+        if b"I" in kinds and _share(lines, lambda line: line[:2] in ("I,", "M,", "T,")) > 0.5:
+            return XImu3(kinds, self.counts)
+        raise self._unknown(head, [line for line in lines if line])
+
+    def _unknown(self, head: bytes, lines: list[str]) -> UnknownFormatError:
+        text = sum(byte in _TEXT for byte in head)
+        if text < _MOSTLY * len(head):
+            rate = (
+                "the baud rate is probably another: try @9600 @57600 @230400 @460800 @921600 behind the port"
+                if self._source.startswith("serial:")
+                else "expected a stream of text, MAVLink or MSP"
+            )
+            return UnknownFormatError(
+                f"{self._source}: garbage: {len(head) - text} of the first {len(head)} bytes are no text and no "
+                f"message that is known; {rate}"
+            )
+        if not lines:
+            return UnknownFormatError(
+                f"{self._source}: no line of text has an end among the first {len(head)} bytes; expected lines"
+            )
+        guess = guess_layout(lines, self._held[-1][1] - self._held[0][1])
+        shown = tuple(printable(line)[:120] for line in lines[1:6] or lines)
+        offered = "--layout FILE.toml says what its columns are" + (", and a guess is offered" if guess else "")
+        return UnknownFormatError(
+            f"{self._source}: unknown format: {quoted(shown[0])}; {offered}; or let the unit send titles such as "
+            "'time [us],accel_x [g],accel_y [g],accel_z [g]'",
+            shown,
+            guess,
+        )
+
+
+def _share(lines: list[str], fits: Callable[[str], bool]) -> float:
+    """Return which part of the lines fits."""
+    return sum(bool(fits(line)) for line in lines) / max(len(lines), 1)

@@ -1,0 +1,153 @@
+"""A simulated unit on a simulated table: it goes where the guide says, or from one random attitude to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import OptionError, listed
+from imulab.procedures.tumble.simulate import simulate_tumble
+from imulab.quantities import number, quantity, whole_number
+from imulab.recording import Array, Recording
+from imulab.units import STANDARD_GRAVITY
+
+_LONGEST = 60.0
+_KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "speed")
+_KINDS = {
+    "rate": ("frequency", "Hz"),
+    "noise": ("acceleration", "mg"),
+    "hold": ("time", "s"),
+    "move": ("time", "s"),
+    "gravity": ("acceleration", "m/s^2"),
+}
+
+
+@dataclass
+class SimulatedUnit:
+    """A unit that is turned while its samples are asked for.
+
+    Attributes
+    ----------
+    seed, order, rate, noise, move, unit, gravity
+        As for `simulate_tumble`, in SI.
+    hold
+        How long it stays in an attitude where nobody turns it, s.
+    knock
+        Number of an attitude, from 1, that is knocked, or None.
+    follow
+        Whether `turn_to` turns it; otherwise it turns by itself.
+    """
+
+    seed: int = 1
+    order: int = 2
+    rate: float = 100.0
+    noise: float = 0.7e-3 * STANDARD_GRAVITY
+    hold: float = 5.0
+    move: float = 2.0
+    unit: str = "m/s^2"
+    gravity: float = STANDARD_GRAVITY
+    knock: int | None = None
+    follow: bool = False
+    _wanted: Array | None = field(default=None, init=False)
+
+    def turn_to(self, direction: Array) -> None:
+        """Turn until this direction of the body is up."""
+        self._wanted = direction
+
+    def blocks(self, step: float) -> Iterator[Recording]:
+        """Yield its samples, `step` seconds at a time, without end."""
+        rng = np.random.default_rng(self.seed)
+        here = _random_direction(rng)
+        known: dict[str, float] = {}
+        metadata: dict[str, str] = {}
+        size, row, legs = max(1, round(step * self.rate)), 0, 0
+        there = here
+        while True:
+            leg = self._leg(here, there, known, legs)
+            if not legs:
+                metadata = {key: text for key, text in leg.metadata.items() if not key.startswith("truth_gyro")}
+                known = {
+                    key.removeprefix("truth_"): float(text)
+                    for key, text in metadata.items()
+                    if key.startswith("truth_")
+                }
+            legs, here = legs + 1, there
+            stay = round((self.move if legs > 1 else 0.0) * self.rate)
+            for start in range(0, len(leg), size):
+                part = {name: column[start : start + size] for name, column in leg.columns.items()}
+                count = len(part["time"])
+                part["time"] = (row + np.arange(count)) / self.rate
+                row += count
+                yield Recording(part, leg.units, metadata, "simulated unit")
+                if start + size >= stay and not self.follow and (start + size - stay) / self.rate >= self.hold:
+                    self._wanted = _random_direction(rng)
+                if self._wanted is not None and start + size >= stay:
+                    break
+            there, self._wanted = here if self._wanted is None else self._wanted, None
+
+    def _leg(self, here: Array, there: Array, known: dict[str, float], number: int) -> Recording:
+        """Return the samples of turning from one attitude to the next and lying there."""
+        knocked = self.knock == number + 1
+        recording = simulate_tumble(
+            attitudes=np.vstack([here, there]),
+            order=self.order,
+            truth=known or None,
+            gravity=self.gravity,
+            rate=self.rate,
+            hold=min(self.hold, 10.0) if knocked else _LONGEST,
+            move=self.move,
+            noise=self.noise,
+            unit=self.unit,
+            gyro=False,
+            knock=2 if knocked else None,
+            seed=self.seed if not number else 1000 * (self.seed + 1) + number,
+        )
+        resting = round((min(self.hold, 10.0) if knocked else _LONGEST) * self.rate)
+        # The first attitude, and one that lasts longer than expected, are lain in without having been turned to.
+        first = 0 if not number or np.allclose(here, there) else resting
+        names = [name for name in recording.columns if not name.startswith("truth_")]
+        last = resting if first == 0 else len(recording)
+        return replace(
+            recording,
+            columns={name: recording.columns[name][first:last] for name in names},
+            units={name: recording.units[name] for name in names},
+        )
+
+
+def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
+    """Return a unit and its speed by a text such as ``seed=3,noise=0.5mg,speed=0``.
+
+    Raises
+    ------
+    OptionError
+        A key or value is none.
+    """
+    given: dict[str, Any] = {}
+    for pair in text.split(",") if text else []:
+        key, equals, value = (part.strip() for part in pair.partition("="))
+        where = f"simulate: {key}"
+        if key not in _KEYS or not equals:
+            raise OptionError(f"simulate:{text}: expected key=value, the keys being {listed(_KEYS, key)}")
+        if key == "unit":
+            given[key] = value
+        elif key == "speed":
+            given[key] = number(value, where)
+        elif key in _KINDS:
+            given[key] = quantity(value, where, *_KINDS[key])
+        else:
+            given[key] = whole_number(value, where)
+    speed = given.pop("speed", 1.0)
+    if not 0 <= speed <= 1e6:
+        raise OptionError(f"simulate: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
+    unit = SimulatedUnit(**given, follow=follow)
+    unit._leg(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), {}, 0)  # refuses what cannot be
+    return unit, speed
+
+
+def _random_direction(rng: np.random.Generator) -> Array:
+    direction = rng.standard_normal(3)
+    unit: Array = direction / np.linalg.norm(direction)
+    return unit

@@ -1,0 +1,392 @@
+"""Where a stream comes from: serial ports, sockets, standard input, files and a simulated unit.
+
+Each source gives what has come with its time of arrival. What blocks is read by one thread, so that neither a fit nor a
+slow screen makes the operating system's buffer run over.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import OptionError, ReadError, listed
+from imulab.live.simulated import SimulatedUnit, simulated_unit
+from imulab.quantities import number, whole_number
+from imulab.recording import Array, Recording
+
+KINDS = ("serial:PORT[@BAUD]", "udp:PORT", "tcp:HOST:PORT", "-", "replay:FILE[@SPEED]", "simulate[:key=value,..]")
+BAUD = 115_200
+_PATIENCE = 0.1
+_STEP = 0.05
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """Bytes, or samples that are known already, and when they came, s on the source's own clock."""
+
+    data: bytes | Recording
+    time: float
+
+
+class Source:
+    """What all sources have.
+
+    Attributes
+    ----------
+    name
+        What messages call it.
+    polled
+        Whether it can be asked for readings.
+    ended
+        Whether nothing more will come.
+    lost
+        Why it ended, where that was no ordinary end.
+    """
+
+    polled = False
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.ended = False
+        self.lost = ""
+
+    def get(self, wait: float) -> list[Arrived]:
+        """Return what has come, after `wait` seconds at most; nothing where nothing has."""
+        raise NotImplementedError
+
+    def now(self) -> float:
+        """Return the time on the clock of arrivals, s."""
+        return time.monotonic()
+
+    def send(self, data: bytes) -> None:
+        """Send bytes to the unit, where the source can."""
+
+    def turn_to(self, direction: Array) -> None:
+        """Turn the unit until this direction of the body is up, where it is a simulated one that follows."""
+
+    def close(self) -> None:
+        """Let go of what the source holds."""
+
+
+class Threaded(Source):
+    """A source that is read by a thread: `read` returns bytes, none for a moment without, None at the end."""
+
+    def __init__(
+        self,
+        name: str,
+        read: Callable[[], bytes | None],
+        *,
+        write: Callable[[bytes], object] | None = None,
+        close: Callable[[], object] = lambda: None,
+        polled: bool = False,
+    ) -> None:
+        super().__init__(name)
+        self.polled = polled
+        self._read, self._write, self._close = read, write, close
+        self._queue: SimpleQueue[Arrived | None] = SimpleQueue()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"imulab {name}")
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                data = self._read()
+                if data is None:
+                    break
+                if data:
+                    self._queue.put(Arrived(data, time.monotonic()))
+        except (
+            OSError,
+            TypeError,
+            ValueError,
+        ) as error:  # the last two: pyserial's, of a port that is gone
+            if not self._stop.is_set():
+                self.lost = f"{self.name}: the connection is lost ({_reason(error)}): unplugged?"
+        self._queue.put(None)
+
+    def get(self, wait: float) -> list[Arrived]:
+        """Return what has come, after `wait` seconds at most."""
+        found: list[Arrived] = []
+        try:
+            one = self._queue.get(timeout=wait)
+            while one is not None:
+                found.append(one)
+                one = self._queue.get_nowait()
+            self.ended = True
+        except Empty:
+            pass
+        return found
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; that the unit is gone is found by the thread that reads."""
+        if self._write is not None:
+            try:
+                self._write(data)
+            except OSError as error:
+                self.lost = self.lost or f"{self.name}: the connection is lost ({_reason(error)}): unplugged?"
+                self.ended = True
+
+    def close(self) -> None:
+        """End the thread and close the port."""
+        self._stop.set()
+        self._thread.join(0.5)
+        self._close()
+
+
+class Paced(Source):
+    """Blocks of samples that are made here, each at its time: `speed` times as fast as it was, 0 without waiting."""
+
+    def __init__(self, name: str, blocks: Iterator[Recording], speed: float) -> None:
+        super().__init__(name)
+        self._blocks, self._speed = blocks, speed
+        self._begun: float | None = None
+        self._first = self._time = 0.0
+        self._waiting: Arrived | None = None
+
+    def get(self, wait: float) -> list[Arrived]:
+        """Return the next block once its time has come."""
+        if self._waiting is None:
+            block = next(self._blocks, None)
+            if block is None:
+                self.ended = True
+                return []
+            times = block.time
+            end = self._time + _STEP if times is None or not len(times) else float(times[-1])
+            self._waiting = Arrived(block, end)
+        if self._begun is None:
+            self._begun, self._first = time.monotonic(), self._waiting.time
+        if self._speed:
+            left = self._begun + (self._waiting.time - self._first) / self._speed - time.monotonic()
+            if left > 0:
+                time.sleep(min(left, wait))
+                if left > wait:
+                    return []
+        found, self._waiting = self._waiting, None
+        self._time = found.time
+        return [found]
+
+    def now(self) -> float:
+        """Return the time of the last block."""
+        return self._time
+
+
+class Simulated(Paced):
+    """A simulated unit, which follows the guide where it is told to."""
+
+    def __init__(self, name: str, unit: SimulatedUnit, speed: float) -> None:
+        super().__init__(name, unit.blocks(_STEP), speed)
+        self.unit = unit
+
+    def turn_to(self, direction: Array) -> None:
+        """Turn the unit."""
+        self.unit.turn_to(direction)
+
+
+def open_source(text: str, layout: str | None = None, *, follow: bool = False) -> Source:
+    """Open a source by what a person calls it.
+
+    Parameters
+    ----------
+    text
+        ``serial:PORT[@BAUD]``, ``udp:PORT``, ``tcp:HOST:PORT``, ``-``, ``replay:FILE[@SPEED]`` or
+        ``simulate[:key=value,..]``.
+    layout
+        Of the file that is replayed.
+    follow
+        Whether a simulated unit does what the guide says.
+
+    Raises
+    ------
+    OptionError
+        There is no such kind of source, or it needs something that is not given.
+    ReadError
+        The port, address or file cannot be opened; the message says what to do.
+    """
+    kind, _, rest = text.partition(":")
+    if follow and kind != "simulate":
+        raise OptionError(f"--follow: expected a simulated unit (simulate), found {text!r}")
+    if text == "-":
+        return Threaded("standard input", lambda: os.read(0, _CHUNK) or None)
+    makers: dict[str, Callable[[str], Source]] = {"serial": _serial, "udp": _udp, "tcp": _tcp}
+    if kind in makers and rest:
+        return makers[kind](rest)
+    if kind == "replay" and rest:
+        return _replay(rest, layout)
+    if kind == "simulate":
+        unit, speed = simulated_unit(rest, follow=follow)
+        return Simulated("simulated unit", unit, speed)
+    raise OptionError(f"source {text!r}: expected one of {listed(KINDS, text)}")
+
+
+def serial_ports() -> list[tuple[str, str]]:
+    """Return the serial ports of this machine and what is connected to them.
+
+    Raises
+    ------
+    OptionError
+        pyserial is not here.
+    """
+    _pyserial()
+    from serial.tools.list_ports import comports
+
+    return sorted((port.device, port.description or "") for port in comports())
+
+
+def _pyserial() -> Any:
+    try:
+        import serial
+    except ImportError:
+        raise OptionError("serial ports need pyserial, which is not here: pip install 'imulab[live]'") from None
+    return serial
+
+
+def _serial(rest: str) -> Source:
+    serial = _pyserial()
+    port, at, rate = rest.rpartition("@")
+    if not at:
+        port, rate = rest, str(BAUD)
+    baud = whole_number(rate, f"serial:{rest}: baud rate")
+    name = f"serial:{port}@{baud}"
+    if not 50 <= baud <= 20_000_000:
+        raise OptionError(f"{name}: expected a baud rate of 50 to 20000000")
+    try:
+        device = serial.Serial(port, baud, timeout=_PATIENCE, write_timeout=1.0, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise ReadError(f"{name}: {_why_no_port(port, error)}") from None
+    return Threaded(
+        name, lambda: bytes(device.read(max(1, device.in_waiting))), write=device.write, close=device.close, polled=True
+    )
+
+
+def _why_no_port(port: str, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    said = str(error).lower()
+    if number == errno.ENOENT or "filenotfound" in said:
+        known = " ".join(device for device, _ in serial_ports()) or "none"
+        return f"no such port; ports of this machine: {known}"
+    if number in (errno.EACCES, errno.EPERM) and "lock" not in said:
+        return (
+            "not permitted; add yourself to the group that owns the port (on most Linux systems: sudo usermod -aG "
+            "dialout $USER, then log in anew)"
+        )
+    if number in (errno.EBUSY, errno.EAGAIN) or "lock" in said:
+        return "the port is busy: another program has it open (a serial monitor? close it)"
+    return f"cannot be opened: {_reason(error)}"
+
+
+def _udp(rest: str) -> Source:
+    name = f"udp:{rest}"
+    port = _port(rest, name)
+    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        link.bind(("", port))
+    except OSError as error:
+        link.close()
+        raise ReadError(f"{name}: {_why_no_address(error)}") from None
+    link.settimeout(_PATIENCE)
+    sender: list[Any] = []
+
+    def read() -> bytes:
+        try:
+            data, address = link.recvfrom(_CHUNK)
+        except TimeoutError:
+            return b""
+        sender[:] = sender or [address]
+        if address != sender[0]:
+            return b""  # one unit at a time: the one that spoke first
+        # A line of text in a datagram of its own often comes without its end.
+        return data + b"\n" if data[-1:] != b"\n" and data.isascii() and data.decode().isprintable() else data
+
+    return Threaded(name, read, close=link.close)
+
+
+def _tcp(rest: str) -> Source:
+    name = f"tcp:{rest}"
+    host, colon, text = rest.rpartition(":")
+    if not colon or not host:
+        raise OptionError(f"{name}: expected tcp:HOST:PORT")
+    port = _port(text, name)
+    try:
+        link = socket.create_connection((host.strip("[]"), port), timeout=5.0)
+    except OSError as error:
+        raise ReadError(f"{name}: {_why_no_address(error)}") from None
+    link.settimeout(_PATIENCE)
+
+    def read() -> bytes | None:
+        try:
+            return link.recv(_CHUNK) or None
+        except TimeoutError:
+            return b""
+
+    return Threaded(name, read, write=link.sendall, close=link.close, polled=True)
+
+
+def _port(text: str, name: str) -> int:
+    port = whole_number(text, f"{name}: port")
+    if not 1 <= port <= 65535:
+        raise OptionError(f"{name}: expected a port of 1 to 65535")
+    return port
+
+
+def _why_no_address(error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "the port is busy: another program listens there"
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return "not permitted: ports below 1024 belong to the administrator; expected another"
+    if isinstance(error, ConnectionRefusedError):
+        return "nobody listens there: is the unit on, and is the port right?"
+    if isinstance(error, TimeoutError):
+        return "no answer within 5 s: is the address right, and on the same network?"
+    if isinstance(error, socket.gaierror):
+        return "no machine of this name"
+    return f"cannot be opened: {_reason(error)}"
+
+
+def _replay(rest: str, layout: str | None) -> Source:
+    from imulab.readers import read_blocks
+
+    path, at, text = rest.rpartition("@")
+    speed = 1.0
+    if at and path and not os.path.lexists(rest):
+        speed = number(text, f"replay:{rest}: speed")
+    else:
+        path = rest
+    if not 0 <= speed <= 1e6:
+        raise OptionError(f"replay:{rest}: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
+    return Paced(f"replay:{path}", _slices(read_blocks(path, layout)), speed)
+
+
+def _slices(blocks: Iterator[Recording]) -> Iterator[Recording]:
+    """Yield blocks of a file in pieces of a twentieth of a second."""
+    for block in blocks:
+        times = block.time
+        if times is None:
+            raise ReadError(
+                f"{block.name}: a table of attitudes has no time to be replayed; imulab tumble fit takes it"
+            )
+        ends = np.flatnonzero(np.diff(np.floor((times - times[0]) / _STEP)) != 0) + 1
+        for start, stop in zip([0, *ends.tolist()], [*ends.tolist(), len(times)], strict=True):
+            columns = {name: column[start:stop] for name, column in block.columns.items()}
+            yield Recording(columns, block.units, block.metadata, block.name)
+
+
+def _reason(error: Exception) -> str:
+    return " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
+
+
+def is_interactive() -> bool:
+    """Return whether keys can be read: standard input is a terminal."""
+    return sys.stdin is not None and sys.stdin.isatty()

@@ -1,0 +1,166 @@
+"""Sources of streams on real pseudo-terminals and sockets, and what is said where one cannot be opened."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.errors import ImulabError, OptionError, ReadError
+from imulab.live.sources import Source, open_source
+from streams import terminal, wait_for
+
+serial = pytest.importorskip("serial", reason="pyserial is in the extra [live]")
+SENT = [f"{k},{k * k},x{k}\n".encode() for k in range(3000)]
+
+
+def everything(source: Source, size: int) -> bytes:
+    found = b""
+    end = source.now() + 5
+    while len(found) < size and source.now() < end and not source.ended:
+        found += b"".join(arrived.data for arrived in source.get(0.05))
+    return found
+
+
+def test_a_serial_port_gives_every_byte_and_takes_some():
+    with terminal() as (device, port):
+        source = open_source(f"serial:{port}@57600")
+        threading.Thread(target=lambda: [os.write(device, line) for line in SENT], daemon=True).start()
+        assert everything(source, sum(map(len, SENT))) == b"".join(SENT)
+        source.send(b"$M<\x00\x66\x66")
+        assert os.read(device, 10) == b"$M<\x00\x66\x66"
+        source.close()
+
+
+def test_an_unplugged_device_is_named():
+    with terminal() as (device, port):
+        source = open_source(f"serial:{port}")
+        os.write(device, b"1,2,3\n")
+        assert everything(source, 6) == b"1,2,3\n"
+        os.close(device)
+        assert wait_for(lambda: bool(source.get(0.05) or source.ended))
+        assert f"serial:{port}@115200: the connection is lost" in source.lost
+        assert "unplugged?" in source.lost
+        source.close()
+
+
+def test_a_busy_port_is_named():
+    with terminal() as (_, port):
+        first = open_source(f"serial:{port}")
+        with pytest.raises(ReadError, match="the port is busy: another program has it open"):
+            open_source(f"serial:{port}")
+        first.close()
+
+
+def test_a_missing_port_is_named_with_those_that_are_there():
+    with pytest.raises(ReadError, match=r"serial:/dev/ttyNONE@9600: no such port; ports of this machine: "):
+        open_source("serial:/dev/ttyNONE@9600")
+
+
+def test_a_port_that_is_not_permitted_says_how_to_get_the_permission(monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(errno.EACCES, "could not open port /dev/ttyUSB0: Permission denied")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(ReadError, match=r"not permitted; add yourself to the group .* dialout"):
+        open_source("serial:/dev/ttyUSB0")
+
+
+def test_tcp_gives_every_byte_and_ends():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        source = open_source(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        link, _ = server.accept()
+        threading.Thread(target=lambda: (link.sendall(b"".join(SENT)), link.close()), daemon=True).start()
+        assert everything(source, sum(map(len, SENT))) == b"".join(SENT)
+        assert wait_for(lambda: bool(source.get(0.05) or source.ended))
+        assert not source.lost
+        source.close()
+
+
+def test_udp_gives_every_datagram_of_the_first_sender():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
+    source = open_source(f"udp:{port}")
+    with pytest.raises(ReadError, match="the port is busy"):
+        open_source(f"udp:{port}")
+    one, other = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    one.sendto(b"first", ("127.0.0.1", port))
+    assert everything(source, 6) == b"first\n"  # a line of its own, without its end
+    other.sendto(b"nobody asked\n", ("127.0.0.1", port))
+    for line in SENT[:200]:
+        one.sendto(line, ("127.0.0.1", port))
+    assert everything(source, sum(map(len, SENT[:200]))) == b"".join(SENT[:200])
+    for each in (one, other, source):
+        each.close()
+
+
+def test_a_file_is_replayed_with_its_samples(tmp_path):
+    recording = il.simulate_tumble(attitudes=2, gravity=9.81)
+    il.write_csv(recording, tmp_path / "a@home.csv")
+    source = open_source(f"replay:{tmp_path / 'a@home.csv'}@0")
+    blocks = []
+    while not source.ended:
+        blocks += [arrived.data for arrived in source.get(0.0)]
+    assert max(map(len, blocks)) <= 6
+    np.testing.assert_array_equal(np.concatenate([b.columns["accel_x"] for b in blocks]), recording.columns["accel_x"])
+
+
+def test_replay_keeps_the_pace(tmp_path):
+    recording = il.simulate_tumble(attitudes=2, gravity=9.81)
+    il.write_csv(recording, tmp_path / "a.csv")
+    source = open_source(f"replay:{tmp_path / 'a.csv'}@20")
+    begun = time.monotonic()
+    while not source.ended:
+        source.get(0.05)
+    assert time.monotonic() - begun == pytest.approx(recording.time[-1] / 20, abs=0.3)
+
+
+def test_a_simulated_unit_goes_where_it_is_told():
+    source = open_source("simulate:seed=4,noise=0.1mg,speed=0", follow=True)
+    wanted = np.array([0.6, 0.0, -0.8])
+    blocks = [source.get(0.0)[0].data for _ in range(60)]
+    source.turn_to(wanted)
+    blocks += [source.get(0.0)[0].data for _ in range(100)]
+    accel = np.concatenate([block.triad("accel") for block in blocks])
+    time = np.concatenate([block.time for block in blocks])
+    np.testing.assert_allclose(np.diff(time), 0.01, rtol=1e-9)
+    last = accel[-50:].mean(axis=0)
+    # A unit of MEMS size is off by 50 mg and 3 % and 2 deg at most.
+    assert np.degrees(np.arccos(last @ wanted / np.linalg.norm(last))) < 8
+    assert np.ptp(accel[150:300], axis=0).max() < 0.05  # it had rung out, and lay still until it was told
+    assert blocks[0].metadata["serial"] == "SIM-0004"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("serail:/dev/ttyUSB0", r"source 'serail:.*expected one of serial:PORT"),
+        ("tcp:localhost", "expected tcp:HOST:PORT"),
+        ("tcp:localhost:0", "port of 1 to 65535"),
+        ("tcp:127.0.0.1:9", "nobody listens there"),
+        ("tcp:no.such.host.invalid:80", "no machine of this name|cannot be opened"),
+        ("udp:seven", "expected a whole number"),
+        ("serial:/dev/ttyS0@fast", "expected a whole number"),
+        ("simulate:colour=red", "the keys being seed order"),
+        ("simulate:noise=1s", "acceleration"),
+        ("simulate:rate=1", "sample rate 1"),
+        ("simulate:speed=-1", "speed -1"),
+        ("replay:none.csv@0", "none.csv: no such file"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_line(text, said):
+    with pytest.raises(ImulabError, match=said) as caught:
+        open_source(text).get(0.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_a_simulated_unit_follows():
+    with pytest.raises(OptionError, match="--follow"):
+        open_source("udp:5005", follow=True)
