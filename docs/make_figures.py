@@ -90,7 +90,7 @@ def centrifuge(folder: Path) -> None:
 def first_figure(folder: Path, record: str, picture: str) -> None:
     """Headline and first figure of one record of the demonstration."""
     exhibits = exhibits_of(il.load(folder / record))
-    figure = next(item for item in exhibits.items if isinstance(item, Figure))
+    figure = exhibits.figures[0]
     page = folder / f"one_{picture}.html"
     page.write_text(render_index(exhibits.headline, "", [Card(figure.title, "", [], replace(figure, title=""))]))
     screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 260)

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from importlib.resources import files
 
 import numpy as np
 import pandas
@@ -150,6 +151,31 @@ def test_a_browser_draws_what_a_notebook_gets_without_a_network(fit, chromium, t
     dom = browse(chromium, tmp_path, tmp_path / "cells.html", "--dump-dom")
     assert dom.count('class="plot-container') == len(fit.plot())
     assert "after, µg" in dom
+
+
+@pytest.mark.parametrize("made", [tumble, warmup])
+def test_no_legend_lies_on_a_title(made, chromium, tmp_path):
+    figures = [plot.to_dict() for plot in made().plot()]
+    library = files("imulab.report").joinpath("vendor", "plotly-cartesian.min.js").read_text()
+    script = """
+        const boxes = (place, name) => [...place.querySelectorAll(name)].map(one => one.getBoundingClientRect());
+        Promise.all(figures.map(figure => {
+            const place = document.body.appendChild(document.createElement("div"));
+            return Plotly.newPlot(place, figure.data, {...figure.layout, width: 900}).then(() => {
+                const [title] = boxes(place, ".gtitle"), legends = boxes(place, ".legend .bg");
+                return legends.map(legend => legend.top - title.bottom);
+            });
+        })).then(gaps => { document.title = "gaps " + gaps.flat().map(Math.round).join(" ") });
+    """
+    page = tmp_path / "titles.html"
+    page.write_text(
+        f"<!doctype html><meta charset=utf-8><body><script>{library}</script>"
+        f"<script>const figures = {json.dumps(figures)};{script}</script>"
+    )
+    dom = browse(chromium, tmp_path, page, "--dump-dom")
+    gaps = [int(gap) for gap in re.search("<title>gaps ([^<]+)", dom)[1].split()]
+    assert gaps
+    assert min(gaps) >= 0
 
 
 def test_a_figure_is_saved_as_a_page(fit, tmp_path):

@@ -186,5 +186,5 @@ def _found(scenario: Scenario) -> tuple[str, Figure | None, Verdict | None]:
     else:
         record = load(scenario.record)
         exhibits, verdict = exhibits_of(record), record.verdict
-    figures = [item for item in exhibits.items if isinstance(item, Figure)]
+    figures = exhibits.figures
     return exhibits.headline, figures[0] if figures else None, verdict

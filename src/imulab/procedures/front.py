@@ -25,7 +25,7 @@ from imulab.procedures.reports import write_report as write_report
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.report.channels import channel_figures
-from imulab.report.elements import Figure, format_uncertain
+from imulab.report.elements import format_uncertain
 from imulab.report.plots import Plot, Plots
 from imulab.shown import LINES, WIDTH, html_table
 from imulab.verdict import SENTENCES
@@ -72,8 +72,7 @@ def html(record: Calibration) -> str:
 
 def plots(record: Calibration, name: str | None) -> Plots | Plot:
     """Return the figures of a record's report, or the one of this name."""
-    figures = [item for item in exhibits_of(record).items if isinstance(item, Figure)]
-    found = Plots(figures, _title(record))
+    found = Plots(exhibits_of(record).figures, _title(record))
     return found if name is None else found[name]
 
 

@@ -44,7 +44,7 @@ def render_page(
     provenance: Sequence[tuple[str, str]] = (),
 ) -> str:
     """Return exhibits as HTML text: subject, verdict, result, notes, figures and tables, provenance."""
-    plots = [item for item in exhibits.items if isinstance(item, Figure)]
+    plots = exhibits.figures
     return str(
         _template("page.html.j2").render(
             title=title,

@@ -56,6 +56,11 @@ class Exhibits:
     facts: list[tuple[str, str]]
     items: list[Figure | ReportTable]
 
+    @property
+    def figures(self) -> list[Figure]:
+        """The figures alone."""
+        return [item for item in self.items if isinstance(item, Figure)]
+
 
 def plain_number(value: float, digits: int) -> str:
     """Return a number with at least `digits` significant digits, never in powers of ten."""

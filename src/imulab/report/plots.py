@@ -24,14 +24,13 @@ _WIDTH = 900
 _LIBRARY = ("vendor", "plotly-cartesian.min.js")
 _BASE = {
     "font": {"family": 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif', "size": 13, "color": INK},
-    "margin": {"l": 70, "r": 20, "t": 60, "b": 55},
+    "margin": {"l": 70, "r": 20, "t": 20, "b": 55},
     "hovermode": "closest",
     "paper_bgcolor": "#ffffff",
     "plot_bgcolor": "#ffffff",
 }
-
-
-_TITLE = {"x": 0, "xanchor": "left", "yref": "container", "y": 0.98, "pad": {"l": 10}}
+_TITLE_HEIGHT = 40
+_TITLE = {"x": 0, "xanchor": "left", "yref": "container", "y": 1, "yanchor": "top", "pad": {"l": 10, "t": 14}}
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,19 +64,13 @@ class Plot:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figure as Plotly's own JSON values: ``data`` and ``layout``."""
-        own = self.figure.layout
-        title = {
-            "text": escape(self.name, quote=False),
-            "x": 0,
-            "xanchor": "left",
-            "yref": "container",
-            "y": 0.98,
-            "pad": {"l": 10},
-        }
-        margin = {**_BASE["margin"], **own.get("margin", {})}  # type: ignore[dict-item]
-        margin["t"] = max(int(margin["t"]), 60)
-        layout = {**_BASE, **own, "title": title, "margin": margin}
-        return {"data": self.figure.traces, "layout": {**layout, "height": self.figure.height + 40}}
+        drawn = _untitled(self.figure)
+        margin = drawn["layout"]["margin"]
+        above = max(margin["t"], _legend_height(self.figure)) + _TITLE_HEIGHT
+        height = self.figure.height + above - margin["t"]
+        title = {"text": escape(self.name, quote=False), **_TITLE}
+        layout = {**drawn["layout"], "title": title, "margin": {**margin, "t": above}, "height": height}
+        return {**drawn, "layout": layout}
 
     def save(self, path: str | Path) -> None:
         """Write the figure: ``.html`` as a page that needs no network, ``.png``, ``.svg`` and ``.pdf`` as a picture.
@@ -97,10 +90,9 @@ class Plot:
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
         """Return the figure for notebooks: JSON for those that know Plotly, HTML for the others."""
-        plot = self.to_dict()
         return {
-            "application/vnd.plotly.v1+json": {**plot, "config": {"displaylogo": False}},
-            "text/html": _html(self, plot),
+            "application/vnd.plotly.v1+json": {**self.to_dict(), "config": {"displaylogo": False}},
+            "text/html": _html(self),
             "text/plain": repr(self),
         }
 
@@ -186,17 +178,34 @@ def _picture(plot: Plot, kind: str, path: str | Path) -> bytes:
     return bytes(drawn)
 
 
-def _html(plot: Plot, drawn: dict[str, Any]) -> str:
+def _untitled(figure: Figure) -> dict[str, Any]:
+    """Return a figure as the report draws it, below a title that is text of the page."""
+    margin = {**_BASE["margin"], **figure.layout.get("margin", {})}  # type: ignore[dict-item]
+    return {"data": figure.traces, "layout": {**_BASE, **figure.layout, "margin": margin, "height": figure.height}}
+
+
+def _legend_height(figure: Figure) -> int:
+    """Return what a legend above the plot takes: Plotly makes room for it, but draws it over a title."""
+    legend = figure.layout.get("legend", {})
+    names = [trace["name"] for trace in figure.traces if "name" in trace and trace.get("showlegend", True)]
+    if legend.get("orientation") != "h" or len(names) < 2:
+        return 0
+    in_a_row = max(1, int(0.85 * _WIDTH / max(8 * len(name) + 45 for name in names)))
+    lift = (legend.get("y", 1.0) - 1) * figure.height
+    return int(lift) + 20 * -(-len(names) // in_a_row) + 8
+
+
+def _html(plot: Plot) -> str:
     """Return a figure as HTML that draws itself without a network."""
     place, figure = f"imulab-{uuid4().hex[:12]}", plot.figure
     said = "".join(f"<p>{escape(text)}</p>" for text in (figure.message, figure.caption) if text)
     packed = f'"{_packed()}"' if _FIRST.carries() else "null"
     script = files("imulab.report").joinpath("notebook.js").read_text(encoding="utf-8")
-    height = drawn["layout"]["height"]
     return (
-        f'<div style="background: #fff; color: {INK}; font-family: system-ui, sans-serif; max-width: 1000px">'
-        f'<div id="{place}" style="height: {height}px"></div>{said}</div>\n'
-        f'<script>{script}("{place}", {json_for_script(drawn)}, {packed})</script>'
+        f'<div style="background: #fff; color: {INK}; font-family: system-ui, sans-serif; max-width: 1000px; '
+        f'padding: 4px 10px"><div style="font-size: 17px">{escape(plot.name)}</div>'
+        f'<div id="{place}" style="height: {figure.height}px"></div>{said}</div>\n'
+        f'<script>{script}("{place}", {json_for_script(_untitled(figure))}, {packed})</script>'
     )
 
 
