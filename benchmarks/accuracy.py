@@ -15,9 +15,9 @@ from timing import Row
 import imulab as il
 from imulab.procedures.centrifuge.manifest import Manifest, Run
 from imulab.procedures.centrifuge.simulate import Simulation, Truth, typical_truth
+from imulab.procedures.changes import compare_records
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
 from imulab.procedures.gyro_array.model import find_elements
-from imulab.procedures.reports import compare_records
 from imulab.procedures.tumble.gyro import fit_gyro
 from imulab.procedures.tumble.plan import plan_tumble
 from imulab.recording import Recording

@@ -12,6 +12,7 @@ import polars
 import pytest
 
 import imulab as il
+from imulab.cli import main
 from imulab.errors import DataError, ImulabError, OptionError, RecordError
 from imulab.procedures.reports import exhibits_of
 from imulab.report import plots as plots_module
@@ -47,6 +48,14 @@ def warmup():
     return il.fit_warmup(cycles, temperatures=temperatures, model="exponential")
 
 
+@pytest.fixture(scope="module")
+def centrifuge(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("centrifuge") / "test"
+    made = ["--levels", "1,10,20", "--duration", "60 s", "--static-duration", "30 s", "-o", str(folder)]
+    assert main(["centrifuge", "simulate", *made]) == 0
+    return folder / "manifest.toml"
+
+
 @pytest.mark.parametrize("made", [tumble, array, warmup])
 def test_every_result_shows_itself_in_twelve_lines_and_as_a_table(made):
     result = made()
@@ -59,7 +68,8 @@ def test_every_result_shows_itself_in_twelve_lines_and_as_a_table(made):
     assert record.verdict.state in repr(result)
     assert exhibits_of(record).headline in repr(record)
     page = result._repr_html_()
-    assert page.count("<tr>") == len(record.parameters) + 1
+    every = page.partition("<details>")[2] or page  # those that show a table of their own first
+    assert every.count("<tr>") == len(record.parameters) + 1
     assert "standard uncertainty" in page
     figures = [item.title for item in exhibits_of(record).items if isinstance(item, Figure)]
     assert [plot.name for plot in result.plot()] == figures
@@ -73,6 +83,59 @@ def test_the_parameters_of_a_text_are_those_of_the_record_in_engineering_units(f
         value, uncertainty = float(found[2 * number + 1]), float(found[2 * number + 2])
         assert value * 9.80665e-3 == pytest.approx(bias.value, abs=0.06 * uncertainty * 9.80665e-3)
         assert uncertainty * 9.80665e-3 == pytest.approx(bias.standard_uncertainty, rel=0.06)
+
+
+def rows_of(text):
+    """Cells of the table in a result's text, which stand two spaces apart or more."""
+    titles, *rows = [re.split(r"  +", line.strip()) for line in text.splitlines() if line.startswith("  ")]
+    return titles, {row[0]: row[1:] for row in rows}
+
+
+def pair(cell):
+    return [float(part) for part in cell.split(" ± ")]
+
+
+def test_an_array_shows_bias_and_angle_random_walk_of_each_gyro():
+    made = array()
+    titles, rows = rows_of(repr(made))
+    assert titles[1:3] == ["bias, deg/s", "ARW, deg/√h"]
+    assert len(rows) == made.calibration.model["elements"]
+    for number, cells in enumerate(rows.values(), start=1):
+        bias = made.calibration.parameters[f"bias_{number}"]
+        value, u = pair(cells[0])
+        assert value == pytest.approx(np.degrees(bias.value), abs=0.06 * u)
+        assert u == pytest.approx(np.degrees(bias.standard_uncertainty), rel=0.06)
+
+
+def test_a_warm_up_shows_what_it_takes_off_at_power_on_and_the_error_before_and_after():
+    made = warmup()
+    titles, rows = rows_of(repr(made))
+    assert titles[1:6] == ["power-on, -40 °C", "power-on, 0 °C", "power-on, 60 °C", "rms before", "rms after"]
+    for i, (axis, cells) in enumerate(rows.items()):
+        table = made.table.coefficients_at(0.0)[i]  # a sum of exponentials is their sum at the start
+        assert axis == made.table.axes[i]
+        factor = 206264.8 if cells[-1] == "deg/h" else 1e6 / 9.80665
+        assert float(cells[1]) == pytest.approx(table.sum() * factor, rel=6e-3)
+        none = next(row for row in made.models if row.label == "none")
+        assert float(cells[3]) == pytest.approx(none.training[i] * factor, rel=0.06)
+
+
+def test_a_centrifuge_test_shows_its_curve_and_the_change_at_the_highest_level(centrifuge):
+    record = il.fit_centrifuge(centrifuge).calibration
+    titles, rows = rows_of(repr(record))
+    assert titles == ["axis", "K0, deg/h/g", "c1, ppm/g", "c2, ppm/g²", "change at 20 g, %"]
+    for prefix, label in (("x_", "X"), ("y_", "Y")):
+        cells = [pair(cell) for cell in rows[label]]
+        for (value, u), name, factor in zip(cells, ("K0", "c1", "c2"), (2022767.0, 9.80665e6, 96.17e6), strict=False):
+            p = record.parameters[prefix + name]
+            assert value == pytest.approx(p.value * factor, abs=0.06 * u)
+            assert u == pytest.approx(p.standard_uncertainty * factor, rel=0.06)
+        c1, c2 = (record.value(prefix + name) for name in ("c1", "c2"))
+        top = 20 * 9.80665
+        C = record.cov(prefix + "c1", prefix + "c2")
+        gradient = np.array([top, top**2])
+        assert cells[3][0] == pytest.approx(100 * (c1 * top + c2 * top**2), abs=0.1)
+        assert cells[3][1] == pytest.approx(100 * np.sqrt(gradient @ C @ gradient), rel=0.06)
 
 
 def test_the_text_of_a_verdict_names_the_gravest_reason(fit):
@@ -263,3 +326,97 @@ def test_importing_imulab_loads_no_library_that_draws_or_tabulates():
     assert not {"numpy", "scipy", "pandas", "polars", "plotly", "kaleido", "IPython", "jinja2", "pydantic"} & set(
         loaded
     )
+
+
+def check():
+    first = il.simulate_tumble(gravity=G)
+    truth = {key[6:]: float(text) for key, text in first.metadata.items() if key.startswith("truth_")}
+    second = il.simulate_tumble(gravity=G, truth=truth, seed=2)
+    return il.check_tumble(il.fit_tumble(first, order=1, gravity=G).calibration, second, limit=2e-3, gravity=G)
+
+
+def changes():
+    fits = [il.fit_tumble(il.simulate_tumble(gravity=G, seed=seed), order=1, gravity=G) for seed in (1, 2)]
+    return il.compare_records(*(fit.calibration for fit in fits))
+
+
+def fused():
+    board = il.simulate_array(session=1)
+    columns = {name: values.copy() for name, values in board.columns.items()}
+    columns["gyro_3"][3000:4000] = columns["gyro_3"][3000]
+    columns["gyro_2"][1000:1010] = np.nan
+    return il.fuse(il.Recording(columns, board.units))
+
+
+def curve():
+    return il.allan_deviation(il.simulate_array(experiment="static", duration=60.0), column="gyro_1")
+
+
+def compared():
+    return il.compare_methods(il.simulate_array(session=1))
+
+
+@pytest.mark.parametrize(
+    ("made", "names", "rows"),
+    [
+        (check, ["Residual |f| − g of each fresh attitude under the record"], 24),
+        (changes, ["Change of each parameter in units of its standard uncertainty"], 9),
+        (fused, ["Fused rate over time", "State of each gyro"], 6),
+        (curve, ["Allan deviation, gyro_1"], 12),
+        (
+            compared,
+            ["Allan deviation of each method", "Angle error over time", "Weight and health of each gyro under robust"],
+            7,
+        ),
+    ],
+)
+def test_results_that_are_no_records_show_tables_and_figures(made, names, rows, tmp_path):
+    result = made()
+    assert [plot.name for plot in result.plot()] == names
+    page = result._repr_html_()
+    assert page.count("<tr>") == rows + 1
+    assert page.startswith("<div><strong>")
+    assert "nan" not in json.dumps(result.plot(names[0]).to_dict(), allow_nan=False)
+    assert len(repr(result).splitlines()) <= 12
+    result.plot(names[0]).save(tmp_path / "x.html")
+    with pytest.raises(OptionError, match="plot 'no such': no such figure; expected one of"):
+        result.plot("no such")
+
+
+def test_the_figure_of_a_fused_rate_marks_where_gyros_fail():
+    result = fused()
+    rate, states = (plot.to_dict() for plot in result.plot())
+    drawn = {trace["name"]: trace for trace in rate["data"]}
+    assert "gyro_2" in drawn["non-finite"]["text"]
+    first = drawn["non-finite"]["text"].index("gyro_2")
+    assert drawn["non-finite"]["x"][first] == pytest.approx(result.time[1000])
+    assert "gyro_3" in drawn["stuck"]["text"]
+    assert max(drawn["rate"]["y"]) == pytest.approx(result.rate.max(), rel=1e-6)
+    stuck = next(trace for trace in states["data"] if trace["name"] == "stuck")
+    assert set(stuck["y"]) == {"gyro_3"}
+    assert result.time[3000] < min(stuck["x"]) < max(stuck["x"]) < result.time[4010]
+
+
+def test_a_change_is_drawn_in_units_of_its_uncertainty():
+    result = changes()
+    (trace,) = result.plot("change").to_dict()["data"]
+    for x, name, change in zip(trace["x"], trace["y"], result.changes, strict=True):
+        assert name == change.name
+        assert x == pytest.approx(change.difference / change.standard_uncertainty)
+    bias = result.changes[0]
+    name, difference, u, _, unit, _ = result.shown()[2][0]
+    assert (name, unit) == ("bias_x", "mg")
+    assert float(difference) * 9.80665e-3 == pytest.approx(bias.difference, rel=1e-3)
+    assert float(u) * 9.80665e-3 == pytest.approx(bias.standard_uncertainty, rel=0.06)
+
+
+def test_records_are_compared_from_their_files_as_by_the_command(tmp_path, capsys):
+    for seed in (1, 2):
+        il.fit_tumble(il.simulate_tumble(gravity=G, seed=seed), order=1, gravity=G).save(tmp_path / f"{seed}.json")
+    found = il.compare_records(tmp_path / "1.json", str(tmp_path / "2.json"))
+    assert main(["show", str(tmp_path / "1.json"), str(tmp_path / "2.json"), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [each["difference"] for each in printed["changes"]] == [each.difference for each in found.changes]
+    assert set(printed) == {"changes", "probability", "left_out", "models"}
+    with pytest.raises(OptionError, match="compare_records: expected a record or the name of its file, found int 3"):
+        il.compare_records(tmp_path / "1.json", 3)

@@ -14,9 +14,9 @@ from imulab.cli.show import describe_blob, describe_record
 from imulab.device.blob import make_blob
 from imulab.errors import ImulabError, RecordError
 from imulab.exporters import ExportOptions
+from imulab.procedures.changes import compare_records
 from imulab.procedures.gyro_array.simulate import simulate_array
 from imulab.procedures.loading import load_any, loads
-from imulab.procedures.reports import compare_records
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.procedures.unit_tables import tables_of_all
 from imulab.procedures.warmup.simulate import simulate_power_cycle

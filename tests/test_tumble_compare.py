@@ -10,7 +10,7 @@ from scipy import stats
 import imulab as il
 from conftest import sap5_table, table
 from imulab.errors import RecordError, UnitError
-from imulab.procedures.reports import compare_records
+from imulab.procedures.changes import compare_records
 from imulab.procedures.tumble.compare import check_tumble
 from reference import tumble as reference
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from imulab.procedures.centrifuge.fit import fit_centrifuge as fit_centrifuge
     from imulab.procedures.centrifuge.manifest import load_manifest as load_manifest
     from imulab.procedures.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
+    from imulab.procedures.changes import compare_records as compare_records
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
@@ -86,6 +87,7 @@ _HOME = {
     "TumbleFit": "procedures.tumble.fit",
     "WarmupFit": "procedures.warmup.fit",
     "apply": "procedures.apply",
+    "compare_records": "procedures.changes",
     "export": "exporters",
     "find_attitudes": "procedures.tumble.segment",
     "find_power_cycle": "procedures.warmup.cycles",

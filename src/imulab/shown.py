@@ -31,8 +31,11 @@ class Shown:
 
 def html_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table as HTML."""
-    head = "".join(f"<th>{escape(title)}</th>" for title in titles)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    right = _numeric_columns(rows, len(titles))
+    styles = [f' style="text-align: {"right" if number else "left"}; padding: 1px 8px"' for number in right]
+    head = "".join(f"<th{style}>{escape(title)}</th>" for title, style in zip(titles, styles, strict=True))
+    cells = (zip(row, styles, strict=True) for row in rows)
+    body = "".join("<tr>" + "".join(f"<td{s}>{escape(cell)}</td>" for cell, s in row) + "</tr>" for row in cells)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
@@ -40,7 +43,7 @@ def aligned(titles: list[str], rows: list[list[str]]) -> list[str]:
     """Return a table as lines of text; texts to the left, numbers to the right."""
     table = [titles, *rows]
     widths = [max(len(row[i]) for row in table) for i in range(len(titles))]
-    numeric = [all(_numeric(row[i]) for row in rows) for i in range(len(titles))]
+    numeric = _numeric_columns(rows, len(titles))
     return [
         "  ".join(
             cell.rjust(width) if right else cell.ljust(width)
@@ -50,5 +53,10 @@ def aligned(titles: list[str], rows: list[list[str]]) -> list[str]:
     ]
 
 
+def _numeric_columns(rows: Sequence[Sequence[str]], count: int) -> list[bool]:
+    """Return which columns hold numbers."""
+    return [all(_numeric(row[i]) for row in rows) for i in range(count)]
+
+
 def _numeric(text: str) -> bool:
-    return text in ("–", "not stated") or text.lstrip("+-")[:1].isdigit()
+    return text in ("–", "not stated", "in noise") or text.lstrip("+-")[:1].isdigit()

@@ -216,15 +216,15 @@ def _show_formats(names: list[str], *, json: bool) -> None:
 
 def _show_changes(first: str, second: str, *, json: bool) -> None:
     from imulab.cli.show import describe_changes
+    from imulab.procedures.changes import compare_records
     from imulab.procedures.loading import load
-    from imulab.procedures.reports import compare_records
 
     records = [load(first), load(second)]
     comparison = compare_records(*records)
     if json:
         from dataclasses import asdict
 
-        print(dumps(asdict(comparison), indent=1))
+        print(dumps({k: v for k, v in asdict(comparison).items() if k != "record"}, indent=1))
         return
     serials = [record.sensor.get("serial") for record in records]
     if all(serials) and serials[0] != serials[1]:

@@ -11,12 +11,13 @@ import numpy as np
 from imulab.cli.speech import coloured
 from imulab.errors import ReadError
 from imulab.printable import printable
-from imulab.procedures.reports import change_unit, exhibits_of
+from imulab.procedures.changes import TITLES, change_rows, verdict
+from imulab.procedures.reports import exhibits_of
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Comparison
 from imulab.records.json_text import json_text
-from imulab.report.elements import ReportTable, format_uncertain, plain_number
+from imulab.report.elements import ReportTable
 from imulab.shown import aligned
 from imulab.verdict import SENTENCES, Verdict
 
@@ -91,21 +92,7 @@ def _joined(value: object) -> str:
 
 def describe_changes(first: str, second: str, comparison: Comparison, record: Calibration) -> str:
     """Return what changed from one record to the other, which is of the procedure and units of `record`."""
-    rows = []
-    for change in comparison.changes:
-        factor, unit = change_unit(change, record)
-        u = change.standard_uncertainty
-        texts = (plain_number(change.difference * factor, 3), "not stated")
-        difference, uncertainty = texts if u is None else format_uncertain(change.difference * factor, u * abs(factor))
-        deviations = "–" if change.deviations is None else f"{change.deviations:+.1f}"
-        rows.append([change.name, difference, uncertainty, deviations, unit, "changed" if change.significant else ""])
-    changed = [change.name for change in comparison.changes if change.significant]
-    judged = sum(change.standard_uncertainty is not None for change in comparison.changes)
-    verdict = (
-        f"{len(changed)} of {judged} parameters changed: {' '.join(changed)}" if changed else "no significant change"
-    )
-    titles = ["parameter", "change", "u", "change / u", "unit", ""]
-    lines = [f"{second} less {first}: {verdict}", "", *aligned(titles, rows)]
+    lines = [f"{second} less {first}: {verdict(comparison)}", "", *aligned(TITLES, change_rows(comparison, record))]
     if comparison.probability is not None:
         lines += ["", f"all together: probability {comparison.probability:.2g} if nothing had changed"]
     if comparison.models:

@@ -3,18 +3,67 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from os import PathLike
-from typing import Any, Unpack
+from typing import Any, ClassVar, Unpack
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import allan
-from imulab.estimation.allan import AllanCurve
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame
 from imulab.procedures.inputs import Data, Part, Window, as_recording
+from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording, check_finite
+from imulab.report.elements import Exhibits, ReportTable, format_uncertain
+from imulab.units import parse_unit
+
+
+@dataclass(frozen=True, repr=False)
+class AllanCurve(Drawn, allan.AllanCurve):
+    """The same of a column, in SI, or of samples of an unknown unit.
+
+    Attributes
+    ----------
+    tau
+        Averaging times, s, shape (t,).
+    deviation, standard_uncertainty
+        Allan deviation and its standard uncertainty, in the unit of the samples, shape (t,).
+    freedom
+        Equivalent degrees of freedom, shape (t,).
+    name, unit
+        Of the samples.
+    """
+
+    name: str = "samples"
+    unit: str = "1"
+
+    subject: ClassVar[str] = "Allan deviation"
+
+    __repr__ = allan.AllanCurve.__repr__
+
+    def exhibits(self) -> Exhibits:
+        """Return the curve with its 95 % interval, and a table of it."""
+        from imulab.report.noise_figures import allan_figure, shown_unit
+
+        unit, factor = shown_unit(self.unit, "bias_instability")
+        pairs = zip(self.deviation.tolist(), self.standard_uncertainty.tolist(), strict=True)
+        rows = [
+            [f"{tau:.6g}", *format_uncertain(deviation * factor, u * factor)]
+            for tau, (deviation, u) in zip(self.tau.tolist(), pairs, strict=True)
+        ]
+        table = ReportTable(self.subject, "", ["averaging time, s", f"deviation, {unit}", "standard uncertainty"], rows)
+        least = int(np.argmin(self.deviation))
+        headline = (
+            f"Allan deviation of {self.name} over {rows[0][0]} to {rows[-1][0]} s; least {' ± '.join(rows[least][1:])} "
+            f"{unit} at {rows[least][0]} s."
+        )
+        return Exhibits(headline, [], [allan_figure({self.name: vars(self)}, [self.name]), table])
+
+
+def _curve(found: allan.AllanCurve, name: str = "samples", unit: str = "1") -> AllanCurve:
+    return AllanCurve(**vars(found), name=name, unit=unit)
 
 
 def allan_deviation(
@@ -74,7 +123,7 @@ def allan_deviation(
     if not isinstance(data, str | PathLike | Recording | Mapping) and not is_frame(data) and _is_line(data):
         if rate is None:
             raise OptionError("allan_deviation: samples without a time: expected rate=, in Hz")
-        return allan.allan_deviation(np.asarray(data, dtype=np.float64), rate, taus)
+        return _curve(allan.allan_deviation(np.asarray(data, dtype=np.float64), rate, taus))
     given: dict[str, Any] = {**reading, "rate": rate, "window": window}
     recording = as_recording(data, given, allan_deviation)
     names = [name for name in recording.columns if name != "time"]
@@ -85,7 +134,9 @@ def allan_deviation(
             f"allan_deviation: {recording.name}: {found}; expected column=, one of {listed(names, column)}"
         )
     check_finite(recording, [chosen])
-    return allan.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
+    curve = allan.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
+    quantity = parse_unit(unit := recording.units[chosen]).quantity
+    return _curve(curve, chosen, {"rate": "rad/s", "acceleration": "m/s^2"}.get(quantity, unit))
 
 
 def _is_line(data: object) -> bool:

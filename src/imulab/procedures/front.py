@@ -20,6 +20,7 @@ from imulab.procedures.apply import apply
 from imulab.procedures.inputs import Reading, as_recording
 from imulab.procedures.loading import load as load
 from imulab.procedures.procedure import Row
+from imulab.procedures.registry import procedure_of
 from imulab.procedures.reports import exhibits_of, parameter_rows
 from imulab.procedures.reports import write_report as write_report
 from imulab.recording import Recording
@@ -27,7 +28,7 @@ from imulab.records.calibration import Calibration
 from imulab.report.channels import channel_figures
 from imulab.report.elements import format_uncertain
 from imulab.report.plots import Plot, Plots
-from imulab.shown import LINES, WIDTH, html_table
+from imulab.shown import LINES, WIDTH, aligned, html_table
 from imulab.verdict import SENTENCES
 
 _COLOURS = {"good": "#1f6f8b", "look": "#b58a1b", "bad": "#c8553d"}
@@ -41,15 +42,7 @@ def text(record: Calibration) -> str:
     more = f" (and {len(verdict.reasons) - 1} more)" if len(verdict.reasons) > 1 else ""
     lines = [_title(record), f"{verdict.state}: {SENTENCES[verdict.state]}{reasons}{more}"]
     lines += [headline] if (headline := _headline(record)) else []
-    groups: dict[tuple[str, str], list[str]] = {}
-    for row in parameter_rows(record):
-        stem, _, last = row.name.rpartition("_")
-        stem, last = (stem, f"{last} ") if stem and (len(last) < 3 or last.isdecimal()) else (row.name, "")
-        groups.setdefault((stem, row.unit), []).append(
-            last + " ± ".join(_number(row)[: 1 if row.standard_uncertainty is None else 2])
-        )
-    width = max((len(stem) for stem, _ in groups), default=0)
-    rows = [_short(f"  {stem:{width}}  {', '.join(texts)} {unit}") for (stem, unit), texts in groups.items()]
+    rows = [f"  {_short(line)}" for line in aligned(*found)] if (found := _summary(record))[1] else _grouped(record)
     room = LINES - len(lines)
     if len(rows) > room:
         rows = [*rows[: room - 1], f"  ... and {len(rows) - room + 1} more: to_frame() has all parameters"]
@@ -61,12 +54,15 @@ def html(record: Calibration) -> str:
     verdict = record.verdict
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     rows = [[row.name, *_number(row), row.unit] for row in parameter_rows(record)]
+    table = html_table(["parameter", "value", "standard uncertainty", "unit"], rows)
+    titles, first = _summary(record)
+    if first:
+        table = f"{html_table(titles, first)}<details><summary>all parameters</summary>{table}</details>"
     return (
         f"<div><strong>{escape(_title(record))}</strong>"
         f'<div style="{_STYLE.format(_COLOURS[verdict.state])}">{escape(verdict.state)}: '
         f"{escape(SENTENCES[verdict.state])}<ul>{reasons}</ul></div>"
-        f"<p>{escape(_headline(record))}</p>"
-        f"{html_table(['parameter', 'value', 'standard uncertainty', 'unit'], rows)}</div>"
+        f"<p>{escape(_headline(record))}</p>{table}</div>"
     )
 
 
@@ -124,6 +120,28 @@ def _headline(record: Calibration) -> str:
         return exhibits_of(record).headline
     except RecordError:
         return ""
+
+
+def _summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
+    """Return the table that a record shows first; nothing of one that lacks what it is made from."""
+    own = procedure_of(record).summary
+    try:
+        return ([], []) if own is None else own(record)
+    except RecordError:
+        return [], []
+
+
+def _grouped(record: Calibration) -> list[str]:
+    """Return the parameters as lines, those that differ in their last part alone in one."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for row in parameter_rows(record):
+        stem, _, last = row.name.rpartition("_")
+        stem, last = (stem, f"{last} ") if stem and (len(last) < 3 or last.isdecimal()) else (row.name, "")
+        groups.setdefault((stem, row.unit), []).append(
+            last + " ± ".join(_number(row)[: 1 if row.standard_uncertainty is None else 2])
+        )
+    width = max((len(stem) for stem, _ in groups), default=0)
+    return [_short(f"  {stem:{width}}  {', '.join(texts)} {unit}") for (stem, unit), texts in groups.items()]
 
 
 def _number(row: Row) -> tuple[str, str]:

@@ -159,6 +159,8 @@ class Procedure:
         Why its records correct no recording by `apply`, and what takes them; None where they do.
     rows
         Record to its parameters in the units in which people read them; by their units if None.
+    summary
+        Record to the table that it shows of itself first, titles and rows of text; of all its parameters if None.
     change_unit
         Change of a parameter and record to the factor from SI and the unit in which it is read; by unit if None.
     same_meaning
@@ -185,6 +187,7 @@ class Procedure:
     elsewhere: str | None = None
     not_applied: str | None = None
     rows: Callable[[Calibration], Sequence[Row]] | None = None
+    summary: Callable[[Calibration], tuple[list[str], list[list[str]]]] | None = None
     change_unit: Callable[[Change, Calibration], tuple[float, str]] | None = None
     same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
     beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None

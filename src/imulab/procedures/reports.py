@@ -10,7 +10,7 @@ from imulab.atomic_write import write_text
 from imulab.procedures.procedure import Row
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
-from imulab.records.comparison import Change, Comparison, compared
+from imulab.records.comparison import Change
 from imulab.report.elements import Exhibits
 from imulab.units import STANDARD_GRAVITY, from_si
 
@@ -32,11 +32,6 @@ def exhibits_of(record: Calibration) -> Exhibits:
     """
     exhibits: Exhibits = procedure_of(record).exhibits(record)
     return exhibits
-
-
-def compare_records(first: Calibration, second: Calibration) -> Comparison:
-    """Compare two records of one unit; see `imulab.records.comparison.compared`."""
-    return compared(first, second, procedure_of(first).same_meaning)
 
 
 def change_unit(change: Change, record: Calibration) -> tuple[float, str]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from imulab.records.calibration import Calibration
+from imulab.report.elements import Exhibits, Figure, ReportTable
+from imulab.shown import Shown
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -53,3 +55,33 @@ class Result:
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
         """Write the record in the form of firmware or another program; see `Calibration.export`."""
         return self.calibration.export(target, folder, **options)
+
+
+class Drawn(Shown):
+    """A result that is no record, and shows itself by what a report on it shows; `subject` says what it is."""
+
+    subject: ClassVar[str]
+
+    def exhibits(self) -> Exhibits:
+        """Return what a report on it shows."""
+        raise NotImplementedError
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return the headline and the first table."""
+        found = self.exhibits()
+        table = next((item for item in found.items if isinstance(item, ReportTable)), None)
+        return found.headline, *(([], []) if table is None else (table.columns, table.rows))
+
+    def plot(self, name: str | None = None) -> Plots | Plot:
+        """Return the figures, which show themselves in a notebook, or the one whose title has these words.
+
+        Raises
+        ------
+        OptionError
+            There is no such figure; the message lists them.
+        """
+        from imulab.report.plots import Plots
+
+        found = self.exhibits()
+        plots = Plots([item for item in found.items if isinstance(item, Figure)], self.subject)
+        return plots if name is None else plots[name]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,7 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
         )
     ]
     for names in kinds.values():
-        items += [_curves(found, names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)]
+        items += [allan_figure(found["columns"], names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)]
     items += [_samples(found, recording, page) for page in panels.pages(list(found["columns"]))]
     return Exhibits(
         headline=f"At rest for {length:.4g} s; white noise, as angle or velocity random walk: "
@@ -91,12 +91,13 @@ def interval(column: dict[str, Any]) -> tuple[Array, Array]:
     return low, high
 
 
-def _curves(found: dict[str, Any], names: list[str]) -> Figure:
-    unit, factor = shown_unit(found["columns"][names[0]]["unit"], "bias_instability")
+def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
+    """Return the Allan curves of columns of one unit, as `imulab.estimation.column_noise.analyse` found them."""
+    unit, factor = shown_unit(columns[names[0]]["unit"], "bias_instability")
     traces: list[dict[str, Any]] = []
     lowest: list[tuple[float, float, str]] = []
     for k, name in enumerate(names):
-        column = found["columns"][name]
+        column = columns[name]
         shown = np.array(column["deviation"]) > 0
         if not shown.any():
             continue

@@ -11,6 +11,7 @@ from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.centrifuge.model import curve
 from imulab.procedures.centrifuge.sections import Centrifuge, centrifuge_of, force_of, level_of
 from imulab.procedures.centrifuge.tables import (
+    ENGINEERING,
     PER_G,
     budget_table,
     curve_table,
@@ -57,6 +58,28 @@ def exhibits(record: Calibration) -> Exhibits:
         run_table(r.runs),
     ]
     return Exhibits(headline=_headline(record, sets[0]), facts=_facts(record, sets), items=items)
+
+
+def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
+    """Return the curve of each axis, and what it changes up to the highest level, with uncertainties."""
+    sets, top = prefixes(record), force_of(record, max(level.level for level in centrifuge_of(record).levels))
+    rows = []
+    for prefix in sets:
+        cells = []
+        for name in ("K0", "c1", "c2"):
+            factor, _ = ENGINEERING[name]
+            found = record.parameters.get(f"{prefix}{name}")
+            u = 0.0 if found is None else (found.standard_uncertainty or 0.0) * factor
+            cells.append("–" if found is None else " ± ".join(format_uncertain(found.value * factor, u)))
+        K, _ = curve_at(record, prefix, np.array([top]))
+        change = 100 * relative(float(K[0]), record.value(f"{prefix}K0"))
+        cells.append(" ± ".join(format_uncertain(change, 100 * _curve_change(record, prefix, top))))
+        rows.append([_label(prefix), *cells])
+    return [
+        "axis",
+        *(f"{name}, {ENGINEERING[name][1]}" for name in ("K0", "c1", "c2")),
+        f"change at {_g(top)}, %",
+    ], rows
 
 
 def prefixes(record: Calibration) -> list[str]:

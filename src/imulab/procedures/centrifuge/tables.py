@@ -12,7 +12,7 @@ from imulab.units import STANDARD_GRAVITY, from_si
 PER_G = float(from_si(STANDARD_GRAVITY, "deg/h"))
 """deg/h/g in one rad/s/(m/s^2)."""
 
-_ENGINEERING = {
+ENGINEERING = {
     "K": (PER_G, "deg/h/g"),
     "K0": (PER_G, "deg/h/g"),
     "zeta": (100.0, "%"),
@@ -21,6 +21,7 @@ _ENGINEERING = {
     "direction": (180 / np.pi, "deg"),
     "cross": (PER_G * STANDARD_GRAVITY, "deg/h/g²"),
 }
+"""By the stem of a parameter: factor from SI, and unit."""
 _BUDGET = {
     "rad": (180 * 3600 / np.pi, "arcsec"),
     "rad/(m/s^2)": (1e6 * STANDARD_GRAVITY, "µrad/g"),
@@ -36,7 +37,7 @@ def parameters_table(record: Calibration, fit: Fit) -> ReportTable:
     rows = []
     for name, parameter in record.parameters.items():
         stem = next((part for part in name.split("_")[1:] if part != "down"), "")
-        factor, unit = _ENGINEERING.get(stem, (1.0, parameter.unit))
+        factor, unit = ENGINEERING.get(stem, (1.0, parameter.unit))
         value, u = parameter.value * factor, (parameter.standard_uncertainty or 0.0) * factor
         ends = " to ".join(format_uncertain(value + sign * fit.coverage_factor_95[name] * u, u)[0] for sign in (-1, 1))
         nu = fit.degrees_of_freedom[name]

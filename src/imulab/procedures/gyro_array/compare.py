@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,13 +17,16 @@ from imulab.estimation.sampling import sampling_rate
 from imulab.procedures.gyro_array.bandwidth import Response, responses
 from imulab.procedures.gyro_array.checks import Checks
 from imulab.procedures.gyro_array.clocks import on_one_clock
+from imulab.procedures.gyro_array.compare_figures import exhibits_of_comparison
 from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
 from imulab.procedures.gyro_array.memory import memory_text
 from imulab.procedures.gyro_array.model import FEWEST_ROBUST, Elements, array_calibration, feedback_notes, find_elements
 from imulab.procedures.gyro_array.sections import MethodRow
 from imulab.procedures.gyro_array.single import Singles, single_gyros
+from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance
+from imulab.report.elements import Exhibits
 
 _TRACE = 800
 _QUIET_FACTOR = 3.0
@@ -36,7 +39,7 @@ _HALVES = 2 * FEWEST_ROBUST
 
 
 @dataclass(frozen=True, repr=False)
-class Comparison:
+class Comparison(Drawn):
     """Every method over one recording.
 
     Attributes
@@ -53,6 +56,12 @@ class Comparison:
     elements: Elements
     record: Calibration
     warnings: tuple[str, ...]
+
+    subject: ClassVar[str] = "Methods of fusion"
+
+    def exhibits(self) -> Exhibits:
+        """Return what its report shows."""
+        return exhibits_of_comparison(self.record)
 
     def __repr__(self) -> str:
         lines = [f"Comparison of {len(self.figures)} methods, rate std in {' '.join(self.elements.units)}"]

@@ -23,6 +23,12 @@ def exhibits(record: Calibration) -> Exhibits:
     return exhibits_of_comparison(record) if model_of(record).kind == "comparison" else _calibration(array_of(record))
 
 
+def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
+    """Return the first table of the report: each gyro with its uncertainties, or each method."""
+    first = next(item for item in exhibits(record).items if isinstance(item, ReportTable))
+    return first.columns, first.rows
+
+
 def _calibration(record: ArrayRecord) -> Exhibits:
     elements, model, shared = record.elements, record.model, record.correlation
     limit = float(np.mean([_deg(limit.value) for limit in shared.limit]))

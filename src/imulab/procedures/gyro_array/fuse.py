@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,8 +28,10 @@ from imulab.procedures.gyro_array.model import (
     find_elements,
 )
 from imulab.procedures.gyro_array.sections import model_of
+from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
+from imulab.report.elements import Exhibits
 from imulab.units import from_si, parse_unit
 
 _NEED_THREE = ("robust", "support", "least-squares")
@@ -103,7 +105,7 @@ class FuseOptions:
 
 
 @dataclass(frozen=True, repr=False)
-class Fused:
+class Fused(Drawn):
     """The fused rate.
 
     Attributes
@@ -132,6 +134,14 @@ class Fused:
     health: Health
     notes: tuple[str, ...] = ()
     block: Recording | None = None
+
+    subject: ClassVar[str] = "Fused rate"
+
+    def exhibits(self) -> Exhibits:
+        """Return the rate and the state of the gyros over time."""
+        from imulab.procedures.gyro_array.fused_figures import exhibits_of_fused
+
+        return exhibits_of_fused(self)
 
     def __repr__(self) -> str:
         gyros, axes = self.elements.count, len(self.elements.axes)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab._version import VERSION
 from imulab.procedures.tumble.attitudes import Attitudes
-from imulab.procedures.tumble.compare import Check
 from imulab.procedures.tumble.engineering import micro_g, small_g
 from imulab.procedures.tumble.prior import FALSE_ALARM
 from imulab.recording import Array
@@ -19,6 +18,9 @@ from imulab.report import render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, ReportTable
 from imulab.verdict import Bad, Note, verdict_of
+
+if TYPE_CHECKING:
+    from imulab.procedures.tumble.compare import Check
 
 _BEYOND = 2.0
 """Standard uncertainties beyond which a residual is marked."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Unpack
+from typing import ClassVar, Unpack
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import chi_square_probability, median
 from imulab.gravity import Gravity, local_gravity
 from imulab.procedures.inputs import Reading, as_record
+from imulab.procedures.result import Drawn
 from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
@@ -22,12 +23,13 @@ from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.report.elements import Exhibits
 from imulab.units import from_si
 from imulab.verdict import Note
 
 
 @dataclass(frozen=True, repr=False)
-class Check:
+class Check(Drawn):
     """How well a record still holds.
 
     Attributes
@@ -47,6 +49,8 @@ class Check:
         Largest ``| |f| - g |`` that passes, m/s^2; None: the test alone decides.
     notes
         What a user must know of the test, a sentence each.
+    attitudes
+        That were tested.
     """
 
     residuals: Array
@@ -56,6 +60,15 @@ class Check:
     gravity: Gravity
     limit: float | None
     notes: tuple[str, ...]
+    attitudes: Attitudes
+
+    subject: ClassVar[str] = "Tumble check"
+
+    def exhibits(self) -> Exhibits:
+        """Return what its report shows."""
+        from imulab.procedures.tumble.checkfigures import exhibits_of_check
+
+        return exhibits_of_check(self, self.attitudes)
 
     def __repr__(self) -> str:
         p = "" if self.probability is None else f", p = {self.probability:.2g}"
@@ -151,7 +164,7 @@ def check_tumble(
     if made_from(record, attitudes.recording):
         notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
     if not record.covariance.names:
-        return Check(residuals, None, None, None, local, limit, tuple(notes))
+        return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
     own_variance = own[0] + _excess(record, g)
     more = scatter(rows, seen, own_variance)
     if more > 0:
@@ -169,7 +182,7 @@ def check_tumble(
 
         probability = float(fdtrc(len(seen), freedom, value / len(seen)))
     total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
-    return Check(residuals, total, value, probability, local, limit, tuple(notes))
+    return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes)
 
 
 def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:

@@ -12,7 +12,18 @@ from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
 from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
+from imulab.report.elements import (
+    BAD,
+    GOOD,
+    INK,
+    LEGEND,
+    QUIET,
+    Exhibits,
+    Figure,
+    ReportTable,
+    format_uncertain,
+    plain_number,
+)
 from imulab.report.traces import rounded, scatter
 
 _POINTS = 121
@@ -62,6 +73,26 @@ def exhibits(record: Calibration) -> Exhibits:
         facts=facts,
         items=items,
     )
+
+
+def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
+    """Return, for each axis, what the table subtracts at power-on, and the error without and with it."""
+    table = record_table(record)
+    at = table.temperatures[[0, len(table.temperatures) // 2, -1]].tolist()
+    first = [evaluate(table, np.zeros(1), _inside(table, temperature)) for temperature in at]
+    fit = drawn_of(record).fit if record.fit else None
+    rows = []
+    for i, axis in enumerate(table.axes):
+        label, factor = engineering_unit(table.units[i])
+        cells = ["–" if z is None else plain_number(float(z[i, 0]) * factor, 3) for z in first]
+        if fit is not None:
+            cells += [_text(fit.row(name).training, [i], factor) for name in ("none", None)]
+            floor, u = fit.repeatability.cycle[i], fit.repeatability.standard_uncertainty[i]
+            known = format_uncertain(floor * factor, u * factor) if floor and u else [_text([floor], [0], factor)]
+            cells.append(" ± ".join(known))
+        rows.append([axis, *cells, label])
+    titles = ["rms before", "rms after", "cycles repeat to"] if fit is not None else []
+    return ["axis", *(f"power-on, {temperature:g} °C" for temperature in at), *titles, "unit"], rows
 
 
 def _worst(
