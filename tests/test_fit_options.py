@@ -18,12 +18,14 @@ COMMANDS = {
     "array": "array calibrate",
     "warmup": "warmup fit",
     "centrifuge": "centrifuge reduce",
+    "noise": "noise fit",
 }
 FUNCTIONS = {
     "tumble": (il.fit_tumble, {}),
     "array": (il.calibrate_array, {"averaging": "averaging_time"}),
     "warmup": (il.fit_warmup, {"exit": "exit_rule"}),
     "centrifuge": (il.fit_centrifuge, {}),
+    "noise": (il.fit_noise, {}),
 }
 OF_FILES = (
     "layout", "topic", "instance", "window", "element", "interval", "method", "memory", "latitude", "height",

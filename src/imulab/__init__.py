@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.loading import load as load
+    from imulab.procedures.noise.fit import NoiseFit as NoiseFit
+    from imulab.procedures.noise.fit import fit_noise as fit_noise
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
     from imulab.procedures.tumble.compare import check_tumble as check_tumble
@@ -92,6 +94,8 @@ _HOME = {
     "find_attitudes": "procedures.tumble.segment",
     "find_power_cycle": "procedures.warmup.cycles",
     "fit_gyro": "procedures.tumble.gyrofit",
+    "NoiseFit": "procedures.noise.fit",
+    "fit_noise": "procedures.noise.fit",
     "fit_centrifuge": "procedures.centrifuge.fit",
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import allan, array, centrifuge, convert, export, fleet, records, tumble, warmup
+from imulab.cli import allan, array, centrifuge, convert, export, fleet, noise, records, tumble, warmup
 from imulab.cli.common import offer
 
 _SETTINGS: dict[str, Any] = {
@@ -30,6 +30,7 @@ _GROUPS: dict[str, tuple[Callable[[dict[str, Any]], typer.Typer], str]] = {
     "array": (array.commands, "Fuse several gyroscopes on one axis into one rate."),
     "centrifuge": (centrifuge.commands, "Measure how a gyroscope's g-sensitive drift changes with g."),
     "warmup": (warmup.commands, "Tabulate and subtract the bias after power-on."),
+    "noise": (noise.commands, "Model the noise of sensors at rest, for filters."),
     "fleet": (fleet.commands, "Calibrate many units, and watch the line."),
 }
 _SUMMARIES = {
@@ -57,6 +58,7 @@ _SUMMARIES = {
     "centrifuge plan": "List the runs of a test, with what they will give.",
     "centrifuge simulate": "Simulate the runs of a test.",
     "centrifuge reduce": "Reduce a test to K at every g and to its curve.",
+    "noise fit": "Fit a model of the noise to logs at rest.",
     "fleet run": "Calibrate every unit of a manifest that has no record.",
     "fleet status": "Say what is done, failed and missing.",
     "fleet report": "Draw the statistics of the line.",

@@ -107,9 +107,9 @@ def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
     for record in records:
         reason = procedure_of(record).elsewhere
         if reason is not None:
+            instead = "; use --to c or --to blob" if procedure_of(record).sections else ""
             raise OptionError(
-                f"{target}: a {record.procedure} record cannot be exported: {reason.format(target=target)}; "
-                "use --to c or --to blob"
+                f"{target}: a {record.procedure} record cannot be exported: {reason.format(target=target)}{instead}"
             )
     if len(records) != 1:
         raise OptionError(f"{target}: expected one tumble record, found {len(records)}")

@@ -44,13 +44,15 @@ class Parameter:
     """A value with its standard uncertainty (None where none can be stated) and its SI or output unit.
 
     Where the order of a model was chosen from the data, `standard_uncertainty_given_order` is what it would be if that
-    order were known to be right.
+    order were known to be right. `interval_95` is the interval that holds the value with 95 %, where it is not about
+    that of a normal distribution.
     """
 
     value: float
     standard_uncertainty: float | None
     unit: str
     standard_uncertainty_given_order: float | None = None
+    interval_95: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +182,7 @@ class Calibration:
                     if p.standard_uncertainty_given_order is None
                     else {"standard_uncertainty_given_order": p.standard_uncertainty_given_order}
                 )
+                | ({} if p.interval_95 is None else {"interval_95": list(p.interval_95)})
                 for name, p in self.parameters.items()
             },
             "covariance": {"names": self.covariance.names, "matrix": self.covariance.matrix},

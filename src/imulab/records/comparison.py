@@ -159,7 +159,8 @@ def _freedom(record: Calibration, name: str) -> float | None:
     if "effective_degrees_of_freedom" in fit:
         effective: float | None = fit["effective_degrees_of_freedom"]
         return effective
-    if fit.get("noise") == "known" and not fit.get("excess", {}).get("value"):
+    noise = fit.get("noise")
+    if noise == "known" and not fit.get("excess", {}).get("value"):
         return None
     stated = fit.get("degrees_of_freedom", fit.get("repeatability"))
     if isinstance(stated, dict):  # of each parameter, or of the scatter that all of them come from

@@ -101,6 +101,9 @@ def _check_numbers(record: Calibration) -> None:
         for value in (p.standard_uncertainty, p.standard_uncertainty_given_order):
             if value is not None and value < 0:
                 raise RecordError(f"parameters.{key}: a standard uncertainty of {value:g}; expected 0 or more")
+        if p.interval_95 is not None and not p.interval_95[0] <= p.value <= p.interval_95[1]:
+            low, high = p.interval_95
+            raise RecordError(f"parameters.{key}: interval_95 from {low:g} to {high:g}; expected it to hold the value")
     names, matrix = record.covariance.names, record.covariance.array()
     unknown = [key for key in names if key not in record.parameters]
     if unknown or len(set(names)) < len(names):

@@ -95,6 +95,24 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> F
     return Fit(statistic, freedom, probability, tau, found, predicted[0], better)
 
 
+def allan_of_bins(records: Sequence[Sequence[Spectrum]]) -> tuple[Array, Array]:
+    """Return octaves of averaging time up to a quarter of a record, s, and the Allan variance there, shapes (t,).
+
+    Sums over the bins of each record, which its mirror image continues and whose lines are left out: they need no
+    samples. Records count by how many means they hold.
+    """
+    interval, longest = records[0][0].interval, max(each.length for record in records for each in record)
+    m = 2 ** np.arange(max(0, int(np.log2(longest / interval / 4))) + 1)
+    total, weight = np.zeros(len(m)), np.zeros(len(m))
+    for record in records:
+        counts = np.maximum(max(each.length for each in record) / (m * interval) - 3, 0.0)
+        for each in record:
+            power = np.where(each.freedom > 0, each.power, 0.0)
+            total += counts * (_weights(each, m) @ (_share(each) * power))
+        weight += counts
+    return np.asarray(m * interval, dtype=np.float64), np.asarray(total / weight)
+
+
 def _share(spectrum: Spectrum) -> Array:
     """Which part of all coefficients of the record each bin holds, those left out as lines included."""
     return np.asarray((spectrum.last - spectrum.first + 1) / spectrum.count)

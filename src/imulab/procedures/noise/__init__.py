@@ -1,0 +1,1 @@
+"""The noise of a sensor at rest: its model, and the numbers that filters want."""

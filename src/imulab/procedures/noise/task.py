@@ -1,0 +1,64 @@
+"""The noise of a unit, from logs at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import OptionError
+from imulab.procedures.noise.choices import COVARIATES, HORIZON, STEPS, check_terms
+from imulab.procedures.options import ELEMENT, READING, Option, choice, measure, part_of, read_options
+from imulab.procedures.procedure import Files, Task, source_of
+
+if TYPE_CHECKING:
+    from imulab.records.calibration import Calibration
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.noise.fit import fit_recordings
+
+    recordings = (access.recording(name, values["layout"], **values["part"]) for name in files)
+    sources = (source for name in files if (source := source_of(access, name)) is not None)
+    fit = {name: values[name] for name in ("terms", "horizon", "band", "regress", "columns", "steps")}
+    return fit_recordings(recordings, sources=sources, **fit).calibration
+
+
+def names_of_columns(text: str, option: str) -> list[str]:
+    """Return ``gyro_x,gyro_y`` as names.
+
+    Raises
+    ------
+    OptionError
+        It is no such list.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise OptionError(f"{option} {text!r}: expected names of columns, each once, such as gyro_x,gyro_y")
+    return names
+
+
+OPTIONS = (
+    Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
+    measure("horizon", "Time that a filter predicts without aiding, s.", "time", "s", f"{HORIZON:g} s", shows="TIME"),
+    measure("band", "Highest frequency to use, Hz; found from the spectrum if not given.", "frequency", "Hz"),
+    choice("regress", "Take out what follows it.", ("no", *COVARIATES), "no"),
+    Option("columns", "Columns to fit; all sensors if not given.", names_of_columns, shows="A,A,..."),
+    choice("steps", "Changes of level: say them, or remove them too.", STEPS, "say"),
+    *READING,
+    ELEMENT,
+)
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.procedures.noise.choices import check_options
+
+    values = read_options(OPTIONS, texts, label)
+    for name, nothing in (("regress", "no"), ("steps", "say")):
+        values[name] = None if values[name] == nothing else values[name]
+    check_options(values["terms"], values["horizon"], values["band"], values["regress"], values["steps"], label)
+    return {**values, "part": part_of(values, label)}
+
+
+TASK = Task(files="its logs at rest", count=(1, None), options=OPTIONS, values=_values, fit=_fit)
