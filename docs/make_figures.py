@@ -43,7 +43,7 @@ def centrifuge(folder: Path) -> None:
         levels=[n * 9.80665 for n in LEVELS], radius=2.0, net_rate=math.radians(40), cycles=2, both_senses=True,
         sensor={"serial": "DTG-7"},
     )  # fmt: skip
-    fit = il.fit_centrifuge(test, il.simulate_centrifuge(test, sample_rate=20.0, static_duration=20.0))
+    fit = il.fit_centrifuge(test, il.simulate_centrifuge(test, rate=20.0, duration=900.0, static_duration=20.0))
     il.write_report(fit.calibration, folder / "centrifuge.html")
     screenshot(folder / "centrifuge.html", FIGURES / "centrifuge.png", 1080, 818)
 
@@ -51,9 +51,7 @@ def centrifuge(folder: Path) -> None:
     tilted = RigTruth(tilt=math.radians(10 / 3600), tilt_phase=2.4, earth_rate=5.6e-5)
     one = make_manifest(levels=[n * 9.80665 for n in LEVELS], radius=2.0, net_rate=math.radians(40))
     linear = Truth(AxisTruth(D_x=K), AxisTruth(D_y=K), FogTruth(), tilted)
-    fit = il.fit_centrifuge(
-        one, il.simulate_centrifuge(one, linear, sample_rate=50.0, duration=120.0, static_duration=20.0)
-    )
+    fit = il.fit_centrifuge(one, il.simulate_centrifuge(one, linear, rate=50.0, duration=120.0, static_duration=20.0))
     force = [run.force / 9.80665 for run in fit.runs]
     curves = {
         "X alone": [abs(run.line[0]) / run.force for run in fit.runs],

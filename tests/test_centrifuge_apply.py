@@ -259,7 +259,7 @@ def test_the_table_of_runs_says_what_differs_between_them():
 
 
 def plan(**change):
-    options = {"levels": [G, 5 * G, 20 * G], "radius": 2.0, "net_rate": NET, "K": 3.3 * DEG_H / G,
+    options = {"levels": [G, 5 * G, 20 * G], "radius": 2.0, "net_rate": NET, "drift": 3.3 * DEG_H / G,
                "dtg_noise": 0.01 * DEG_H * 60,
                "fog_noise": 0.005 * DEG_H * 60, "uncertainty": 0.01} | change  # fmt: skip
     return plan_centrifuge(**options)

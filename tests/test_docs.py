@@ -25,12 +25,23 @@ EXAMPLES = (
     "read",
 )
 OF_COMMANDS = (
+    "compare_records",
+    "export",
+    "fleet_status",
+    "merge_array",
+    "plan_centrifuge",
     "plan_tumble",
     "plan_warmup",
+    "run_fleet",
+    "simulate_array",
+    "simulate_centrifuge",
+    "simulate_fleet",
     "simulate_power_cycle",
     "simulate_tumble",
     "simulate_warmup",
     "warmup_table",
+    "write_fleet_report",
+    "write_report",
 )
 PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
 

@@ -287,7 +287,7 @@ int main(void) {
 def test_the_readme_of_an_array_leads_to_what_fuse_gives(compiler, tmp_path):
     """In the unit and at the rate that it names; readings in rad/s, so that no conversion rounds."""
     record = il.calibrate_array(il.simulate_array(experiment="static", duration=60.0, unit="rad/s")).calibration
-    flight = il.simulate_array(session=1, sample_rate=100.0, duration=20.0, unit="rad/s")
+    flight = il.simulate_array(session=1, rate=100.0, duration=20.0, unit="rad/s")
     export("c", [record], tmp_path)
     code = (tmp_path / "README.md").read_text(encoding="utf-8").split("```")[1].removeprefix("c\n")
     assert "all gyros, in rad/s, to one rate per axis, in rad/s; 100 times a second" in code

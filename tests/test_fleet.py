@@ -14,7 +14,7 @@ from fleets import G, attitudes, make_fleet, records, write_attitudes, write_man
 from imulab.cli import main
 from imulab.errors import ImulabError, OptionError, ReadError
 from imulab.fleet.manifest import load_fleet
-from imulab.fleet.run import fleet_state, run_fleet
+from imulab.fleet.run import fleet_status, run_fleet
 from imulab.fleet.store import Store
 
 
@@ -221,11 +221,11 @@ def test_a_second_run_on_the_folder_is_refused_while_one_is_at_work(tmp_path, ca
     manifest = make_fleet(tmp_path / "in", 1, order=1)
     run(manifest, tmp_path / "out")
     with Store(tmp_path / "out").run():
-        assert str(fleet_state(str(tmp_path / "out")).at_work).startswith(f"process {os.getpid()} on ")
+        assert str(fleet_status(str(tmp_path / "out")).at_work).startswith(f"process {os.getpid()} on ")
         assert main(["fleet", "run", str(manifest), "-o", str(tmp_path / "out"), "--workers", "1"]) == 2
         assert f"another run is at work on it (process {os.getpid()} on " in capsys.readouterr().err
     run(manifest, tmp_path / "out")
-    assert fleet_state(str(tmp_path / "out")).at_work is None
+    assert fleet_status(str(tmp_path / "out")).at_work is None
 
 
 # ---- manifest ------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 
 import imulab as il
 from fleets import children, command, make_fleet, records, wait_for, workers_of
-from imulab.fleet.run import fleet_state, run_fleet
+from imulab.fleet.run import fleet_status, run_fleet
 from imulab.fleet.store import MOST_ATTEMPTS
 
 UNITS = 300
@@ -48,7 +48,7 @@ def check_complete(folder, reference, untouched):
         assert plain(folder / f"{serial}.json") == expected
     assert not list(folder.rglob("*.part"))
     assert not list((folder / ".fleet" / "active").iterdir())
-    state = fleet_state(str(folder))
+    state = fleet_status(str(folder))
     assert (state.count("done"), state.at_work) == (UNITS, None)
 
 
@@ -61,14 +61,14 @@ def test_a_killed_run_is_finished_by_the_next(fleet, reference, tmp_path):
     wait_for(lambda: len(list(folder.glob("*.json"))) >= 5)
     workers = workers_of(process.pid)
     assert workers
-    assert fleet_state(str(folder)).at_work is not None
+    assert fleet_status(str(folder)).at_work is not None
     process.kill()
     process.communicate()
     before = records(folder)
     assert 5 <= len(before) < UNITS
     for serial in before:
         il.load(folder / f"{serial}.json")
-    state = fleet_state(str(folder))
+    state = fleet_status(str(folder))
     assert (state.count("failed"), state.at_work) == (0, None)
     done = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
     out, error = done.communicate()

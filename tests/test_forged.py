@@ -13,7 +13,6 @@ from imulab.cli import main
 from imulab.device.blob import load_blob
 from imulab.device.tables import pack
 from imulab.errors import RecordError
-from imulab.exporters import ExportOptions
 from imulab.procedures.loading import loads
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.procedures.unit_tables import tables_of_all
@@ -79,7 +78,7 @@ def test_no_text_of_a_record_adds_a_line_to_an_export(tmp_path, hidden):
         },
     )
     for target in ("px4", "ardupilot", "kalibr", "openvins", "ros"):
-        for path in il.export(target, [record], tmp_path / target, options=ExportOptions(lossy=True)):
+        for path in il.export(target, [record], tmp_path / target, lossy=True):
             lines = path.read_text(encoding="utf-8").splitlines()  # splits at every line end that Unicode knows
             assert not any(line.lstrip().startswith(("EVIL", "1\t1\tEVIL")) for line in lines)
             assert all(line.startswith(("#", "//", "%")) for line in lines if "EVIL" in line)

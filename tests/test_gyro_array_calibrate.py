@@ -100,7 +100,7 @@ def test_the_uncertainty_of_the_bias_covers_what_the_curve_cannot_show(noise, du
     # The turn-on bias, under noise whose slow part the Allan curve barely shows: N^2 / T alone covers half or less.
     ratios = []
     for seed in range(20):
-        recording = simulate_array(experiment="static", duration=duration, sample_rate=50.0, noise=noise, seed=seed)
+        recording = simulate_array(experiment="static", duration=duration, rate=50.0, seed=seed, **vars(noise))
         for i, element in enumerate(calibrate_array(recording).calibration.sections["elements"]):
             truth = float(recording.metadata[f"truth_bias_{i + 1}"].split()[0])
             ratios.append(abs(element["bias"]["value"] - truth) / element["bias"]["standard_uncertainty"])

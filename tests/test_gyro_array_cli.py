@@ -27,7 +27,7 @@ G = 9.80665
 def run_file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("array")
     faults = (Fault("stuck", 3, 10.0, 5.0), Fault("jump", 5, 20.0))
-    il.write_csv(simulate_array(duration=40.0, faults=faults, seed=3), folder / "run.csv")
+    il.write_csv(simulate_array(duration=40.0, fault=faults, seed=3), folder / "run.csv")
     il.write_csv(simulate_array(experiment="static", duration=60.0, seed=3, session=1), folder / "still.csv")
     calibrate_array(il.read(folder / "still.csv")).calibration.save(folder / "array.json")
     return folder
@@ -94,8 +94,8 @@ def test_the_verdict_is_printed_first_where_the_rate_goes_to_a_file(imulab, run_
     ],
 )
 def test_feedback_says_where_its_source_does_not_reach(elements, rate, words):
-    run = simulate_array(elements=elements, sample_rate=rate, duration=30.0, seed=3)
-    still = simulate_array(experiment="static", elements=elements, sample_rate=rate, duration=30.0, seed=3)
+    run = simulate_array(elements=elements, rate=rate, duration=30.0, seed=3)
+    still = simulate_array(experiment="static", elements=elements, rate=rate, duration=30.0, seed=3)
     said = [fuse(run, FuseOptions(method="feedback")).notes, compare_methods(run).warnings]
     said.append(calibrate_array(still, fusion=Fusion("feedback")).calibration.warnings)
     for found in said:
@@ -268,7 +268,7 @@ def at_rest(rate: float = 100.0) -> np.ndarray:
 def test_compare_measures_against_the_gyros_that_work():
     # The mean of all would be the size of the fault: "53 times quieter" than a dead gyro in motion.
     faults = (Fault("stuck", 3, 10.0, 20.0), Fault("jump", 5, 40.0))
-    broken = compare_methods(simulate_array(duration=60.0, faults=faults, seed=2))
+    broken = compare_methods(simulate_array(duration=60.0, fault=faults, seed=2))
     whole = compare_methods(simulate_array(duration=60.0, seed=2))
     assert broken.record.data["working"] == [["gyro_1", "gyro_2", "gyro_4", "gyro_6"]]
     assert whole.record.data["working"] == [[f"gyro_{i}" for i in range(1, 7)]]
@@ -395,7 +395,7 @@ def test_compare_refuses_motion_without_truth():
 
 def test_the_report_of_a_comparison_comes_from_its_record():
     faults = (Fault("stuck", 2, 5.0, 5.0), Fault("nan", 3, 2.0, 2.0), Fault("jump", 4, 12.0))
-    record = compare_methods(simulate_array(duration=20.0, faults=faults)).record
+    record = compare_methods(simulate_array(duration=20.0, fault=faults)).record
     shown = exhibits_of(record)
     titles = [item.title for item in shown.items]
     assert titles == [

@@ -16,7 +16,7 @@ from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream
 from imulab.procedures.gyro_array.memory import parse_memory
 from imulab.procedures.gyro_array.model import find_elements
-from imulab.procedures.gyro_array.simulate import Fault, NoiseModel, simulate_array
+from imulab.procedures.gyro_array.simulate import Fault, simulate_array
 from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Recording
 from reference import gyro_array as reference
@@ -317,7 +317,7 @@ def test_elements_on_clocks_of_their_own_are_brought_to_one():
 
 
 def test_zero_rate_updates_take_the_common_bias_off():
-    recording = simulate_array(experiment="static", duration=120.0, noise=NoiseModel(turn_on=np.radians(0.5)), seed=4)
+    recording = simulate_array(experiment="static", duration=120.0, turn_on=np.radians(0.5), seed=4)
     plain = fuse(recording)
     updated = fuse(recording, FuseOptions(still=(0.0, 30.0)))
     after = recording.time > 30
@@ -409,7 +409,7 @@ def test_other_memories_are_refused(text):
 
 def test_faults_of_the_simulator_are_where_they_should_be():
     plain = simulate_array(duration=20.0)
-    broken = simulate_array(duration=20.0, faults=(Fault("stuck", 2, 5.0, 5.0), Fault("jump", 3, 10.0, size=0.1)))
+    broken = simulate_array(duration=20.0, fault=(Fault("stuck", 2, 5.0, 5.0), Fault("jump", 3, 10.0, size=0.1)))
     stuck = broken.columns["gyro_2"][250:500]
     assert np.ptp(stuck) == 0
     np.testing.assert_array_equal(broken.columns["gyro_2"][500:], plain.columns["gyro_2"][500:])
@@ -429,7 +429,7 @@ np.save(sys.argv[3], stream.process(np.load(sys.argv[2])).rate)
 def test_a_saved_stream_goes_on_in_another_process_to_the_last_bit(kind, tmp_path):
     still = simulate_array(experiment="static", duration=60.0, seed=2)
     record = calibrate_array(still).calibration
-    recording = simulate_array(duration=20.0, seed=2, faults=(Fault("stuck", 3, 9.0, 4.0),))
+    recording = simulate_array(duration=20.0, seed=2, fault=(Fault("stuck", 3, 9.0, 4.0),))
     elements = find_elements(recording)
     readings = elements.readings(recording)
     if kind == "blob":
@@ -459,7 +459,7 @@ def test_a_blob_fuses_as_the_unit_does(imulab, tmp_path):
     array = {"seed": 6, "scale_spread": 0.01, "mounting": "alternate"}
     still = simulate_array(experiment="static", duration=60.0, **array)
     record = calibrate_array(still, simulate_array(experiment="moving", **array)).calibration
-    run = simulate_array(duration=20.0, sample_rate=100.0, **array)
+    run = simulate_array(duration=20.0, rate=100.0, **array)
     record.save(tmp_path / "a.json")
     il.write_csv(run, tmp_path / "run.csv")
     assert imulab("export", "--to", "blob", "a.json", "-o", "unit").returncode == 0

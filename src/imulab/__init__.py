@@ -29,21 +29,27 @@ from imulab._version import VERSION as __version__  # noqa: N811
 
 if TYPE_CHECKING:
     from imulab.errors import ImulabError as ImulabError
-    from imulab.exporters import export as export
+    from imulab.fleet.report import write_fleet_report as write_fleet_report
+    from imulab.fleet.run import fleet_status as fleet_status
+    from imulab.fleet.run import run_fleet as run_fleet
+    from imulab.fleet.simulate import simulate_fleet as simulate_fleet
     from imulab.gravity import normal_gravity as normal_gravity
     from imulab.procedures.allan import allan_deviation as allan_deviation
     from imulab.procedures.apply import apply as apply
     from imulab.procedures.centrifuge.fit import CentrifugeFit as CentrifugeFit
     from imulab.procedures.centrifuge.fit import fit_centrifuge as fit_centrifuge
     from imulab.procedures.centrifuge.manifest import load_manifest as load_manifest
-    from imulab.procedures.centrifuge.simulate import simulate_centrifuge as simulate_centrifuge
+    from imulab.procedures.centrifuge.plan import plan_centrifuge as plan_centrifuge
+    from imulab.procedures.centrifuge.rig import simulate_centrifuge as simulate_centrifuge
     from imulab.procedures.changes import compare_records as compare_records
+    from imulab.procedures.exporting import export as export
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
     from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
     from imulab.procedures.gyro_array.public import fuse as fuse
+    from imulab.procedures.gyro_array.public import merge_array as merge_array
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.loading import load as load
     from imulab.procedures.noise.fit import NoiseFit as NoiseFit
@@ -80,6 +86,7 @@ _HOME = {
     "check_tumble": "procedures.tumble.compare",
     "compare_methods": "procedures.gyro_array.public",
     "fuse": "procedures.gyro_array.public",
+    "run_fleet": "fleet.run",
     "simulate_array": "procedures.gyro_array.simulate",
     "Attitudes": "procedures.tumble.attitudes",
     "Calibration": "records.calibration",
@@ -90,7 +97,7 @@ _HOME = {
     "WarmupFit": "procedures.warmup.fit",
     "apply": "procedures.apply",
     "compare_records": "procedures.changes",
-    "export": "exporters",
+    "export": "procedures.exporting",
     "find_attitudes": "procedures.tumble.segment",
     "find_power_cycle": "procedures.warmup.cycles",
     "fit_gyro": "procedures.tumble.gyrofit",
@@ -99,20 +106,25 @@ _HOME = {
     "fit_centrifuge": "procedures.centrifuge.fit",
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
+    "fleet_status": "fleet.run",
     "load": "procedures.loading",
     "load_manifest": "procedures.centrifuge.manifest",
+    "merge_array": "procedures.gyro_array.public",
     "normal_gravity": "gravity",
+    "plan_centrifuge": "procedures.centrifuge.plan",
     "plan_tumble": "procedures.tumble.planning",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",
     "read_blocks": "readers",
-    "simulate_centrifuge": "procedures.centrifuge.simulate",
+    "simulate_centrifuge": "procedures.centrifuge.rig",
+    "simulate_fleet": "fleet.simulate",
     "simulate_power_cycle": "procedures.warmup.simulate",
     "simulate_tumble": "procedures.tumble.simulate",
     "simulate_warmup": "procedures.warmup.simulate",
     "warmup_table": "procedures.warmup.spreadsheet",
     "write": "writers",
     "write_csv": "writers",
+    "write_fleet_report": "fleet.report",
     "write_report": "procedures.reports",
 }
 

@@ -19,6 +19,7 @@ from imulab.cli.options import (
     ReportFile,
     Topic,
     Window,
+    call,
     check_outputs,
     chosen,
     progress_bar,
@@ -33,7 +34,6 @@ from imulab.procedures.gyro_array.task import OPTIONS
 if TYPE_CHECKING:
     from imulab.device.blob import Blob
     from imulab.procedures.gyro_array.fuse import Fuser
-    from imulab.procedures.gyro_array.simulate import Fault
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
@@ -77,55 +77,18 @@ def simulate(
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate an array's recording, with its truth in the columns truth_rate."""
-    from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
+    from imulab.procedures.gyro_array.simulate import simulate_array
     from imulab.writers import write_csv
 
     check_outputs([output], [])
-    low, _, high = spread.partition(",")
-    if "," in high:
-        raise OptionError(f"--spread {spread!r}: expected LOW,HIGH, such as 0.6,1.6")
-    noise = NoiseModel(
-        white=quantity(white, "--white", "rate", "deg/s"),
-        spread=(quantity(low, "--spread", "number", "1"), quantity(high or low, "--spread", "number", "1")),
-        gauss_markov=quantity(gauss_markov, "--gauss-markov", "rate", "deg/s"),
-        correlation_time=quantity(correlation_time, "--correlation-time", "time", "s"),
-        walk=quantity(walk, "--walk", "rate", "deg/s"),
-        turn_on=quantity(turn_on, "--turn-on", "rate", "deg/s"),
-    )
-    recording = simulate_array(
-        experiment=experiment,
-        elements=whole_number(elements, "--elements"),
-        axes=whole_number(axes, "--axes"),
-        sample_rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
-        duration=None if duration is None else quantity(duration, "--duration", "time", "s"),
-        noise=noise,
-        scale_spread=quantity(scale_spread, "--scale-spread", "number", "1"),
-        misalignment=quantity(misalignment, "--misalignment", "angle", "deg"),
-        mounting=mounting,
-        faults=tuple(_fault(text) for text in fault or []),
-        unit=unit,
-        session=whole_number(session, "--session"),
-        seed=whole_number(seed, "--seed"),
-    )
+    recording = call(
+        simulate_array, experiment=experiment, elements=elements, axes=axes, rate=rate, duration=duration, white=white,
+        spread=spread, gauss_markov=gauss_markov, correlation_time=correlation_time, walk=walk, turn_on=turn_on,
+        scale_spread=scale_spread, misalignment=misalignment, mounting=mounting, fault=fault, unit=unit,
+        session=session, seed=seed,
+    )  # fmt: skip
     write_csv(recording, output)
     print(f"{output}: {len(recording)} samples, {elements} gyros on each axis, serial {recording.metadata['serial']}")
-
-
-def _fault(text: str) -> Fault:
-    from imulab.procedures.gyro_array.simulate import Fault
-
-    kind, *rest = text.split(":")
-    if not 1 <= len(rest) <= 4:
-        raise OptionError(f"--fault {text!r}: expected KIND:GYRO[:START[:DURATION[:SIZE]]], such as stuck:3:40:20")
-    found = {"gyro": whole_number(rest[0], "--fault")}
-    values = {
-        name: quantity(part, "--fault", of, unit)
-        for (name, of, unit), part in zip(
-            (("start", "time", "s"), ("duration", "time", "s"), ("size", "rate", "deg/s")), rest[1:], strict=False
-        )
-        if part
-    }
-    return Fault(kind, **found, **values)  # type: ignore[arg-type]
 
 
 def merge(
@@ -141,19 +104,14 @@ def merge(
 ) -> None:
     """Join files of one gyroscope each to the recording of an array, by time, at the times of the first file."""
     from imulab.cli.options import note, read_recording
-    from imulab.procedures.gyro_array.merge import merge_recordings
+    from imulab.procedures.gyro_array.public import merge_array
     from imulab.writers import check_writable, write
 
-    if axis is not None and axis not in ("x", "y", "z"):
-        raise OptionError(f"--axis {axis!r}: expected x, y or z")
-    if axis is not None and column is not None:
-        raise OptionError("array merge: --axis and --column both say which column to take; expected one of them")
     check_outputs([output], [*files, *([layout] if layout else [])])
     reading = chosen(topic, instance, window)
     check_writable(output)
-    merged = merge_recordings(
-        [read_recording(file, layout, reading) for file in files], axis=axis, column=column, align=align
-    )
+    recordings = [read_recording(file, layout, reading) for file in files]
+    merged = call(merge_array, recordings, axis=axis, column=column, align=align)
     write(merged.recording, output)
     for message in merged.notes:
         note(message)

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from imulab.cli.options import naming, warn, whole_number
-from imulab.errors import OptionError, listed
-
-if TYPE_CHECKING:
-    from imulab.device.array_settings import Fusion
-    from imulab.records.calibration import Calibration
-
-_DEVICE_IDS = 2**32
+from imulab.cli.options import call, warn
+from imulab.errors import OptionError
 
 
 def export(
@@ -38,54 +29,13 @@ def export(
     ] = None,
 ) -> None:
     """Write calibration records in the form of firmware, an autopilot or a toolbox."""
-    from imulab.exporters import EXPORTERS, ExportOptions
-    from imulab.exporters import export as write
-    from imulab.procedures.loading import load
-    from imulab.procedures.unit_tables import tables_of
-    from imulab.verdict import SENTENCES
+    from imulab.procedures.exporting import export as write
 
-    if to not in EXPORTERS:
-        raise OptionError(f"--to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")
-    number = whole_number(device_id, "--device-id")
-    if not 0 <= number < _DEVICE_IDS:
-        raise OptionError(f"--device-id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
     if not output:
         raise OptionError("-o '': expected a folder to write to")
-    if Path(output).exists() and not Path(output).is_dir():
-        raise OptionError(f"{output}: expected a folder to write to, found a file")
-    options = ExportOptions(
-        lossy=lossy, device_id=number, noise=_noise(noise) if noise else {}, noise_file=noise or "", tell=warn
-    )
-    loaded = [load(name) for name in records]
-    if method is not None or memory is not None:
-        options = replace(options, fusion=_fusion(to, method, memory, loaded))
-    if to in ("c", "blob"):
-        for name, record in zip(records, loaded, strict=True):
-            with naming(name):
-                tables_of(record, options.fusion)
-    for name, record in zip(records, loaded, strict=True):
-        if record.verdict.state == "bad":
-            warn(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
-    for file in write(to, loaded, output, options):
+    files = call(
+        write, to=to, records=records, folder=output, lossy=lossy, device_id=device_id, noise=noise, method=method,
+        memory=memory, tell=warn,
+    )  # fmt: skip
+    for file in files:
         print(f"{to}: {file}")
-
-
-def _fusion(to: str, method: str | None, memory: str | None, records: list[Calibration]) -> Fusion:
-    from imulab.procedures.gyro_array.memory import carried, fusion_text
-
-    array = next((record for record in records if record.procedure == "gyro_array"), None)
-    if to not in ("c", "blob") or array is None:
-        raise OptionError("--method and --memory say how a gyro array fuses: expected its record, and --to c or blob")
-    return fusion_text(method, memory, held=carried(array))
-
-
-def _noise(file: str) -> dict[str, Any]:
-    try:
-        content = json.loads(Path(file).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise OptionError(f"{file}: no such file") from None
-    except (OSError, ValueError) as error:
-        raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found no JSON ({error})") from None
-    if not isinstance(content, dict) or "columns" not in content:
-        raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found JSON without 'columns'")
-    return content

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.options import AsJson, check_outputs, progress_bar, warn, whole_number
+from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
@@ -55,19 +55,19 @@ def run(
     """
     from imulab.fleet.run import run_fleet
 
-    count = None if workers is None else whole_number(workers, "--workers")
     with ExitStack() as stack:
         update: list[Any] = []
 
         def started(total: int) -> None:
             update.append(stack.enter_context(progress_bar("units", total)))
 
-        state = run_fleet(
+        state = call(
+            run_fleet,
             manifest,
             output,
             engine=engine,
             scheduler=scheduler,
-            workers=count,
+            workers=workers,
             history=history,
             table=table,
             started=started,
@@ -94,14 +94,13 @@ def status(
     json: AsJson = False,
 ) -> int:
     """Say where a fleet stands; exit status 2 if a unit failed."""
-    from imulab.fleet.run import fleet_state
+    from imulab.fleet.run import fleet_status
 
-    state = fleet_state(folder)
+    state = fleet_status(folder)
     if json:
         print(_as_json(state))
     else:
-        counts = ", ".join(f"{state.count(name)} {name}" for name in ("done", "failed", "missing"))
-        print(f"{len(state.rows)} units of {state.manifest.name}: {counts}")
+        print(state.shown()[0])
         print("at work: " + (state.at_work or "nobody"))
         print("".join(f"{line}\n" for line in _failures(state)), end="")
     return 2 if state.failures else 0
@@ -133,11 +132,11 @@ def simulate(
     Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit 5
     is far off, and unit 7 changes between its two calibrations.
     """
-    from imulab.fleet.simulate import simulate_line
+    from imulab.fleet.simulate import simulate_fleet
 
     if not output:
         raise OptionError("output '': expected the name of a folder to write to")
-    first, second = simulate_line(output, units=whole_number(units, "--units"), seed=whole_number(seed, "--seed"))
+    first, second = call(simulate_fleet, output, units=units, seed=seed)
     print(f"manifests: {first} {second}")
     print(f"limits: {first.parent / 'limits.toml'}")
 

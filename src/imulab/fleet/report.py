@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
+from os import PathLike
 from pathlib import Path
 
 from imulab.atomic_write import write_text
@@ -11,7 +13,7 @@ from imulab.errors import OptionError
 from imulab.fleet import figures, reporttables
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
-from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_state, own_files, read_by, refuse_overwriting
+from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_status, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
     FleetChange,
     ParameterStatistics,
@@ -30,7 +32,13 @@ _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
 
 
-def write_fleet_report(folder: str, output: str, *, limits: str | None = None, history: str | None = None) -> None:
+def write_fleet_report(
+    folder: str | PathLike[str],
+    output: str | PathLike[str],
+    *,
+    limits: str | PathLike[str] | None = None,
+    history: str | None = None,
+) -> None:
     """Write the statistics of a fleet's records.
 
     Parameters
@@ -46,8 +54,18 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
     ------
     ReadError, UnitError, OptionError
         The folder, the limits or the history cannot be used, or there is no record yet.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first, second = il.simulate_fleet("line", units=8)
+    >>> il.run_fleet(first, "line/records", workers=1).count("failed")
+    0
+    >>> il.write_fleet_report("line/records", "line.html", limits="line/limits.toml")
     """
-    state = fleet_state(folder)
+    output = os.fspath(output)
+    folder, limits = os.fspath(folder), None if limits is None else os.fspath(limits)
+    state = fleet_status(folder)
     refuse_overwriting([Path(output)], {**own_files(Store(Path(folder)), state.manifest), **read_by(state.manifest)})
     exhibits, found = _exhibits(state, limits, history)
     provenance = [
@@ -66,7 +84,7 @@ def write_fleet_report(folder: str, output: str, *, limits: str | None = None, h
 
 def exhibits_of_folder(folder: str, *, limits: str | None = None, history: str | None = None) -> Exhibits:
     """Return what the report of a fleet's folder shows; options and errors as for `write_fleet_report`."""
-    return _exhibits(fleet_state(folder), limits, history)[0]
+    return _exhibits(fleet_status(folder), limits, history)[0]
 
 
 def _exhibits(state: FleetState, limits: str | None, history: str | None) -> tuple[Exhibits, list[Summary]]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from os import PathLike
 from pathlib import Path
 
 from imulab._version import VERSION
@@ -21,6 +22,8 @@ from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
 from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, summarise
 from imulab.procedures.registry import PROCEDURES
+from imulab.quantities import whole
+from imulab.shown import Shown
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""
@@ -28,8 +31,8 @@ _FLUSH = 2.0
 TABLE, HISTORY = "parameters.csv", "history.sqlite"
 
 
-@dataclass(frozen=True)
-class FleetState:
+@dataclass(frozen=True, repr=False)
+class FleetState(Shown):
     """Where a fleet stands.
 
     Attributes
@@ -56,6 +59,12 @@ class FleetState:
     seconds: float = 0.0
     notes: tuple[str, ...] = ()
 
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return how many units are done, failed and missing, and which failed."""
+        counts = ", ".join(f"{self.count(name)} {name}" for name in ("done", "failed", "missing"))
+        rows = [[row.unit.serial, "; ".join(row.unit.files), row.reason or ""] for row in self.failures]
+        return f"{len(self.rows)} units of {self.manifest.name}: {counts}", ["failed", "files", "reason"], rows
+
     def count(self, status: str) -> int:
         """Return the number of units with this status."""
         return sum(row.status == status for row in self.rows)
@@ -72,12 +81,12 @@ def default_history(folder: str | Path) -> str:
 
 
 def run_fleet(
-    manifest: str | FleetManifest,
-    folder: str,
+    manifest: str | PathLike[str] | FleetManifest,
+    folder: str | PathLike[str],
     *,
     engine: str = "local",
     scheduler: str | None = None,
-    workers: int | None = None,
+    workers: int | str | None = None,
     history: str | None = None,
     table: str | None = None,
     started: Callable[[int], None] = lambda _: None,
@@ -108,9 +117,18 @@ def run_fleet(
     ------
     ReadError, OptionError
         The manifest, an option, the folder, the cluster or the history cannot be used.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first, second = il.simulate_fleet("line", units=8)
+    >>> il.run_fleet(first, "line/records", workers=1).count("done")
+    8
     """
     begin = time.monotonic()
-    fleet = load_fleet(manifest) if isinstance(manifest, str) else manifest
+    number = None if workers is None else whole(workers, "workers")
+    fleet = manifest if isinstance(manifest, FleetManifest) else load_fleet(os.fspath(manifest))
+    folder = os.fspath(folder)
     store = Store(real_path(folder))
     if not folder:
         raise OptionError("output '': expected the name of a folder to write to")
@@ -125,7 +143,7 @@ def run_fleet(
     with ExitStack() as stack:
         notes: list[str] = []
         past = _open_history(history, stack) if history else None
-        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=workers))
+        machine = stack.enter_context(open_engine(engine, scheduler=scheduler, workers=number))
         token = stack.enter_context(store.run())
         if history is None:
             try:
@@ -314,14 +332,29 @@ def _take(outcomes: Iterator[Outcome], keeper: _Keeper) -> None:
             keeper.take(outcome)
 
 
-def fleet_state(folder: str) -> FleetState:
+def fleet_status(folder: str | PathLike[str]) -> FleetState:
     """Return where a fleet stands, from its records alone.
+
+    Parameters
+    ----------
+    folder
+        Where the records are.
 
     Raises
     ------
     OptionError
         The folder is none of a fleet.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first, second = il.simulate_fleet("line", units=8)
+    >>> il.run_fleet(first, "line/records", workers=1).seconds > 0
+    True
+    >>> il.fleet_status("line/records").failures
+    ()
     """
+    folder = os.fspath(folder)
     store = Store(Path(folder))
     fleet = store.manifest()
     return FleetState(folder, fleet, tuple(_row(store, unit) for unit in fleet.units), at_work=store.at_work())

@@ -11,6 +11,7 @@ import numpy as np
 from imulab.atomic_write import write_text
 from imulab.errors import OptionError
 from imulab.procedures.tumble.simulate import simulate_tumble
+from imulab.quantities import whole
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv
 
@@ -25,7 +26,7 @@ LIMITS = """[tumble]
 """
 
 
-def simulate_line(folder: str | Path, *, units: int = 12, seed: int = 1) -> tuple[Path, Path]:
+def simulate_fleet(folder: str | Path, *, units: int | str = 12, seed: int | str = 1) -> tuple[Path, Path]:
     """Write the recordings of a line's units, two manifests and limits; return the paths of the manifests.
 
     ``first.csv`` calibrates every unit, one a day; ``second.csv`` the same units half a year later. The zero of z
@@ -44,7 +45,14 @@ def simulate_line(folder: str | Path, *, units: int = 12, seed: int = 1) -> tupl
     ------
     OptionError
         A value is out of range, or the folder cannot be written to.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> [manifest.name for manifest in il.simulate_fleet("line", units=8)]
+    ['first.csv', 'second.csv']
     """
+    units, seed = whole(units, "units"), whole(seed, "seed")
     if not _FEWEST <= units <= _MOST:
         raise OptionError(f"units {units}: expected {_FEWEST} to {_MOST}")
     if seed < 0:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from os import PathLike, fspath
+from pathlib import Path
 from typing import Any, Unpack
 
 from imulab.device.blob import Blob
@@ -17,6 +18,7 @@ from imulab.procedures.loading import load_any
 from imulab.procedures.procedure import Section
 from imulab.procedures.registry import procedure_of, section
 from imulab.procedures.unit_tables import tables_of
+from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.verdict import SENTENCES, Note
@@ -95,6 +97,7 @@ def apply(
     data: Data,
     *,
     again: bool = False,
+    latest_start: float | str = "5 s",
     **reading: Unpack[Reading],
 ) -> Recording:
     """Return data corrected by a record; columns that it does not touch pass unchanged.
@@ -110,6 +113,8 @@ def apply(
         What is corrected: a file, recording, data frame or arrays.
     again
         Whether to correct it though the same record corrected it before.
+    latest_start
+        A recording that starts later after power-on, s, is refused by a warm-up table.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.
@@ -132,12 +137,17 @@ def apply(
     >>> [round(abs(float((r.column("accel_x") - truth).mean())), 1) for r in (recording, il.apply(record, recording))]
     [0.4, 0.0]
     """
+    name = None
     if isinstance(record, str | PathLike):
+        name = Path(record).name
         record = load_any(fspath(record))
     if not isinstance(record, Calibration | Blob | Loaded):
         raise OptionError(f"apply: expected a record or the name of its file, found {described(record)}")
     recording = as_recording(data, reading, apply)
-    ready = record if isinstance(record, Loaded) else loaded(record, again=again)
+    if isinstance(record, Loaded):
+        ready = record
+    else:
+        ready = loaded(record, name, again=again, latest_start=in_si(latest_start, "latest_start", "time", "s"))
     before = {entry.rpartition("sha256:")[2] for entry in recording.corrected_by}
     if not ready.again and before.intersection(ready.holds):
         raise DataError(

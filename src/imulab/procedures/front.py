@@ -6,17 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from html import escape
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from imulab.errors import OptionError, RecordError, listed
-from imulab.exporters import ExportOptions
-from imulab.exporters import export as export_records
 from imulab.procedures.apply import apply
+from imulab.procedures.exporting import export as export_records
 from imulab.procedures.inputs import Reading, as_recording
 from imulab.procedures.loading import load as load
 from imulab.procedures.procedure import Row
@@ -79,11 +78,11 @@ def apply_to(record: Calibration, data: Any, again: bool, reading: Mapping[str, 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:
     """Write a record in the form of another program."""
-    known = [each.name for each in fields(ExportOptions)]
+    known = [name for name in signature(export_records).parameters if name not in ("to", "records", "folder")]
     for name in options:
         if name not in known:
             raise OptionError(f"export: unknown option {name!r}; known: {listed(known, name)}")
-    return export_records(target, [record], folder, ExportOptions(**options))
+    return export_records(target, record, folder, **options)
 
 
 def recording_html(recording: Recording) -> str:

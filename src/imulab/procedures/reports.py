@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
+from typing import TypeAlias
 
 from imulab import report
 from imulab.atomic_write import write_text
+from imulab.procedures.inputs import as_record
 from imulab.procedures.procedure import Row
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
@@ -14,6 +17,7 @@ from imulab.records.comparison import Change
 from imulab.report.elements import Exhibits
 from imulab.units import STANDARD_GRAVITY, from_si
 
+Record: TypeAlias = Calibration | str | PathLike[str]
 _READ = {
     "rad/s": (from_si(1.0, "deg/h"), "deg/h"),
     "m/s^2": (from_si(1.0, "ug"), "µg"),
@@ -59,14 +63,27 @@ def rendered(record: Calibration) -> str:
     return report.render(record, exhibits_of(record), procedure_of(record).title)
 
 
-def write_report(record: Calibration, path: str | Path) -> None:
+def write_report(record: Record, path: str | Path) -> None:
     """Write the report of a record as one HTML file that opens without a network.
+
+    Parameters
+    ----------
+    record
+        A record, or its file.
+    path
+        HTML file to write.
 
     Raises
     ------
     RecordError
-        The record lacks the data that its figures need.
+        The record cannot be read, or lacks the data that its figures need.
     OptionError
-        The file cannot be written there.
+        The file cannot be written there, or what is given is no record.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
+    >>> il.write_report(fit.calibration, "sn42.html")
     """
-    write_text(path, rendered(record))
+    write_text(path, rendered(as_record(record, "write_report")))

@@ -7,13 +7,20 @@ rad/sqrt(s)) of DTG and FOG together; ``u(K)/K = sigma / (K a)``, over sqrt(n) f
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from imulab.errors import OptionError
+from imulab.atomic_write import write_text
+from imulab.errors import OptionError, quoted
 from imulab.procedures.centrifuge.budget import FLEXURE
-from imulab.procedures.centrifuge.manifest import Manifest, make_manifest
+from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manifest_text
+from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
+from imulab.shown import Shown
 from imulab.units import from_si, to_si
 
+DRIFT = {"deg/h/g": 0.01745329251994329577 / 3600 / 9.80665, "rad/s/(m/s^2)": 1.0}
+"""Units of K that texts have, in SI."""
 PERIODS_ASKED = 500
 _NEAR = 0.05
 """A table rate this close to a multiple of the net rate, as part of the net rate, is warned of."""
@@ -46,40 +53,89 @@ class PlannedLevel:
     needed: float
 
 
-@dataclass(frozen=True)
-class Plan:
-    """A planned test: its manifest, its levels, the time on the centrifuge, s, and warnings with what to do."""
+@dataclass(frozen=True, repr=False)
+class Plan(Shown):
+    """A planned test: manifest, levels, times on the centrifuge, s, wanted u(K) / K, and warnings with what to do."""
 
     manifest: Manifest
     levels: tuple[PlannedLevel, ...]
     duration: float
     static_duration: float
     total: float
+    wanted: float
     warnings: tuple[str, ...]
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return how long the test takes and whether it reaches what is wanted, and its levels."""
+        rows = [
+            [
+                f"{from_si(level.force, 'g'):.4g}",
+                f"{from_si(level.arm_rate, 'deg/s'):.4f}",
+                f"{from_si(level.table_rate, 'deg/s'):.4f}",
+                f"{level.periods:.0f}",
+                f"{100 * level.relative:.3g}",
+                "–" if level.zeta is None else f"{100 * level.zeta:.3g}",
+                "–" if math.isinf(level.needed) else f"{level.needed / 60:.1f}",
+            ]
+            for level in self.levels
+        ]
+        too_few = sum(level.relative > self.wanted for level in self.levels)
+        reach = f"{too_few} of {len(self.levels)} levels do not reach" if too_few else "every level reaches"
+        head = (
+            f"{len(self.manifest.runs)} runs, {self.total / 3600:.1f} h of recording ({self.duration / 60:.0f} min "
+            f"each, static {self.static_duration / 60:.0f} min); {reach} u(K) = {100 * self.wanted:.3g} % (needed: how "
+            "long a run must be for that)"
+        )
+        return head, ["level, g", "arm, deg/s", "table, deg/s", "periods", "u(K), %", "u(zeta), %", "needed, min"], rows
+
+    def save(self, path: str | Path) -> None:
+        """Write the list of runs where the name ends in .csv, else the manifest.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        test = self.manifest
+        if not str(path).lower().endswith(".csv"):
+            comments = [
+                f"{len(test.runs)} runs; warm up 10 min after each power-on, then the static record of "
+                f"{self.static_duration / 60:.0f} min,",
+                f"then the loaded runs of {self.duration / 60:.0f} min. Columns: time, dtg_x, dtg_y, fog, table_angle.",
+            ]
+            write_text(path, manifest_text(test, comments))
+            return
+        lines = ["number,file,power_cycle,role,sense,arm_rate [deg/s],table_rate [deg/s],specific_force [g]"]
+        for number, run in enumerate(test.runs, start=1):
+            lines.append(
+                f"{number},{run.file},{run.power_cycle},{run.role},{run.sense},{from_si(run.arm_rate, 'deg/s'):.4f},"
+                f"{from_si(run.table_rate, 'deg/s'):.4f},{from_si(test.force(run), 'g'):.6g}"
+            )
+        write_text(path, "\n".join(lines) + "\n")
 
 
 def plan_centrifuge(
+    levels: Sequence[float] | str = "1,2,5,10,15,20,30,40",
     *,
-    levels: list[float],
-    radius: float,
-    net_rate: float,
-    duration: float = 900.0,
-    static_duration: float = 300.0,
-    cycles: int = 2,
+    radius: float | str = "2 m",
+    net_rate: float | str = "40 deg/s",
+    duration: float | str = "15 min",
+    cycles: int | str = 2,
     both_senses: bool = False,
-    K: float,
-    dtg_noise: float,
-    fog_noise: float,
-    uncertainty: float,
-    radius_uncertainty: float = 0.0,
-    rate_uncertainty: float = 0.0,
+    drift: float | str = "3.3 deg/h/g",
+    dtg_noise: float | str = "0.01 deg/sqrt(h)",
+    fog_noise: float | str = "0.005 deg/sqrt(h)",
+    uncertainty: float | str = "1 %",
+    radius_uncertainty: float | str = "0 m",
+    rate_uncertainty: float | str = "0 deg/s",
+    static_duration: float = 300.0,
 ) -> Plan:
     """Plan a centrifuge test.
 
     Parameters
     ----------
     levels
-        Specific forces, m/s^2; the lowest is the reference K_1.
+        Specific forces, m/s^2, or a text of them in g, with commas; the lowest is the reference K_1.
     radius, radius_uncertainty
         m.
     net_rate, rate_uncertainty
@@ -90,8 +146,8 @@ def plan_centrifuge(
         Power cycles.
     both_senses
         Whether each level is run in both senses.
-    K
-        Expected drift per specific force, rad/s/(m/s^2).
+    drift
+        Expected K, rad/s/(m/s^2).
     dtg_noise, fog_noise
         Angle random walk, rad/sqrt(s).
     uncertainty
@@ -101,7 +157,28 @@ def plan_centrifuge(
     ------
     OptionError
         A value is out of range, or a level is at a rate below the net rate.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> plan = il.plan_centrifuge("1,10,20", duration="10 min", both_senses=True)
+    >>> len(plan.manifest.runs), round(plan.levels[0].relative, 4)
+    (14, 0.0059)
+    >>> plan.save("plan.toml")
     """
+    levels, cycles = read_levels(levels), whole(cycles, "cycles")
+    radius, radius_uncertainty = (
+        in_si(value, name, "length", "m")
+        for value, name in ((radius, "radius"), (radius_uncertainty, "radius_uncertainty"))
+    )
+    net_rate, rate_uncertainty = (
+        in_si(value, name, "rate", "deg/s")
+        for value, name in ((net_rate, "net_rate"), (rate_uncertainty, "rate_uncertainty"))
+    )
+    duration, uncertainty = in_si(duration, "duration", "time", "s"), fraction(uncertainty, "uncertainty")
+    K = of_units(drift, "drift", DRIFT)
+    dtg_noise = of_units(dtg_noise, "dtg_noise", RANDOM_WALK)
+    fog_noise = of_units(fog_noise, "fog_noise", RANDOM_WALK)
     _check(levels, radius, net_rate, duration, cycles, K, uncertainty)
     for name, value in (
         ("DTG noise", dtg_noise), ("FOG noise", fog_noise),
@@ -134,9 +211,30 @@ def plan_centrifuge(
         planned.append(PlannedLevel(force, arm, table, duration * table / (2 * math.pi), relative, zeta, needed))
     total = cycles * static_duration + runs * len(levels) * duration
     return Plan(
-        manifest, tuple(planned), duration, static_duration, total,
+        manifest, tuple(planned), duration, static_duration, total, uncertainty,
         tuple(_warnings(planned, net_rate, duration, runs, K, uncertainty, both_senses)),
     )  # fmt: skip
+
+
+def read_levels(given: Sequence[float] | str) -> list[float]:
+    """Return specific forces, m/s^2, given as such or as a text of them in g, with commas.
+
+    Raises
+    ------
+    OptionError
+        They are none.
+    """
+    try:
+        values = [float(part) for part in (given.removesuffix("g").split(",") if isinstance(given, str) else given)]
+    except (TypeError, ValueError):
+        raise OptionError(
+            f"levels {quoted(given)}: expected specific forces in g, with commas, such as 1,2,5,10"
+        ) from None
+    if not isinstance(given, str):
+        return values
+    if not all(0 < value < 1e4 for value in values):
+        raise OptionError(f"levels {given!r}: expected specific forces above 0 g")
+    return [to_si(value, "g") for value in values]
 
 
 def _check(

@@ -8,16 +8,21 @@ fixed in the room stands there at minus the angle by which the gyroscope has tur
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from imulab.atomic_write import write_text
 from imulab.errors import OptionError
 from imulab.procedures.centrifuge.cells import FEWEST_PER_PERIOD
-from imulab.procedures.centrifuge.manifest import Manifest, Run
+from imulab.procedures.centrifuge.manifest import Manifest, Run, manifest_text
 from imulab.recording import Array, Recording
+from imulab.shown import Shown
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+from imulab.writers import write_csv
 
 _DEG_H = np.pi / 180 / 3600
 _DEG_ROOT_H = np.pi / 180 / 60
@@ -170,8 +175,8 @@ def typical_truth(nonlinearity: float = 0.01, at: float = 20 * STANDARD_GRAVITY)
     return Truth(axis, other, fog, rig)
 
 
-@dataclass(frozen=True)
-class Simulation:
+@dataclass(frozen=True, repr=False)
+class Simulation(Shown):
     """A simulated test; `blocks` gives the recording of one run, the same one every time.
 
     Attributes
@@ -221,6 +226,40 @@ class Simulation:
             raise OptionError(f"seed {self.seed}: expected a whole number from 0")
         if parse_unit(self.unit).quantity != "rate":
             raise OptionError(f"unit {self.unit!r}: expected a unit of rate")
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return what it is a simulation of, and its runs."""
+        runs = self.manifest.runs
+        rows = [[run.file, str(run.power_cycle), run.role, str(run.sense)] for run in runs]
+        return f"simulated centrifuge test of {len(runs)} runs", ["file", "power cycle", "role", "sense"], rows
+
+    def save(self, folder: str | Path, progress: Callable[[int], object] = lambda _: None) -> None:
+        """Write manifest.toml, a CSV file for each run, and truth.json into a folder, made if it is not there.
+
+        Raises
+        ------
+        OptionError
+            The folder cannot be made, or holds files of these names that are no simulation; or the manifest names
+            files in other folders.
+        """
+        home, test = Path(folder), self.manifest
+        for run in test.runs:
+            if Path(run.file).name != run.file:
+                raise OptionError(f"{run.file}: expected file names without folders in a manifest to simulate")
+        taken = [name for name in ("manifest.toml", *(run.file for run in test.runs)) if (home / name).exists()]
+        if taken and not (home / "truth.json").is_file():
+            raise OptionError(
+                f"{home / taken[0]}: exists and is no simulation (no truth.json beside it); expected another folder"
+            )
+        try:
+            home.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OptionError(f"{home}: the folder cannot be made: {error.strerror}") from None
+        for done, run in enumerate(test.runs, start=1):
+            write_csv(self(run), home / run.file)
+            progress(done)
+        write_text(home / "truth.json", json.dumps(asdict(self.truth), indent=1) + "\n")
+        write_text(home / "manifest.toml", manifest_text(test, ["simulated; the truth is in truth.json, SI units"]))
 
     def blocks(self, run: Run, size: int = _BLOCK) -> Iterator[Recording]:
         """Yield the recording of a run in blocks of `size` samples."""
@@ -335,63 +374,3 @@ def _markov(
     noise, final = lfilter([1.0], [1.0, -decay], drive, zi=state[slot : slot + 1])
     state[slot] = final[0]
     return noise
-
-
-def simulate_centrifuge(
-    manifest: Manifest,
-    truth: Truth | None = None,
-    *,
-    sample_rate: float = 100.0,
-    duration: float = 900.0,
-    static_duration: float = 300.0,
-    encoder: bool = True,
-    unit: str = "deg/h",
-    ramp: float = 0.0,
-    seed: int = 1,
-) -> Simulation:
-    """Simulate a centrifuge test.
-
-    ``X = (1 + k_x) common + D_F + (D_X + g D_XZ) a cos chi + (D_Y + g D_YZ) a sin chi + D_XX a^2 cos^2 chi + D_XXX
-    a^3 cos^3 chi`` + gravity terms + differential flexure + noise, ``common = w_n mu + W_N cos(w_n t) - w_t (delta +
-    kappa a) cos(chi + ..)``; the FOG senses the common rate alone.
-
-    Parameters
-    ----------
-    manifest
-        The runs.
-    truth
-        Parameters in SI; `typical_truth` unless given.
-    sample_rate
-        Hz.
-    duration, static_duration
-        Of loaded and of static runs, s.
-    encoder
-        Whether there is a `table_angle` column.
-    unit
-        Of the rates in the recordings.
-    ramp
-        Duration of a spin-up at the start of every loaded run, s.
-    seed
-        Of the random numbers.
-
-    Returns
-    -------
-    Simulation
-        ``simulation(run)`` yields the blocks of a run.
-
-    Raises
-    ------
-    OptionError
-        A value is out of range.
-    """
-    return Simulation(
-        manifest,
-        typical_truth() if truth is None else truth,
-        sample_rate,
-        duration,
-        static_duration,
-        encoder,
-        unit,
-        ramp,
-        seed,
-    )

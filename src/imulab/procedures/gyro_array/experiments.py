@@ -55,10 +55,15 @@ def run_experiment(
     rate = EXPERIMENTS[experiment][0]
     found: dict[tuple[str, bool], list[tuple[float, float, float, float]]] = {}
     for seed in range(1, seeds + 1):
-        recording = simulate_array(experiment=experiment, noise=noise, seed=seed)
+        recording = simulate_array(experiment=experiment, seed=seed, **vars(noise or NoiseModel()))
         # The stretch at rest comes first; the same gyros with the same turn-on biases.
         still = simulate_array(
-            experiment="static", noise=noise, sample_rate=rate, duration=CALIBRATION_TIME, session=1, seed=seed
+            experiment="static",
+            rate=rate,
+            duration=CALIBRATION_TIME,
+            session=1,
+            seed=seed,
+            **vars(noise or NoiseModel()),
         )
         record = calibrate_array(still).calibration
         elements = find_elements(recording)

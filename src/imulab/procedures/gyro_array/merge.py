@@ -12,6 +12,7 @@ from imulab.errors import DataError, UnitError
 from imulab.estimation.sampling import WIDEST_GAP, usual_step
 from imulab.procedures.gyro_array.model import MOST_ELEMENTS
 from imulab.recording import Array, Recording, check_time
+from imulab.shown import Shown
 from imulab.units import conversion_factor, parse_unit
 
 _MOST_POINTS = 1 << 20
@@ -21,12 +22,17 @@ _ALIKE = 0.8
 _SECOND = 0.9
 
 
-@dataclass(frozen=True)
-class Merged:
+@dataclass(frozen=True, repr=False)
+class Merged(Shown):
     """The recording of the array, and what there is to say of how its elements came together."""
 
     recording: Recording
     notes: tuple[str, ...]
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return what was joined, and what there is to say of it."""
+        gyros = sum(name.startswith("gyro_") for name in self.recording.columns)
+        return f"{len(self.recording)} samples, {gyros} gyros", ["note"], [[note] for note in self.notes]
 
 
 def merge_recordings(

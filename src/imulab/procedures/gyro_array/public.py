@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from typing import Any, TypeAlias, Unpack, cast
@@ -18,6 +18,7 @@ from imulab.procedures.gyro_array.fuse import Fused, FuseOptions
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.kalman import RATE_WALK
 from imulab.procedures.gyro_array.memory import carried, fusion_text
+from imulab.procedures.gyro_array.merge import Merged, merge_recordings
 from imulab.procedures.inputs import Data, Reading, as_record, as_recording
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
@@ -201,6 +202,57 @@ def compare_methods(
     gain: str | float = "growing" if by.memory is None else by.memory
     count = by.start if count_from is None else count_from
     return compare.compare_methods(recording, calibration=record, memory=gain, count_from=count)
+
+
+def merge_array(
+    recordings: Sequence[Data],
+    *,
+    axis: str | None = None,
+    column: str | None = None,
+    align: bool = False,
+    **reading: Unpack[Reading],
+) -> Merged:
+    """Join recordings of one gyroscope each to the recording of an array, by time, at the times of the first.
+
+    The others are interpolated, linearly; in a gap of more than 10 of their sampling intervals they are NaN. Nothing is
+    extrapolated.
+
+    Parameters
+    ----------
+    recordings
+        Two or more files, recordings or data frames, on clocks that agree unless `align` is chosen.
+    axis
+        ``x``, ``y`` or ``z``: take this axis of each; all three (or the only one) if not given.
+    column
+        Take the column of this name instead.
+    align
+        Move the clocks to where the motion fits that of the first.
+    reading
+        How arrays and files are to be understood, as for `fuse`.
+
+    Raises
+    ------
+    OptionError
+        `axis` and `column` are both given, or `axis` is none.
+    DataError
+        There is only one recording, or one twice; a recording has no gyroscope or no time; they have no time in
+        common; `align` finds no motion that fits.
+    UnitError
+        The units of two gyroscopes cannot be converted to each other.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> first, second = (il.simulate_tumble(attitudes=6, seed=seed) for seed in (1, 2))
+    >>> [name for name in il.merge_array([first, second], axis="x").recording.columns]
+    ['time', 'gyro_1', 'gyro_2']
+    """
+    if axis is not None and axis not in ("x", "y", "z"):
+        raise OptionError(f"axis {axis!r}: expected x, y or z")
+    if axis is not None and column is not None:
+        raise OptionError("axis and column both say which column to take: expected one of them")
+    parts = [as_recording(each, reading, merge_array, gyros_of, "recordings") for each in recordings]
+    return merge_recordings(parts, axis=axis, column=column, align=align)
 
 
 def gyros_of(readings: NDArray[Any]) -> Mapping[str, NDArray[Any]]:

@@ -6,12 +6,13 @@ Source of both set-ups: patent CN109443333B (6 gyros; 100 Hz, 2000 s at rest; 50
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from imulab.errors import OptionError, listed
+from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit
 
@@ -55,18 +56,23 @@ class Fault:
 def simulate_array(
     *,
     experiment: str = "dynamic",
-    elements: int = 6,
-    axes: int = 1,
-    sample_rate: float | None = None,
-    duration: float | None = None,
-    noise: NoiseModel | None = None,
-    scale_spread: float = 0.0,
-    misalignment: float = 0.0,
+    elements: int | str = 6,
+    axes: int | str = 1,
+    rate: float | str | None = None,
+    duration: float | str | None = None,
+    white: float | str = "0.05 deg/s",
+    spread: tuple[float, float] | str = "0.6,1.6",
+    gauss_markov: float | str = "0.003 deg/s",
+    correlation_time: float | str = "200 s",
+    walk: float | str = "0.0002 deg/s",
+    turn_on: float | str = "0.02 deg/s",
+    scale_spread: float | str = 0,
+    misalignment: float | str = "0 deg",
     mounting: str = "same",
-    faults: tuple[Fault, ...] = (),
+    fault: Sequence[Fault | str] | None = None,
     unit: str = "deg/s",
-    session: int = 0,
-    seed: int = 1,
+    session: int | str = 0,
+    seed: int | str = 1,
 ) -> Recording:
     """Simulate an array's recording with columns time, gyro_1 .. (or gyro_x_1 ..) and truth_rate (or truth_rate_x ..).
 
@@ -77,14 +83,18 @@ def simulate_array(
     ----------
     elements, axes
         Gyros on each axis; 1 or 3 axes.
-    sample_rate, duration
+    rate, duration
         Hz and s; by default those of the experiment.
+    white, gauss_markov, correlation_time, walk, turn_on
+        Noise of each gyro: `NoiseModel`, rad/s and s.
+    spread
+        Range of the factor of each gyro's white noise.
     scale_spread, misalignment
         Standard deviations of the scale factors, and of the axes' misalignments, rad.
     mounting
         ``same``, or ``alternate``: even elements measure (-y, -x, -z), or -x on a single axis.
-    faults
-        Faults to put in.
+    fault
+        Faults to put in, each a `Fault` or a text ``KIND:GYRO[:START[:DURATION[:SIZE]]]``, s and deg/s.
     session, seed
         Of the random numbers. Biases and scale factors depend on `seed` alone: another experiment or session with one
         seed is another recording of one array.
@@ -93,12 +103,31 @@ def simulate_array(
     ------
     OptionError
         A value is out of range.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.simulate_array(elements=2, duration="10 s", fault=["stuck:1:5"]).units["gyro_2"]
+    'deg/s'
     """
-    noise = noise or NoiseModel()
+    noise = NoiseModel(
+        white=in_si(white, "white", "rate", "deg/s"),
+        spread=_spread(spread),
+        gauss_markov=in_si(gauss_markov, "gauss_markov", "rate", "deg/s"),
+        correlation_time=in_si(correlation_time, "correlation_time", "time", "s"),
+        walk=in_si(walk, "walk", "rate", "deg/s"),
+        turn_on=in_si(turn_on, "turn_on", "rate", "deg/s"),
+    )
+    elements, axes = whole(elements, "elements"), whole(axes, "axes")
+    session, seed = whole(session, "session"), whole(seed, "seed")
+    scale_spread = in_si(scale_spread, "scale_spread", "number", "1")
+    misalignment = in_si(misalignment, "misalignment", "angle", "deg")
+    faults = tuple(_fault(each) if isinstance(each, str) else each for each in fault or ())
     if experiment not in EXPERIMENTS:
         raise OptionError(f"experiment {experiment!r}: expected one of {listed(EXPERIMENTS, experiment)}")
-    rate = sample_rate if sample_rate is not None else EXPERIMENTS[experiment][0]
-    length = duration if duration is not None else EXPERIMENTS[experiment][1]
+    usual_rate, usual_length = EXPERIMENTS[experiment]
+    rate = usual_rate if rate is None else in_si(rate, "rate", "frequency", "Hz")
+    length = usual_length if duration is None else in_si(duration, "duration", "time", "s")
     _check(elements, axes, rate, length, mounting, unit)
     _check_numbers(noise, scale_spread, misalignment, session, seed)
     _check_faults(faults, elements)
@@ -109,18 +138,18 @@ def simulate_array(
         )
     time = np.arange(count) / rate
     unit_rng = np.random.default_rng([seed, 1])
-    white = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
-    turn_on = noise.turn_on * unit_rng.standard_normal((axes, elements))
+    levels = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
+    biases = noise.turn_on * unit_rng.standard_normal((axes, elements))
     sensing = _sensing(elements, axes, scale_spread, misalignment, mounting, unit_rng)
     rng = np.random.default_rng([seed, 2 + list(EXPERIMENTS).index(experiment), session])
     truth = _motion(experiment, time, axes, rng)
     readings = np.einsum("iab,tb->tai", sensing, truth)
-    readings += turn_on
-    readings += white * rng.standard_normal(readings.shape)
+    readings += biases
+    readings += levels * rng.standard_normal(readings.shape)
     readings += noise.walk / math.sqrt(rate) * np.cumsum(rng.standard_normal(readings.shape), axis=0)
     readings += _gauss_markov(readings.shape, noise, rate, rng)
-    for fault in faults:
-        _break(readings, fault, rate, rng)
+    for each in faults:
+        _break(readings, each, rate, rng)
     factor = conversion_factor("rad/s", unit)
     letters = ("",) if axes == 1 else ("x_", "y_", "z_")
     columns: dict[str, Array] = {"time": time}
@@ -128,11 +157,34 @@ def simulate_array(
     for a, letter in enumerate(letters):
         for i in range(elements):
             columns[f"gyro_{letter}{i + 1}"] = readings[:, a, i] * factor
-            metadata[f"truth_bias_{letter}{i + 1}"] = f"{float(turn_on[a, i])!r} rad/s"
+            metadata[f"truth_bias_{letter}{i + 1}"] = f"{float(biases[a, i])!r} rad/s"
     for a, letter in enumerate(letters):
         columns[f"truth_rate_{letter}".rstrip("_")] = truth[:, a] * factor
     units = {name: "s" if name == "time" else unit for name in columns}
     return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated {experiment} array")
+
+
+def _spread(given: tuple[float, float] | str) -> tuple[float, float]:
+    """Return the range of a factor, given as LOW,HIGH or as one number for both."""
+    if not isinstance(given, str):
+        low, high = given
+        return float(low), float(high)
+    first, _, second = given.partition(",")
+    if "," in second:
+        raise OptionError(f"spread {given!r}: expected LOW,HIGH, such as 0.6,1.6")
+    return quantity(first, "spread", "number", "1"), quantity(second or first, "spread", "number", "1")
+
+
+def _fault(text: str) -> Fault:
+    """Return a fault from ``KIND:GYRO[:START[:DURATION[:SIZE]]]``."""
+    kind, *rest = text.split(":")
+    if not 1 <= len(rest) <= 4:
+        raise OptionError(f"fault {text!r}: expected KIND:GYRO[:START[:DURATION[:SIZE]]], such as stuck:3:40:20")
+    units = (("start", "time", "s"), ("duration", "time", "s"), ("size", "rate", "deg/s"))
+    values = {
+        name: quantity(part, "fault", of, unit) for (name, of, unit), part in zip(units, rest[1:], strict=False) if part
+    }
+    return Fault(kind, whole(rest[0], "fault"), **values)
 
 
 def _check(elements: int, axes: int, rate: float, length: float, mounting: str, unit: str) -> None:

@@ -1,0 +1,126 @@
+"""Records to firmware, autopilots and toolboxes, as people have them: records or their files, options as keywords."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from imulab import exporters
+from imulab.device.array_settings import Fusion
+from imulab.errors import ImulabError, OptionError, listed
+from imulab.exporters import EXPORTERS, ExportOptions
+from imulab.procedures.gyro_array.memory import carried, fusion_text
+from imulab.procedures.inputs import as_record
+from imulab.procedures.loading import load
+from imulab.procedures.unit_tables import tables_of
+from imulab.quantities import whole
+from imulab.records.calibration import Calibration
+from imulab.verdict import SENTENCES
+
+Record: TypeAlias = Calibration | str | PathLike[str]
+_DEVICE_IDS = 2**32
+
+
+def _nothing(message: str) -> None:
+    """Tell nobody."""
+
+
+def export(
+    to: str,
+    records: Record | Sequence[Record],
+    folder: str | PathLike[str],
+    *,
+    lossy: bool = False,
+    device_id: int | str = 0,
+    noise: str | PathLike[str] | Mapping[str, Any] | None = None,
+    method: str | None = None,
+    memory: str | float | None = None,
+    tell: Callable[[str], object] = _nothing,
+) -> list[Path]:
+    """Write records in the form of firmware, an autopilot or a toolbox.
+
+    Parameters
+    ----------
+    to
+        One of ``c blob px4 ardupilot kalibr openvins ros``.
+    records
+        The unit's records, or their files; one or several.
+    folder
+        Where to; made where it is not there.
+    lossy
+        Leave out what the target cannot hold, and fit the rest anew.
+    device_id
+        PX4's number of the sensor.
+    noise
+        What ``imulab allan --json`` printed, or its file, for noise keys.
+    method, memory
+        For c and blob: how an array fuses, as for `fuse`; what its record carries if not given.
+    tell
+        Called with a sentence on each loss that was allowed, and on each record that is not good.
+
+    Returns
+    -------
+    list
+        The files written.
+
+    Raises
+    ------
+    OptionError
+        An unknown target, or one that cannot hold the records; nothing is written then.
+    RecordError
+        A record cannot be read, or lacks what is needed.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
+    >>> [file.name for file in il.export("ros", fit.calibration, "calibration")]
+    ['imu_calib.yaml']
+    """
+    if to not in EXPORTERS:
+        raise OptionError(f"to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")
+    number = whole(device_id, "device_id")
+    if not 0 <= number < _DEVICE_IDS:
+        raise OptionError(f"device_id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
+    if Path(folder).exists() and not Path(folder).is_dir():
+        raise OptionError(f"{os.fspath(folder)}: expected a folder to write to, found a file")
+    given = [records] if isinstance(records, Calibration | str | PathLike) else list(records)
+    loaded = [load(os.fspath(one)) if isinstance(one, str | PathLike) else as_record(one, "export") for one in given]
+    names = [os.fspath(one) if isinstance(one, str | PathLike) else "the record" for one in given]
+    fusion = None if method is None and memory is None else _fusion(to, method, memory, loaded)
+    if to in ("c", "blob"):
+        for name, record in zip(names, loaded, strict=True):
+            try:
+                tables_of(record, fusion)
+            except ImulabError as error:
+                raise (error if str(error).startswith(name) else type(error)(f"{name}: {error}")) from None
+    for name, record in zip(names, loaded, strict=True):
+        if record.verdict.state == "bad":
+            tell(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
+    file = os.fspath(noise) if isinstance(noise, str | PathLike) else "the noise"
+    found = noise if isinstance(noise, Mapping) else _noise(file) if noise else {}
+    options = ExportOptions(lossy, number, found, file if noise else "", fusion, tell)
+    return exporters.export(to, loaded, Path(folder), options)
+
+
+def _fusion(to: str, method: str | None, memory: str | float | None, records: Sequence[Calibration]) -> Fusion:
+    array = next((record for record in records if record.procedure == "gyro_array"), None)
+    if to not in ("c", "blob") or array is None:
+        raise OptionError("method and memory say how a gyro array fuses: expected its record, and target c or blob")
+    return fusion_text(method, None if memory is None else str(memory), "{}", carried(array))
+
+
+def _noise(file: str) -> dict[str, Any]:
+    try:
+        content = json.loads(Path(file).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise OptionError(f"{file}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found no JSON ({error})") from None
+    if not isinstance(content, dict) or "columns" not in content:
+        raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found JSON without 'columns'")
+    return content

@@ -1,0 +1,326 @@
+"""Every command has its function: the same options, the same defaults, the same result bit for bit."""
+
+import inspect
+import json
+import keyword
+import re
+
+import pytest
+
+import imulab as il
+from imulab.cli import common, main
+from imulab.cli.app import command
+from imulab.quantities import quantity
+
+FUNCTIONS = {
+    "apply": il.apply,
+    "show": il.compare_records,  # of two records; of one file: il.load or il.read, which show themselves
+    "report": il.write_report,
+    "convert": il.write,
+    "export": il.export,
+    "allan": il.allan_deviation,
+    "tumble plan": il.plan_tumble,
+    "tumble simulate": il.simulate_tumble,
+    "tumble fit": il.fit_tumble,
+    "tumble gyro": il.fit_gyro,
+    "tumble check": il.check_tumble,
+    "array simulate": il.simulate_array,
+    "array merge": il.merge_array,
+    "array calibrate": il.calibrate_array,
+    "array fuse": il.fuse,
+    "array compare": il.compare_methods,
+    "centrifuge plan": il.plan_centrifuge,
+    "centrifuge simulate": il.simulate_centrifuge,
+    "centrifuge reduce": il.fit_centrifuge,
+    "warmup plan": il.plan_warmup,
+    "warmup simulate": il.simulate_warmup,
+    "warmup fit": il.fit_warmup,
+    "warmup table": il.warmup_table,
+    "fleet run": il.run_fleet,
+    "fleet status": il.fleet_status,
+    "fleet report": il.write_fleet_report,
+    "fleet simulate": il.simulate_fleet,
+}
+WITHOUT = {"demo"}  # which runs other commands
+READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
+APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
+OTHERWISE = {
+    "apply": {"temperature_column"},
+    "show": {"formats"},  # a list for people
+    "tumble fit": {"latitude", "height"},  # gravity=il.normal_gravity(...)
+    "tumble check": {"latitude", "height"},
+    "tumble gyro": {"accel", "accel_file", "g_sensitivity", "clock"},
+    "array calibrate": {"interval", "averaging"},
+    "array fuse": {"rate"},  # of arrays and files, a keyword of reading
+    "array compare": {"experiment", "seeds"},
+    "warmup fit": {"settling_limit", "exit", "latest_start", "temperature_column"},
+}
+"""Options that functions have by another name, or say in another way."""
+COMMANDS = dict(common._commands(command()))
+G = 9.80665
+
+
+def options_of(path):
+    """Names of a command's options, as keywords, and their defaults."""
+    found = {}
+    for parameter in COMMANDS[path].params:
+        if parameter.param_type_name == "option":
+            long = next(name for name in parameter.opts if name.startswith("--"))
+            name = long.lstrip("-").replace("-", "_")
+            found[name + "_" * keyword.iskeyword(name)] = parameter.default
+    return {name: default for name, default in found.items() if name not in APART}
+
+
+def plain(default):
+    """A default as what it means: a number in SI where it is one, else a text; None for what is not given."""
+    if default in (None, inspect.Parameter.empty) or isinstance(default, bool):
+        return None if default is inspect.Parameter.empty else default or None
+    if isinstance(default, tuple | list):
+        return ",".join(f"{value:g}" for value in default) or None
+    text = str(default)
+    for kind, unit in (("time", "s"), ("number", "1"), ("acceleration", "m/s^2"), ("rate", "rad/s")):
+        try:
+            return quantity(text, "", kind, unit)
+        except il.ImulabError:
+            continue
+    return text
+
+
+def test_every_command_has_a_function():
+    assert {*FUNCTIONS} | WITHOUT == {*COMMANDS}
+
+
+@pytest.mark.parametrize("path", FUNCTIONS)
+def test_options_are_keywords_of_the_same_name_and_default(path):
+    keywords = inspect.signature(FUNCTIONS[path]).parameters
+    wrong = {
+        name: (default, str(keywords.get(name, "none")))
+        for name, default in options_of(path).items()
+        if name not in keywords or plain(default) != plain(keywords[name].default)
+    }
+    assert {*wrong} == OTHERWISE.get(path, set()) & {*wrong}
+    assert all(name in options_of(path) for name in OTHERWISE.get(path, ()))
+
+
+def test_the_unit_of_a_bare_number_is_in_the_help():
+    """Every call ``in_si(value, "option", kind, unit)`` of a function, against the help of that option."""
+    seen, missing = 0, []
+    for path, function in FUNCTIONS.items():
+        texts = {
+            name.lstrip("-").replace("-", "_"): f"{parameter.help} {parameter.default} {parameter.metavar}"
+            for parameter in COMMANDS[path].params
+            for name in parameter.opts
+        }
+        read = re.findall(r'in_si\(\w+, "(\w+)", "\w+", "([^"]+)"\)', inspect.getsource(function))
+        for name, unit in read:
+            if name in texts and unit != "1":
+                seen += 1
+                if not re.search(rf"(?<![\w/]){re.escape(unit)}(?![\w/])", texts[name]):
+                    missing.append((path, name, unit))
+    assert missing == []
+    assert seen > 20
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Files that several commands read."""
+    place = tmp_path_factory.mktemp("commands")
+    il.write_csv(il.simulate_tumble(attitudes=12, order=1, hold="2 s"), place / "tumble.csv")
+    for seed in (1, 2):
+        fit = il.fit_tumble(il.simulate_tumble(attitudes=12, order=1, hold="2 s", seed=seed), order=1, gravity=G)
+        fit.save(place / f"unit{seed}.json")
+    still = il.simulate_array(experiment="static", duration=30.0)
+    il.calibrate_array(still).save(place / "array.json")
+    cycles = il.simulate_warmup([-40, 0, 60], cycles=2, duration="400 s", rate="2 Hz")
+    il.fit_warmup(cycles, temperatures=(-40, 0, 60), model="knot-cubic").save(place / "warm.json")
+    il.plan_centrifuge("1,10", cycles=1).save(place / "plan.toml")
+    return place
+
+
+def ran(*words, status=0):
+    assert main([str(word) for word in words], project=False) == status
+
+
+def same(one, other):
+    """Whether two files, or all files of two folders, are the same bit for bit, but for when they were made."""
+    if one.is_dir():
+        names = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
+        assert names == sorted(path.relative_to(other) for path in other.rglob("*") if path.is_file()) != []
+        return all(same(one / name, other / name) for name in names)
+    texts = [path.read_bytes() for path in (one, other)]
+    if one.suffix == ".json" and b"content_sha256" in texts[0]:
+        contents = [json.loads(text) for text in texts]
+        for content in contents:
+            del content["created"], content["content_sha256"]
+        return contents[0] == contents[1]
+    return texts[0] == texts[1]
+
+
+MADE = {
+    "tumble plan": (
+        ["--attitudes", "12", "--noise", "20ug", "--order", "1", "--add", "tumble.csv", "-o", "one.csv"],
+        lambda out: il.plan_tumble(12, noise="20ug", order=1, add="tumble.csv").save(out),
+    ),
+    "tumble plan of a record's noise": (
+        ["--attitudes", "14", "--order", "1", "--noise", "unit1.json", "--from", "fixture:45", "--report", "one.html"],
+        lambda out: il.plan_tumble(14, order=1, noise="unit1.json", from_="fixture:45").report(out),
+    ),
+    "tumble simulate": (
+        ["--attitudes", "6", "--noise", "1 mg", "--hold", "1 s", "--unit", "g", "-o", "one.csv"],
+        lambda out: il.write(il.simulate_tumble(attitudes=6, noise=1e-3 * G, hold=1, unit="g"), out),
+    ),
+    "array simulate": (
+        ["--duration", "10 s", "--elements", "3", "--fault", "stuck:2:3:4", "--walk", "0", "-o", "one.csv"],
+        lambda out: il.write(il.simulate_array(duration=10, elements=3, fault=["stuck:2:3:4"], walk=0.0), out),
+    ),
+    "array merge": (
+        ["tumble.csv", "tumble2.csv", "--axis", "x", "-o", "one.csv"],
+        lambda out: il.write(il.merge_array(["tumble.csv", "tumble2.csv"], axis="x").recording, out),
+    ),
+    "centrifuge plan": (
+        ["--levels", "1,10", "--both-senses", "-o", "one.toml"],
+        lambda out: il.plan_centrifuge([G, 10 * G], both_senses=True).save(out),
+    ),
+    "centrifuge simulate": (
+        ["--plan", "plan.toml", "--duration", "20 s", "--static-duration", "10 s", "--tilt", "0", "-o", "one"],
+        lambda out: il.simulate_centrifuge("plan.toml", duration=20, static_duration=10, tilt=0.0).save(out),
+    ),
+    "warmup plan": (
+        ["--temperatures", "-40,0,60", "--soak", "30 min", "-o", "one.csv"],
+        lambda out: il.plan_warmup([-40, 0, 60], soak=1800).save(out),
+    ),
+    "warmup simulate": (
+        ["--temperatures", "-40,60", "--cycles", "1", "--units", "2", "--rate", "1", "-o", "one"],
+        lambda out: il.simulate_warmup([-40, 60], cycles=1, units=2, rate=1.0).save(out),
+    ),
+    "warmup table": (
+        ["warm.json", "--per-second", "-o", "one.csv"],
+        lambda out: il.warmup_table("warm.json", per_second=True).save(out),
+    ),
+    "fleet simulate": (
+        ["--units", "8", "--seed", "3", "-o", "one"],
+        lambda out: il.simulate_fleet(out, units=8, seed=3),
+    ),
+    "export": (
+        ["--to", "kalibr", "unit1.json", "--lossy", "-o", "one"],
+        lambda out: il.export("kalibr", "unit1.json", out, lossy=True),
+    ),
+    "export of an array": (
+        ["--to", "c", "array.json", "--method", "mean", "-o", "one"],
+        lambda out: il.export("c", ["array.json"], out, method="mean"),
+    ),
+    "report": (["unit1.json", "-o", "one.html"], lambda out: il.write_report("unit1.json", out)),
+    "convert": (["tumble.csv", "-o", "one.csv"], lambda out: il.write(il.read("tumble.csv"), out)),
+    "apply": (
+        ["unit1.json", "tumble.csv", "-o", "one.csv"],
+        lambda out: il.write(il.apply("unit1.json", "tumble.csv"), out),
+    ),
+    "tumble fit": (
+        ["tumble.csv", "--order", "1", "--loss", "square", "-o", "one.json"],
+        lambda out: il.fit_tumble("tumble.csv", order=1, loss="square").save(out),
+    ),
+}
+
+
+@pytest.mark.parametrize("row", MADE)
+def test_a_command_and_its_function_give_the_same(row, folder, tmp_path, monkeypatch, capsys):
+    for path in folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    il.write_csv(il.simulate_tumble(attitudes=12, order=1, hold="2 s", seed=2), tmp_path / "tumble2.csv")
+    monkeypatch.chdir(tmp_path)
+    words, function = MADE[row]
+    ran(*row.partition(" of ")[0].split(), *words)
+    (out,) = (tmp_path / word for word in words if word.startswith("one"))
+    other = out.with_name("other" + out.suffix)
+    function(other)
+    assert same(out, other)
+
+
+def test_records_are_compared_as_on_the_command_line(folder, capsys):
+    first, second = folder / "unit1.json", folder / "unit2.json"
+    ran("show", first, second, "--json")
+    said = json.loads(capsys.readouterr().out)
+    found = il.compare_records(first, second)
+    assert said["probability"] == found.probability
+    assert [change["difference"] for change in said["changes"]] == [change.difference for change in found.changes]
+
+
+def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
+    first, _ = il.simulate_fleet(tmp_path / "line", units=8)
+    state = il.run_fleet(first, tmp_path / "one", workers=1, history="none")
+    ran("fleet", "run", first, "-o", tmp_path / "other", "--workers", "1", "--history", "none", "-q")
+    for row in state.rows:
+        assert same(tmp_path / "one" / f"{row.unit.serial}.json", tmp_path / "other" / f"{row.unit.serial}.json")
+    capsys.readouterr()
+    ran("fleet", "status", tmp_path / "one", "--json")
+    said = json.loads(capsys.readouterr().out)
+    found = il.fleet_status(tmp_path / "one")
+    assert (said["units"], said["done"], said["failures"]) == (len(found.rows), found.count("done"), [])
+    limits = tmp_path / "line" / "limits.toml"
+    il.write_fleet_report(tmp_path / "one", tmp_path / "one.html", limits=limits, history="none")
+    ran("fleet", "report", tmp_path / "one", "-o", tmp_path / "other.html", "--limits", limits, "--history", "none")
+    assert same(tmp_path / "one.html", tmp_path / "other.html")
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda: il.plan_tumble(24, noise="20ug"),
+        lambda: il.plan_warmup(),
+        lambda: il.plan_centrifuge(),
+        lambda: il.simulate_centrifuge(),
+        lambda: il.simulate_warmup(),
+    ],
+    ids=["tumble", "warmup", "centrifuge", "rig", "cycles"],
+)
+def test_results_show_themselves_in_twelve_lines_at_most(made):
+    result = made()
+    headline, titles, rows = result.shown()
+    text, html = repr(result), result._repr_html_()
+    assert len(text.splitlines()) <= 12
+    assert text.startswith(headline[:100])
+    assert html.count("<tr>") == (len(rows) + 1 if rows else 0)
+    assert all(f"<th>{title}</th>" in html for title in titles if rows)
+
+
+def test_the_plot_of_a_plan_has_its_attitudes_in_order(tmp_path):
+    plan = il.plan_tumble(12, noise="20ug", order=1)
+    (trace,) = plan.plot().to_dict()["data"]
+    saved = il.read(_saved(plan, tmp_path / "plan.csv"))
+    assert trace["x"] == pytest.approx(saved.column("roll").tolist(), abs=1e-3)
+    assert trace["y"] == pytest.approx(saved.column("pitch").tolist(), abs=1e-3)
+
+
+def _saved(plan, path):
+    plan.save(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: il.plan_tumble(12), "noise: expected the noise"),
+        (lambda: il.plan_tumble(12, noise="20ugg"), "noise '20ugg': "),
+        (lambda: il.plan_tumble(12.5, noise="20ug"), "attitudes 12.5: expected a whole number"),
+        (lambda: il.plan_tumble(12, noise="20ug", from_=[1, 2]), "from_: expected upward directions, shape"),
+        (lambda: il.plan_warmup(soak=True), "soak True: expected a number in SI, or a text with a unit"),
+        (lambda: il.plan_warmup("cold"), "temperatures 'cold': expected numbers"),
+        (lambda: il.plan_warmup(repeatability="much"), "repeatability 'much': expected a fraction"),
+        (lambda: il.plan_centrifuge(5), "levels 5: expected specific forces"),
+        (lambda: il.plan_centrifuge(drift="3 deg/h"), "drift '3 deg/h': expected a number with one of deg/h/g"),
+        (lambda: il.simulate_centrifuge("plan.toml", levels="1,2"), "levels: the plan says that already"),
+        (lambda: il.simulate_centrifuge(7), "plan 7: expected a plan, a manifest or its file"),
+        (lambda: il.simulate_array(fault=["stuck"]), "fault 'stuck': expected KIND:GYRO"),
+        (lambda: il.merge_array(["a.csv"], axis="u"), "axis 'u': expected x, y or z"),
+        (lambda: il.compare_records(1, 2), "compare_records: expected a record or the name of its file"),
+        (lambda: il.export("px5", [], "out"), "to 'px5': unknown target; known targets: "),
+        (lambda: il.run_fleet("m.csv", "out", workers="two"), "workers 'two': expected a whole number"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line_that_names_the_keyword(call, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(il.ImulabError) as refused:
+        call()
+    assert str(refused.value).startswith(said)
+    assert "\n" not in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
