@@ -41,7 +41,8 @@ FUNCTIONS = {
     "fleet report": il.write_fleet_report,
     "fleet simulate": il.simulate_fleet,
 }
-WITHOUT = {"demo"}  # which runs other commands
+WITHOUT = {"demo", "noise fit"}
+"""One runs other commands; the others are for a person at a screen."""
 READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
 APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
 OTHERWISE = {
