@@ -64,6 +64,18 @@ def test_what_a_page_shows_runs(page, tmp_path, monkeypatch):
             assert done.returncode == 0, f"{page.name}: {line}\n{done.stderr}"
 
 
+def test_five_lines_lead_from_a_data_frame_to_a_record_and_a_picture(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ((language, text),) = BLOCK.findall((REPOSITORY / "README.md").read_text(encoding="utf-8"))
+    assert language == "python"
+    assert len([line for line in text.splitlines() if line]) == 5
+    imulab.simulate_tumble(gravity=9.81362).to_frame("pandas").to_csv("recording.csv", index=False)
+    (tmp_path / "example.py").write_text(text, encoding="utf-8")
+    runpy.run_path("example.py")
+    assert len(imulab.load("sn42.json").parameters) >= 9
+    assert "Residual |f| \u2212 g of each attitude" in (tmp_path / "residuals.html").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge"])
 def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
