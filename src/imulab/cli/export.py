@@ -19,7 +19,7 @@ def export(
     ] = False,
     device_id: Annotated[str, typer.Option("--device-id", metavar="N", help="PX4: number of the sensor.")] = "0",
     noise: Annotated[
-        str | None, typer.Option("--noise", metavar="FILE", help="What 'allan --json' printed, for noise keys.")
+        str | None, typer.Option("--noise", metavar="FILE", help="Noise record, or what 'allan --json' printed.")
     ] = None,
     method: Annotated[
         str | None, typer.Option("--method", help="c, blob: how an array fuses; what its record carries if not given.")

@@ -16,6 +16,7 @@ from imulab.exporters import EXPORTERS, ExportOptions
 from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.inputs import as_record
 from imulab.procedures.loading import load
+from imulab.procedures.noise.wants import for_export
 from imulab.procedures.unit_tables import tables_of
 from imulab.quantities import whole
 from imulab.records.calibration import Calibration
@@ -36,7 +37,7 @@ def export(
     *,
     lossy: bool = False,
     device_id: int | str = 0,
-    noise: str | PathLike[str] | Mapping[str, Any] | None = None,
+    noise: str | PathLike[str] | Mapping[str, Any] | Calibration | None = None,
     method: str | None = None,
     memory: str | float | None = None,
     tell: Callable[[str], object] = _nothing,
@@ -56,7 +57,7 @@ def export(
     device_id
         PX4's number of the sensor.
     noise
-        What ``imulab allan --json`` printed, or its file, for noise keys.
+        A noise record, or what ``imulab allan --json`` printed, or the file of either, for noise keys.
     method, memory
         For c and blob: how an array fuses, as for `fuse`; what its record carries if not given.
     tell
@@ -102,7 +103,9 @@ def export(
         if record.verdict.state == "bad":
             tell(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     file = os.fspath(noise) if isinstance(noise, str | PathLike) else "the noise"
-    found = noise if isinstance(noise, Mapping) else _noise(file) if noise else {}
+    found: Mapping[str, Any] = for_export(noise) if isinstance(noise, Calibration) else {}
+    if noise and not isinstance(noise, Calibration):
+        found = noise if isinstance(noise, Mapping) else _noise(file)
     options = ExportOptions(lossy, number, found, file if noise else "", fusion, tell)
     return exporters.export(to, loaded, Path(folder), options)
 
@@ -121,6 +124,8 @@ def _noise(file: str) -> dict[str, Any]:
         raise OptionError(f"{file}: no such file") from None
     except (OSError, ValueError) as error:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found no JSON ({error})") from None
+    if isinstance(content, dict) and content.get("procedure") == "noise":
+        return for_export(load(file))
     if not isinstance(content, dict) or "columns" not in content:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found JSON without 'columns'")
     return content
