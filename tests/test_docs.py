@@ -18,11 +18,17 @@ EXAMPLES = (
     "allan_deviation",
     "apply",
     "check_tumble",
+    "compare_methods",
+    "export",
     "find_attitudes",
     "fit_gyro",
     "fit_tumble",
+    "load",
     "normal_gravity",
     "read",
+    "simulate_array",
+    "write_csv",
+    "write_report",
 )
 OF_COMMANDS = (
     "compare_records",
@@ -43,6 +49,25 @@ OF_COMMANDS = (
     "write_fleet_report",
     "write_report",
 )
+WITHOUT_EXAMPLE = {
+    "ArrayFit",
+    "Attitudes",
+    "Calibration",
+    "CentrifugeFit",
+    "FuseOptions",
+    "Fused",
+    "ImulabError",
+    "NoiseFit",
+    "Recording",
+    "TumbleFit",
+    "WarmupFit",
+    "find_power_cycle",
+    "fit_centrifuge",
+    "fit_warmup",
+    "load_manifest",
+    "read_blocks",
+    "write",
+}
 PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.search(page.read_text(encoding="utf-8")))
 
 
@@ -93,3 +118,11 @@ def test_the_page_on_python_describes_every_public_name():
     page = (REPOSITORY / "docs" / "python.md").read_text(encoding="utf-8")
     described = re.findall(r"^\.\. auto\w+:: imulab\.(\w+)$", page, re.MULTILINE)
     assert sorted(described) == sorted(set(imulab.__all__) - {"__version__"})
+
+
+def test_every_public_name_has_a_docstring_and_but_for_these_an_example():
+    finder = doctest.DocTestFinder(recurse=False)
+    names = set(imulab.__all__) - {"__version__"}
+    assert not [name for name in names if not getattr(imulab, name).__doc__]
+    lacking = {name for name in names if not any(found.examples for found in finder.find(getattr(imulab, name), name))}
+    assert lacking <= WITHOUT_EXAMPLE

@@ -18,6 +18,14 @@ def load(path: str | Path) -> Calibration:
     ------
     RecordError
         The file is missing, is no record, is of a newer version, was altered, or lacks something.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), gravity=9.81)
+    >>> fit.save("sn42.json")
+    >>> il.load("sn42.json").procedure
+    'tumble'
     """
     return load_sealed(path)[0]
 

@@ -60,6 +60,13 @@ def write_csv(blocks: Recording | Iterable[Recording], path: str | Path) -> None
     ------
     OptionError
         The name does not end in .csv, or the file cannot be written there.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.write_csv(il.simulate_tumble(), "recording.csv")
+    >>> len(il.read("recording.csv")) > 0
+    True
     """
     if Path(path).suffix.lower() != ".csv":
         raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv")

@@ -195,6 +195,12 @@ def compare_methods(
         No elements, no time, an axis without a finite reading, or neither truth nor a stretch at rest.
     OptionError
         An option has a value that cannot be.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> sorted(il.compare_methods(il.simulate_array()).figures)[0]
+    'covariance'
     """
     recording = _timed(as_recording(data, reading, compare_methods, gyros_of), "compare_methods")
     record = None if calibration is None else as_record(calibration, "compare_methods: calibration")
