@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,16 +11,22 @@ import numpy as np
 
 from imulab.errors import DataError
 from imulab.estimation.allan import AllanCurve, allan_deviation
+from imulab.estimation.noise.analysis import Analysis, analyses
+from imulab.estimation.noise.choice import CANDIDATES, average
+from imulab.estimation.noise.cosine import transformed
+from imulab.estimation.noise.terms import allan_variance
 from imulab.estimation.noise_coefficients import (
     NoiseCoefficients,
     coefficients_dict,
+    fits,
+    mean_uncertainty,
     read_coefficients,
     resolution,
     undetermined,
+    unseen,
 )
 from imulab.estimation.rows import leave_out
 from imulab.estimation.sampling import bridged, sampling_rate, steady_part
-from imulab.estimation.spectral_lines import Lines, spectral_lines
 from imulab.estimation.steps import Step, find_step
 from imulab.recording import Array, Recording
 from imulab.units import from_si, parse_unit
@@ -32,15 +38,52 @@ _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 _NOISE_REACH = 20.0
 _LARGEST = 1e140
 _MOST_NAMED, _MOST_COLUMNS = 3, 6
+_FEWEST, _LEAST_FREEDOM = 50, 4.0
+_COARSE = 2.2  # of the deviation from sample to sample; whole counts of an angle show steps of 2.0 of it at most
+_FITTED = 0.5  # averaging times that a band tells, in terms of 1/f_max
 
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """Allan curve of a column, its noise coefficients, and the lines of its spectrum."""
+    """Allan curve of a column, its noise coefficients, and the model that they are from, None where there is none."""
 
     curve: AllanCurve
     coefficients: NoiseCoefficients
-    lines: Lines
+    model: Analysis | None = None
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is a model and the record agrees with it."""
+        return self.model is not None and fits(self.model)
+
+    @property
+    def lines(self) -> list[float]:
+        """Lines of the spectrum, which are no noise, the largest first, Hz."""
+        return [] if self.model is None else [line.frequency for line in self.model.stretches[0].lines]
+
+    def mean_uncertainty(self, duration: float) -> float:
+        """Return the standard uncertainty of the mean over a duration, s, as a measure of the bias.
+
+        That of the model; where it is not that of the record, at least the Allan deviation at the far end of the curve.
+        """
+        own = 0.0 if self.model is None else mean_uncertainty(self.model, duration)
+        if self.fits:
+            return own
+        known = (self.curve.freedom >= _LEAST_FREEDOM) & (self.curve.deviation > 0)
+        upper = (self.curve.deviation * np.sqrt(1 + 2 * np.sqrt(2 / self.curve.freedom)))[known]
+        return max(own, float(upper[-3:].max(initial=0.0)))
+
+    def unseen(self, duration: float) -> float:
+        """Return how many times as large noise that the record cannot show could make it, from 2 on; else 1."""
+        return unseen(self.model, self.coefficients, duration) if self.model is not None and self.fits else 1.0
+
+    def fitted(self, tau: Array) -> Array | None:
+        """Return the Allan deviation of the model, nan where the band does not reach; None without a model."""
+        if self.model is None or not self.fits:
+            return None
+        interval = self.model.interval
+        found = average(self.model.choice, lambda values: allan_variance(values, tau, interval)).mean[0]
+        return np.where(tau * self.coefficients.highest >= _FITTED, np.sqrt(found), np.nan)
 
 
 def noise_columns(recording: Recording) -> Iterator[str]:
@@ -79,14 +122,17 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     notes += [*more, *trimmed, *timing]
     moved = moved_columns(recording, names, rate)
     columns: dict[str, Any] = {}
-    noises: dict[str, ColumnNoise] = {}
+    noises = dict(
+        zip(
+            names, columns_noise([recording.si(n) for n in names], rate, [moved.get(n, "") for n in names]), strict=True
+        )
+    )
     for name in names:
         unit = {"rate": "rad/s", "acceleration": "m/s^2"}.get(
             parse_unit(recording.units[name]).quantity, recording.units[name]
         )
         samples = recording.si(name)
-        noises[name] = column_noise(samples, rate, moved.get(name, ""))
-        if name not in moved and (step := find_step(noises[name].lines.samples)) is not None:
+        if name not in moved and (step := find_step(samples)) is not None:
             notes.append(_step_line(recording, name, step))
         curve = noises[name].curve if taus == "octave" else allan_deviation(samples, rate, taus)
         columns[name] = {
@@ -96,6 +142,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
             "tau": curve.tau.tolist(),
             "deviation": curve.deviation.tolist(),
             "standard_uncertainty": curve.standard_uncertainty.tolist(),
+            "fitted": _listed(noises[name].fitted(curve.tau)),
         }
     notes += [type(line)(f"{recording.name}: {line}") for line in noise_lines(noises)]
     return {
@@ -123,24 +170,48 @@ def _check_squares(recording: Recording, names: list[str]) -> None:
             )
 
 
-def column_noise(samples: Array, rate: float, moved: str = "") -> ColumnNoise:
-    """Return the Allan curve of samples, shape (n,), at a rate, Hz, and the coefficients that can be read from it.
+def _listed(values: Array | None) -> list[float | None] | None:
+    return None if values is None else [None if math.isnan(value) else value for value in values.tolist()]
 
-    Lines of the spectrum stay in the curve and are taken out for the coefficients. `moved` is why there are none.
+
+def columns_noise(
+    columns: Sequence[Array], rate: float, moved: Sequence[str] = (), candidates: tuple[str, ...] = CANDIDATES
+) -> list[ColumnNoise]:
+    """Return the Allan curves of columns, shape (n,) each, at a rate, Hz, and the coefficients of the model that fits.
+
+    Spikes and lines of the spectrum stay in the curve and are taken out of what the model is fitted to. `moved` says
+    of each column why it has no coefficients.
 
     Raises
     ------
     DataError, OptionError
-        As for `allan_deviation` and `read_coefficients`.
+        As for `allan_deviation`; fewer than 50 samples.
     """
-    curve = allan_deviation(samples, rate)
-    why = moved if np.ptp(samples) else "all samples are the same: a dead sensor"
-    if why:
-        return ColumnNoise(curve, undetermined(why), Lines(np.empty(0), np.empty(0), samples))
-    lines = spectral_lines(samples, rate)
-    of_noise = allan_deviation(lines.samples, rate) if len(lines.frequency) else curve
-    found = read_coefficients(of_noise, resolution(samples))
-    return ColumnNoise(curve, found, lines)
+    curves = [allan_deviation(samples, rate) for samples in columns]
+    if len(columns[0]) < _FEWEST:
+        raise DataError(
+            f"noise coefficients: {len(columns[0])} samples are too few; expected some {_FEWEST} samples or more"
+        )
+    why = [
+        reason or _unfit(samples, float(curve.deviation[0]))
+        for samples, curve, reason in zip(columns, curves, moved or [""] * len(columns), strict=True)
+    ]
+    fit = [k for k, reason in enumerate(why) if not reason]
+    found = analyses([[transformed(columns[k], 1 / rate)] for k in fit], candidates) if fit else []
+    models = dict(zip(fit, zip(read_coefficients(found), found, strict=True), strict=True))
+    return [
+        ColumnNoise(curve, *(models[k] if k in models else (undetermined(why[k]),))) for k, curve in enumerate(curves)
+    ]
+
+
+def _unfit(samples: Array, noise: float) -> str:
+    """Why no model of noise can be fitted to samples whose deviation from one to the next is `noise`; else nothing."""
+    if not np.ptp(samples):
+        return "all samples are the same: a dead sensor"
+    step = resolution(samples)
+    if step > _COARSE * noise:
+        return f"the samples take steps that are {step / noise:.1f} times as large as their noise"
+    return ""
 
 
 def _step_line(recording: Recording, name: str, step: Step) -> str:
@@ -161,22 +232,25 @@ def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
     """Return what is to say of columns by name: filters and lines, and coefficients that are not determined."""
     told: dict[str, list[str]] = {}
     for name, noise in noises.items():
-        reason = noise.coefficients.angle_random_walk.reason or noise.coefficients.bias_instability.reason
+        its = noise.coefficients
+        reason = its.angle_random_walk.reason or its.bias_instability.reason
         if reason:
             told.setdefault(reason, []).append(name)
-    said = [f"{_columns(names)}: noise coefficients not determined: {reason}" for reason, names in told.items()]
+    said = []
+    for reason, names in told.items():
+        alone = not noises[names[0]].coefficients.angle_random_walk.reason
+        which = "bias instability and random walk of the zero" if alone else "noise coefficients"
+        said.append((Note if alone else str)(f"{_columns(names)}: {which} not determined: {reason}"))
     filtered = {n: f.coefficients for n, f in noises.items() if f.coefficients.filtered}
     if filtered:
-        shortest = max(f.shortest for f in filtered.values())
-        time = max(f.correlation_time for f in filtered.values())
-        how = f", over {1e3 * time:.3g} ms as behind a low-pass filter of {0.16 / time:.3g} Hz" if time else ""
+        highest = min(f.highest for f in filtered.values())
         said.append(
             Note(
-                f"{_columns(list(filtered))}: the noise is correlated from sample to sample{how}; the coefficients are "
-                f"read from averaging times of {shortest:.3g} s and more"
+                f"{_columns(list(filtered))}: the noise is correlated from sample to sample, as behind a filter; the "
+                f"coefficients are read from frequencies up to {highest:.3g} Hz"
             )
         )
-    with_lines = {n: f.lines.frequency[:_MOST_NAMED] for n, f in noises.items() if len(f.lines.frequency)}
+    with_lines = {n: f.lines[:_MOST_NAMED] for n, f in noises.items() if f.lines}
     if with_lines:
         each = "; ".join(
             f"{n} {' '.join(f'{f:.4g}' for f in found)}" for n, found in list(with_lines.items())[:_MOST_COLUMNS]

@@ -1,50 +1,48 @@
-"""Noise coefficients read from an Allan curve, where their model fits it.
+"""Noise coefficients of a column: N, B, K, Q of the model that its record is fitted by, where that model fits it.
 
-Sources: IEEE Std 952 (annex C) and IEEE Std 647 for the coefficients; the variance of a mean of correlated samples for
-the term of short correlation.
+Sources: IEEE Std 952 (annex C) and IEEE Std 647 for the coefficients.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 
-from imulab.errors import DataError
-from imulab.estimation.allan import AllanCurve
+from imulab.estimation.noise.analysis import Analysis, intervals_of
+from imulab.estimation.noise.choice import average
+from imulab.estimation.noise.cosine import frequencies
+from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, letters
+from imulab.estimation.noise.use import bias_square
 from imulab.recording import Array
 
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk", "quantisation")
-_FLICKER = 2 * math.log(2) / math.pi
-_OCTAVE_CORRELATION = 0.5
-"""Of estimates an octave apart, measured on white noise and random walk (.45 to .6); falls as its power."""
-_LEAST_FREEDOM = 4.0  # about a fifth of the recording
-_FEWEST = 4
-_FEWEST_TO_TEST = 6
-_FITS, _PLAINLY_NOT = 0.05, 1e-3
-"""Probabilities of chi-square: the model passes; it plainly does not."""
-_ALLOWANCES = (0.0, 0.02, 0.05)
-"""What the variance may be off the model beyond its scatter: real noise is not exactly of these kinds."""
-_SHOWS = 3.0  # standard deviations
-_PLAIN = 0.2
-"""Relative uncertainty of N^2 up to which a part of the curve tells white noise."""
-_FREE = np.array([[*choice, True] for choice in product((False, True), repeat=3)])
-"""Which parameters are not held at zero: every choice of the three that cannot be negative."""
-_COARSE = 2.2  # of the deviation from sample to sample; whole counts of an angle show steps of 2.0 of it at most
+_UNFIT = 0.01
+"""Probability of the test of fit below which the model is not that of the record."""
+_NORMAL = 1.96
+_EDGE, _SHARE = 1.5, 0.003
+"""Of the shortest time constant, and of the record: what is as fast is a filter, where the band has no level end."""
+_LEVELS = 0.01
+"""How far off the white noise the level at the end of the band may be, relative."""
+_MUCH = 2.0
+"""How many times as large unseen noise must be able to make the uncertainty of a mean for that to be said."""
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A noise coefficient and its standard uncertainty; both nan where `reason` says why it is not determined.
+    """A noise coefficient, its standard uncertainty and its 95 % interval; all nan where it is not determined.
 
-    Unit of the samples times s (quantisation), s^1/2, 1 or s^-1/2.
+    Unit of the samples times s (quantisation), s^1/2, 1 or s^-1/2; `reason` says why it is not determined. The interval
+    is where the deviance is 3.84 above its least (the profile of the likelihood), the uncertainty its longer side over
+    1.96.
     """
 
     value: float
     standard_uncertainty: float
+    interval: tuple[float, float] = (math.nan, math.nan)
     reason: str = ""
 
 
@@ -56,121 +54,159 @@ class NoiseCoefficients:
     ----------
     angle_random_walk, bias_instability, rate_random_walk, quantisation
         The coefficients.
-    covariance
-        Of N^2, B^2, K^2 as the curve gives them, shape (3, 3).
-    shortest, longest
-        Averaging times that the model was fitted to, s.
-    left_out
-        Whether shorter averaging times of the curve were left out because the model plainly does not fit there.
-    correlation_time
-        Over which a low-pass filter correlates the white noise, s; 0 where none shows.
-    ceiling
-        Largest Allan variance that the far end of the curve allows, in the squared unit of the samples.
+    highest
+        Up to which frequency the noise counts, Hz; 0 where nothing is determined.
+    filtered
+        Whether the noise is plainly correlated from sample to sample.
     """
 
     angle_random_walk: Coefficient
     bias_instability: Coefficient
     rate_random_walk: Coefficient
     quantisation: Coefficient
-    covariance: Array
-    shortest: float = 0.0
-    longest: float = 0.0
-    left_out: bool = False
-    correlation_time: float = 0.0
-    ceiling: float = 0.0
-
-    @property
-    def filtered(self) -> bool:
-        """Whether the noise is plainly correlated from sample to sample."""
-        return self.left_out or self.correlation_time > 0
-
-    def variance(self, tau: Array) -> Array:
-        """Return the Allan variance that N, B and K predict, shape of `tau`; nan where one is not determined."""
-        values = [getattr(self, name).value ** 2 for name in COEFFICIENTS[:3]]
-        variance: Array = _terms(tau)[:, :3] @ np.array(values)
-        return variance
-
-    def mean_uncertainty(self, duration: float) -> float:
-        """Return the standard uncertainty of the mean over a duration, s, as an estimate of the bias.
-
-        ``u^2 = E[x | x >= N^2 / T]``, x normal about the Allan variance that the coefficients predict at T, with the
-        variance that their covariance gives it: what the curve, which ends at T / 5, leaves open counts as well. A
-        recording that is shorter than the noise is correlated cannot show it. Where the model does not fit, the largest
-        variance that the far end of the curve allows.
-        """
-        predicted = float(self.variance(np.array([duration]))[0])
-        if math.isnan(predicted):
-            return math.sqrt(self.ceiling)
-        terms = _terms(np.array([duration]))[0, :3]
-        spread = math.sqrt(max(float(terms @ self.covariance @ terms), 0.0))
-        if spread == 0.0:
-            return math.sqrt(predicted)
-        cut = (float(terms[0]) * self.angle_random_walk.value**2 - predicted) / spread
-        density, above = math.exp(-(cut**2) / 2) / math.sqrt(2 * math.pi), math.erfc(cut / math.sqrt(2)) / 2
-        return math.sqrt(predicted + spread * density / above)
+    highest: float = 0.0
+    filtered: bool = False
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A fit of (N^2, B^2, K^2, c) over the averaging times from number `low` up to `high`, not included.
+def read_coefficients(columns: Sequence[Analysis]) -> list[NoiseCoefficients]:
+    """Return the coefficients of the noise of columns, with profile intervals, where their model fits it.
 
-    `probability` is that of its chi-square, `from_first` that of the fit from the first averaging time on.
+    They are those of white noise, 1/f noise and random walk together, and quantisation of an angle where it shows; one
+    that the record does not show is 0 or little, with an interval from 0. Where Gauss-Markov processes explain the
+    record plainly better, there is no B and no K, unless they are the filter of the sensor. Where the test of fit
+    rejects the best model at 1 %, there is no number but N, as the level at the end of the band, where that is level.
     """
+    wanted = [(k, index) for k, found in enumerate(columns) for index in sorted({*_candidates(found)} - {-1})]
+    ends = dict(zip(wanted, intervals_of([columns[k] for k, _ in wanted], [index for _, index in wanted]), strict=True))
+    return [
+        _read(found, *({i: ends[k, i] for i in _candidates(found) if i >= 0}, _candidates(found)))
+        for k, found in enumerate(columns)
+    ]
 
-    values: Array
-    covariance: Array
-    probability: float
-    low: int
-    high: int
-    from_first: float = 1.0
+
+def fits(found: Analysis) -> bool:
+    """Whether the test of fit lets the best model pass at 1 %."""
+    return bool(found.test.probability >= _UNFIT)
 
 
-def read_coefficients(curve: AllanCurve, resolution: float = 0.0) -> NoiseCoefficients:
-    """Read noise coefficients from an Allan curve, with uncertainties, where their model fits it.
+def _candidates(found: Analysis) -> tuple[int, int, int]:
+    """From which candidates N, B and K are taken; -1 for none."""
+    if not fits(found):
+        return (-1, -1, -1)
+    names = ["".join(sorted(letters(model).replace("Q", ""))) for model in found.choice.models[0]]
+    near = found.choice.rivals[0].copy()
+    near[found.index] = True
+    if any("G" not in name for name, one in zip(names, near.tolist(), strict=True) if one):
+        every = names.index("BKN")
+        return (every, every, every)
+    if (found.values[list(TIME)] <= _fast(found)).all():
+        flicker, walk = (names.index(each) if each in names else -1 for each in ("BGN", "GKN"))
+        return (-1, flicker, walk)
+    return (-1, -1, -1)
 
-    Generalised least squares of ``sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + c / tau^2`` over
-    averaging times about an octave apart, up to about a fifth of the recording; an estimate's relative variance is 2 /
-    freedom, neighbours are correlated. N^2, B^2 and K^2 are not negative. c takes up what is correlated over few
-    samples, exactly so beyond the length of the correlation: negative behind a low-pass filter, ``3 Q^2`` for an angle
-    that is quantised. The shortest averaging times are left out until chi-square lets the model pass, and one octave
-    more. Where the model passes nowhere, a curve whose short part shows white noise gives N alone, and any other curve
-    nothing. A coefficient that the curve does not show is 0 with the size that it may have as its uncertainty.
 
-    Parameters
-    ----------
-    curve
-        Allan deviation over averaging time.
-    resolution
-        Step of the samples, in their unit; noise below 0.45 of it is not determined.
+def _fast(found: Analysis) -> float:
+    """Up to which time constant a Gauss-Markov process is the filter of the sensor, s."""
+    return max(_EDGE * found.limits[0], 0.0 if found.band.flat else _SHARE * found.length)
 
-    Raises
-    ------
-    DataError
-        The curve has fewer than four usable averaging times.
+
+def _white(found: Analysis) -> Coefficient:
+    """White noise, with what lies behind a filter, over all candidates."""
+
+    def square(values: Array) -> Array:
+        sizes, times = values[..., list(SIGMA)], values[..., list(TIME)]
+        density = np.where(times <= _fast(found), 2 * sizes**2 * times, 0.0)
+        return np.asarray(values[..., :1] ** 2 + density.sum(axis=-1, keepdims=True))
+
+    white = average(found.choice, square)
+    return _coefficient(*(math.sqrt(float(white.quantile(level)[0, 0])) for level in (0.5, 0.025, 0.975)))
+
+
+def _read(
+    found: Analysis, ends: Mapping[int, tuple[Array, Array]], candidates: tuple[int, int, int]
+) -> NoiseCoefficients:
+    band = found.band
+    # Half of the band is given up where nothing is filtered.
+    filtered = band.highest * found.interval < 0.24
+    if not fits(found):
+        reason = f"the noise is not that of the model (test of fit: p = {found.test.probability:.1g})"
+        none = undetermined(reason, band.highest, filtered)
+        return replace(none, angle_random_walk=_level(found)) if band.flat else none
+
+    def one(k: int, index: int) -> Coefficient:
+        if index < 0:
+            return _none(f"the noise is also {_markov(found)}, no 1/f noise or random walk: imulab noise fit")
+        return _coefficient(*(float(part[k]) for part in (found.choice.values[0, index], *ends[index])))
+
+    white = one(0, candidates[0]) if candidates[0] >= 0 else _white(found)
+    angle = _none("does not show" if band.full else f"would show above {band.highest:.4g} Hz only")
+    if found.model[NAMES.index("quantisation")] and candidates[0] >= 0:
+        angle = one(3, candidates[0])
+    flicker, walk = one(1, candidates[1]), one(2, candidates[2])
+    filtered = filtered or (not band.flat and candidates[0] < 0)
+    return NoiseCoefficients(_widened(white, band.roll_off), flicker, walk, angle, band.highest, filtered)
+
+
+def _widened(found: Coefficient, relative: float) -> Coefficient:
+    """A coefficient with a further relative standard uncertainty."""
+    value, more = found.value, relative * found.value
+    sides = [math.hypot(end - value, _NORMAL * more) for end in found.interval]
+    return _coefficient(value, value - sides[0], value + sides[1])
+
+
+def _level(found: Analysis) -> Coefficient:
+    """White noise as the level of the two highest octaves of the band, which agree."""
+    highest = found.band.highest
+    f = np.concatenate([frequencies(each) for each in found.spectra])
+    top = np.where(f > highest / 4, found.bins.freedom, 0.0)
+    value = math.sqrt(float((top * found.bins.power).sum() / top.sum()) * found.interval)
+    u = value * math.hypot(_LEVELS, math.sqrt(1 / (2 * float(top.sum()))))
+    return Coefficient(value, u, (value - _NORMAL * u, value + _NORMAL * u))
+
+
+def _markov(found: Analysis) -> str:
+    """Say which Gauss-Markov processes were found."""
+    times = [f"{found.values[t]:.3g}" for t, size in zip(TIME, SIGMA, strict=True) if found.values[size] > 0]
+    return f"a Gauss-Markov {'process' if len(times) == 1 else 'processes'} of {' and '.join(times)} s"
+
+
+def _coefficient(value: float, low: float, high: float) -> Coefficient:
+    return Coefficient(value, max(high - value, value - low) / _NORMAL, (low, high))
+
+
+def _none(reason: str) -> Coefficient:
+    return Coefficient(math.nan, math.nan, reason=reason)
+
+
+def undetermined(reason: str, highest: float = 0.0, filtered: bool = False) -> NoiseCoefficients:
+    """Return coefficients none of which is determined, for this reason."""
+    none = _none(reason)
+    return NoiseCoefficients(none, none, none, none, highest, filtered)
+
+
+def mean_uncertainty(found: Analysis, duration: float) -> float:
+    """Return the standard uncertainty of a mean over a duration, s, as a measure of the bias.
+
+    ``u^2`` of `use.bias_square`, averaged over all candidate models, each times exp(variance of ln u^2 / 2).
     """
-    tau, deviation, freedom = curve.tau, curve.deviation, curve.freedom
-    if not (deviation > 0).any():
-        zero = Coefficient(0.0, 0.0)
-        return NoiseCoefficients(zero, zero, zero, zero, np.zeros((3, 3)))
-    keep = _octaves(tau, (freedom >= _LEAST_FREEDOM) & (deviation > 0))
-    if len(keep) < _FEWEST:
-        raise DataError("noise coefficients: the recording is too short; expected some 50 samples or more")
-    tau, variance, relative = tau[keep], deviation[keep] ** 2, np.sqrt(2 / freedom[keep])
-    ceiling = float(np.max((variance * (1 + 2 * relative))[-3:]))
-    if resolution > _COARSE * deviation[0]:
-        reason = f"the samples take steps that are {resolution / deviation[0]:.1f} times as large as their noise"
-        return undetermined(reason, ceiling)
-    if len(tau) < _FEWEST_TO_TEST:
-        return _coefficients(_fitted(tau, variance, relative, 0, len(tau), 0.0), tau, ceiling)
-    whole = _longest_fit(tau, variance, relative, len(tau))
-    if whole is not None:
-        return _coefficients(whole, tau, ceiling)
-    for high in range(len(tau) - 1, _FEWEST_TO_TEST - 1, -1):
-        part = _longest_fit(tau, variance, relative, high)
-        if part is not None and _shows_white(part, tau):
-            return _coefficients(part, tau, ceiling)
-    reason = f"the curve from {tau[0]:.3g} to {tau[-1]:.3g} s is not that of white noise, 1/f noise and random walk"
-    return undetermined(reason, ceiling)
+    square = average(found.choice, lambda values: bias_square(values, np.array([duration]), found.interval))
+    return float(np.sqrt(square.expected[0, 0]))
+
+
+def unseen(found: Analysis, coefficients: NoiseCoefficients, duration: float) -> float:
+    """Return how many times as large noise that does not show could make that uncertainty; 1 where that is below 2.
+
+    1/f noise or random walk at the upper end of its interval, beside the white noise.
+    """
+    white, *slow = (each.interval[1] for each in (coefficients.angle_random_walk, coefficients.bias_instability,
+                                                  coefficients.rate_random_walk))  # fmt: skip
+    if math.isnan(slow[0]):
+        return 1.0
+    ends = np.zeros((2, len(NAMES)))
+    ends[:, 0], ends[0, 1], ends[1, 2] = white, *slow
+    largest = float(bias_square(ends, np.array([duration]), found.interval).max())
+    ratio = math.sqrt(largest) / mean_uncertainty(found, duration)
+    return ratio if ratio > _MUCH else 1.0
 
 
 def resolution(samples: Array) -> float:
@@ -180,12 +216,6 @@ def resolution(samples: Array) -> float:
     """
     values = np.unique(samples[:20_000])
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
-
-
-def undetermined(reason: str, ceiling: float = 0.0) -> NoiseCoefficients:
-    """Return coefficients none of which is determined, for this reason."""
-    none = Coefficient(math.nan, math.nan, reason)
-    return NoiseCoefficients(none, none, none, none, np.full((3, 3), np.nan), ceiling=ceiling)
 
 
 def coefficients_dict(found: NoiseCoefficients, unit: str) -> dict[str, Any]:
@@ -198,128 +228,8 @@ def coefficients_dict(found: NoiseCoefficients, unit: str) -> dict[str, Any]:
         listed[name] = {
             "value": one.value if known else None,
             "standard_uncertainty": one.standard_uncertainty if known else None,
+            "interval_95": list(one.interval) if known else None,
             "unit": its,
             **({} if known else {"reason": one.reason}),
         }
     return listed
-
-
-def _octaves(tau: Array, usable: np.ndarray) -> np.ndarray:
-    """Numbers of usable averaging times that are an octave apart or a little more."""
-    kept: list[int] = []
-    for index in np.flatnonzero(usable).tolist():
-        if not kept or tau[index] > 1.99 * tau[kept[-1]]:
-            kept.append(index)
-    return np.array(kept, dtype=np.int64)
-
-
-def _terms(tau: Array) -> Array:
-    """Derivative of the Allan variance by N^2, B^2, K^2 and c, shape (t, 4)."""
-    return np.column_stack([1 / tau, np.full(len(tau), _FLICKER), tau / 3, tau**-2.0])
-
-
-def _fitted(tau: Array, variance: Array, relative: Array, low: int, high: int, allowance: float) -> _Fit:
-    from imulab.estimation.special import chdtrc
-
-    part = slice(low, high)
-    tau, variance = tau[part], variance[part]
-    relative = np.hypot(relative[part], allowance)
-    short = len(tau) < _FEWEST_TO_TEST  # too few to tell a fourth term
-    terms = _terms(tau)[:, : 3 if short else 4]
-    correlation = _OCTAVE_CORRELATION ** np.abs(np.subtract.outer(np.log2(tau), np.log2(tau)))
-    root = np.linalg.cholesky(correlation + 1e-12 * np.eye(len(tau)))
-    predicted = variance
-    for _ in range(12):
-        sigma = (relative * predicted)[:, None]
-        whitened = np.linalg.solve(root, np.column_stack([terms, variance]) / sigma)
-        scale = np.linalg.norm(whitened[:, :-1], axis=0)
-        scaled = whitened[:, :-1] / scale
-        found, misfit = not_negative(scaled, whitened[:, -1])
-        values = found / scale
-        last, predicted = predicted, np.maximum(terms @ values, 1e-3 * variance)
-        if np.allclose(last, predicted, rtol=1e-6, atol=0):
-            break
-    covariance = np.linalg.inv(scaled.T @ scaled) / np.outer(scale, scale)
-    if short:
-        values = np.append(values, 0.0)
-        covariance = np.pad(covariance, (0, 1))
-    left = len(tau) - np.count_nonzero(values[:3]) - (0 if short else 1)
-    return _Fit(values, covariance, float(chdtrc(max(left, 1), misfit**2)), low, high)
-
-
-def not_negative(columns: Array, target: Array) -> tuple[Array, float]:
-    """Return least squares in which the first three parameters are not negative, and the length of what is left.
-
-    The best of the eight choices of those that are zero. scipy's nnls, of which this is a small case, takes 0.3 s of
-    processor time to load.
-    """
-    size = columns.shape[1]
-    free = _FREE[:, :size]
-    gram, seen = columns.T @ columns, columns.T @ target
-    systems = np.where(free[:, :, None] & free[:, None, :], gram, np.eye(size))
-    found = np.linalg.solve(systems, np.where(free, seen, 0.0)[:, :, None])[:, :, 0]
-    explained = np.where((found[:, :3] >= 0).all(axis=1), found @ seen, -np.inf)
-    best = found[explained.argmax()]
-    return best, float(np.linalg.norm(target - columns @ best))
-
-
-def _longest_fit(tau: Array, variance: Array, relative: Array, high: int) -> _Fit | None:
-    """The fit up to averaging time number `high` that tells N best, or None where the model passes nowhere."""
-    best: _Fit | None = None
-    from_first = 1.0
-    for allowance in _ALLOWANCES:
-        for low in range(high - _FEWEST_TO_TEST + 1):
-            found = _fitted(tau, variance, relative, low, high, allowance)
-            if low == 0 and allowance == 0:
-                from_first = found.probability
-            if found.probability < _FITS:
-                continue
-            if 0 < low <= high - _FEWEST_TO_TEST - 1:  # what just passes is still off by a standard deviation or two
-                found = _fitted(tau, variance, relative, low + 1, high, allowance)
-            if best is None or found.covariance[0, 0] < best.covariance[0, 0]:
-                best = replace(found, from_first=from_first)
-            break
-        if best is not None and best.low == 0:
-            break
-    return best
-
-
-def _shows_white(fit: _Fit, tau: Array) -> bool:
-    """Whether white noise makes up most of the variance in half of the averaging times that were fitted."""
-    white, spread = fit.values[0], math.sqrt(fit.covariance[0, 0])
-    part = tau[fit.low : fit.high]
-    mostly = white / part > 0.5 * (_terms(part) @ fit.values)
-    return bool(spread < _PLAIN * white and np.mean(mostly) >= 0.5)
-
-
-def _coefficients(fit: _Fit, tau: Array, ceiling: float) -> NoiseCoefficients:
-    spreads = np.sqrt(np.diag(fit.covariance))
-    shortest, longest = float(tau[fit.low]), float(tau[fit.high - 1])
-    white, flicker, walk = (_root(v, s) for v, s in zip(fit.values[:3], spreads[:3], strict=True))
-    if fit.high < len(tau):
-        reason = f"beyond {longest:.3g} s the curve is not that of white noise, 1/f noise and random walk"
-        flicker = walk = Coefficient(math.nan, math.nan, reason)
-    short, uncertain = float(fit.values[3]), float(spreads[3])
-    if fit.low:
-        quantisation = Coefficient(math.nan, math.nan, f"averaging times below {shortest:.3g} s do not fit the model")
-    else:
-        quantisation = _root(max(short, 0.0) / 3, uncertain / 3)
-    filtered = short < -_SHOWS * uncertain and fit.values[0] > 0
-    return NoiseCoefficients(
-        white,
-        flicker,
-        walk,
-        quantisation,
-        fit.covariance[:3, :3],
-        shortest,
-        longest,
-        fit.low > 0 and fit.from_first < _PLAINLY_NOT,
-        -short / (1.5 * float(fit.values[0])) if filtered else 0.0,
-        ceiling,
-    )
-
-
-def _root(square: float, spread: float) -> Coefficient:
-    """A coefficient from its square."""
-    size = math.sqrt(square)
-    return Coefficient(size, float(min(spread / (2 * size) if size else math.inf, math.sqrt(spread))))

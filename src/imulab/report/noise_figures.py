@@ -58,7 +58,8 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
     items: list[Figure | ReportTable] = [
         ReportTable(
             "Noise coefficients",
-            "Value and standard uncertainty u. Angle (velocity) random walk: the white noise of the rate (specific "
+            "Value and standard uncertainty u, of the model that fits the spectrum best; 0 ± u: it does not show. "
+            "Angle (velocity) random walk: the white noise of the rate (specific "
             "force). Bias instability: the level of 1/f noise, below which no averaging helps. Rate (acceleration) "
             "random walk: how the zero wanders.",
             ["column", "coefficient", "value", "u", "unit"],
@@ -111,6 +112,7 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
                     line={"color": _COLOURS[k], "dash": DASHES[k]}, marker={"symbol": SYMBOLS[k], "size": 6},
                     hovertemplate=f"{name}<br>%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>"),
         ]  # fmt: skip
+        traces += _fitted(column, factor, name, _COLOURS[k])
     message = "All samples are the same."
     if lowest:
         level, at_time, which = min(lowest)
@@ -120,7 +122,8 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
         title=f"Allan deviation, {', '.join(names)}",
         message=message,
         caption="Deviation between neighbouring means over the averaging time. Shaded: 95 % interval, "
-        "wide on the right where there are few averages. Slope −1/2: white noise. Flat: bias instability. Slope "
+        "wide on the right where there are few averages. Dotted: the model that the coefficients are of. "
+        "Slope −1/2: white noise. Flat: bias instability. Slope "
         "+1/2: a random walk of the zero.",
         traces=traces,
         layout={
@@ -130,6 +133,18 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
         },
         height=430,
     )
+
+
+def _fitted(column: dict[str, Any], factor: float, name: str, colour: str) -> list[dict[str, Any]]:
+    """The Allan deviation of the model, where there is one."""
+    known = [(t, d) for t, d in zip(column["tau"], column["fitted"] or [], strict=False) if d is not None]
+    if not known:
+        return []
+    tau, deviation = np.array(known).T
+    line = {"line": {"color": colour, "width": 1, "dash": "dot"}, "hoverinfo": "skip", "showlegend": False}
+    return [
+        scatter(rounded(tau, _DIGITS), rounded(factor * deviation, _DIGITS), "lines", name=f"{name}, fitted", **line)
+    ]
 
 
 def _samples(found: dict[str, Any], recording: Recording, names: Sequence[str]) -> Figure:

@@ -152,17 +152,55 @@ def analysed(
     highest
         Up to which frequency, Hz; found from the spectra if not given.
     """
-    spectra = [each for stretch in stretches for each in stretch.spectra]
-    nyquist = 0.5 / stretches[0].interval
-    band = usable_band(spectra) if highest is None else Band(min(highest, nyquist), highest >= nyquist)
-    inside = [within(each, band.highest) for each in spectra]
-    bins, limits = prepare(inside), time_limits(inside)
-    richest = terms(_RICHEST + "Q" * band.full)
-    found = fit(bins, richest[None], limits, bins.power[None], bins.freedom[None])
-    allowance = allow(inside, _split(bins.variances(found.values)[0], inside))
-    bins, limits = prepare(allowance.spectra), time_limits(allowance.spectra)
-    choice = choose(bins, limits, bins.power[None], bins.freedom[None], candidates, full_band=band.full and band.flat)
-    return Analysis(tuple(stretches), band, allowance, limits, choice)
+    return analyses([stretches], candidates, highest)[0]
+
+
+def analyses(
+    columns: Sequence[Sequence[Stretch]], candidates: tuple[str, ...] = CANDIDATES, highest: float | None = None
+) -> list[Analysis]:
+    """Return the noise of columns with the same times, all at once: see `analysed`."""
+    spectra = [[each for stretch in stretches for each in stretch.spectra] for stretches in columns]
+    nyquist = 0.5 / columns[0][0].interval
+    bands = [
+        usable_band(each) if highest is None else Band(min(highest, nyquist), highest >= nyquist) for each in spectra
+    ]
+    found: dict[int, Analysis] = {}
+    for band in dict.fromkeys(bands):
+        alike = [k for k, its in enumerate(bands) if its == band]
+        fitted = _of_one_band([spectra[k] for k in alike], band, candidates)
+        found |= {k: Analysis(tuple(columns[k]), band, *its) for k, its in zip(alike, fitted, strict=True)}
+    return [found[k] for k in range(len(columns))]
+
+
+def _of_one_band(
+    columns: Sequence[Sequence[Spectrum]], band: Band, candidates: tuple[str, ...]
+) -> list[tuple[Allowance, tuple[float, float], Choice]]:
+    inside = [[within(each, band.highest) for each in spectra] for spectra in columns]
+    bins, limits = prepare(inside[0]), time_limits(inside[0])
+    power = np.array([np.concatenate([each.power for each in spectra]) for spectra in inside])
+    freedom = np.array([np.concatenate([each.freedom for each in spectra]) for spectra in inside])
+    richest = terms(_RICHEST + "Q" * band.full)[None]
+    variances = bins.variances(fit(bins, richest, limits, power, freedom).values)
+    allowances = [allow(spectra, _split(each, spectra)) for spectra, each in zip(inside, variances, strict=True)]
+    freedom = np.array([np.concatenate([each.freedom for each in allowance.spectra]) for allowance in allowances])
+    choice = choose(bins, limits, power, freedom, candidates, full_band=band.full and band.flat)
+    parts = [Choice(*(getattr(choice, name)[k : k + 1] for name in Choice.__annotations__)) for k in range(len(power))]
+    return [(allowance, limits, part) for allowance, part in zip(allowances, parts, strict=True)]
+
+
+def intervals_of(found: Sequence[Analysis], index: Sequence[int]) -> list[tuple[Array, Array]]:
+    """Return the ends of 95 % intervals, shapes (8,), of one candidate of each column, columns as in `analyses`."""
+    ends: dict[int, tuple[Array, Array]] = {}
+    for limits in dict.fromkeys(each.limits for each in found):
+        alike = [k for k, each in enumerate(found) if each.limits == limits]
+        bins = [found[k].bins for k in alike]
+        values, models = (
+            np.array([getattr(found[k].choice, name)[0, index[k]] for k in alike]) for name in ("values", "models")
+        )
+        power, freedom = np.array([each.power for each in bins]), np.array([each.freedom for each in bins])
+        parts = profile(bins[0], values, models, limits, power, freedom)
+        ends |= dict(zip(alike, zip(*parts, strict=True), strict=True))
+    return [ends[k] for k in range(len(found))]
 
 
 def without_steps(stretches: Sequence[Stretch], steps: Sequence[Sequence[Step]]) -> list[Stretch]:

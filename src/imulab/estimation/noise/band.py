@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,8 @@ from imulab.estimation.noise.cosine import frequencies
 from imulab.estimation.noise.spectrum import Spectrum
 from imulab.recording import Array
 
-_AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.05
-"""How far two octaves may be apart, beyond so many sigma; up to where these sigma tell the agreement well."""
+_AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.2
+"""How far two octaves may be apart, beyond so many sigma; up to where these sigma tell of an agreement at all."""
 _FULL = 0.999
 _MANY, _FEWEST = 200, 16
 """Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
@@ -34,18 +35,21 @@ class Band:
         Whether that is the whole band of the samples.
     flat
         Whether there is white noise at its end: where no two octaves agree, the band is full and this is False.
+    roll_off
+        Relative standard uncertainty of N from what may be left of a filter's roll-off.
     """
 
     highest: float
     full: bool
     flat: bool = True
+    roll_off: float = field(default=0.0, compare=False)
 
 
 def usable_band(spectra: Sequence[Spectrum]) -> Band:
     """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do, and once more.
 
     They agree within 3 % + 3 sigma. Of these 3 % a long record makes a term of its own, and N comes out too small: so
-    the band ends an octave lower, unless 3 sigma are more than 5 %. Quantisation of an angle rises with frequency:
+    the band ends an octave lower, unless 3 sigma are more than 20 %. Quantisation of an angle rises with frequency:
     where white noise and quantisation together, ``a + b s^2``, bring the three highest octaves to agreement, or the
     highest octave is plainly above the next, the band is full.
     """
@@ -60,7 +64,8 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
             full = highest > _FULL * nyquist
             if _SIGMAS * u[0] > _SHARP or (full and far[0] < -_SIGMAS * u[0]):
                 return Band(highest, full)
-            return Band(highest / 2, False)
+            # One of first order leaves a quarter of it an octave lower, and N has half of that at most.
+            return Band(highest / 2, False, roll_off=float(_AGREE + _SIGMAS * u[0]) / 8 / math.sqrt(3))
         highest /= 2
     return Band(nyquist, True, False)
 

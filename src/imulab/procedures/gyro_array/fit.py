@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from imulab.device.array_settings import Fusion
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.estimation.allan import AllanCurve
-from imulab.estimation.column_noise import ColumnNoise, column_noise, noise_lines
+from imulab.estimation.column_noise import ColumnNoise, columns_noise, noise_lines
 from imulab.estimation.noise_coefficients import COEFFICIENTS, coefficients_dict
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.estimation.sampling import sampling_rate
@@ -32,6 +33,8 @@ _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
 _OVERLAP = 8
 _CLIPPED_RUN = 3
 _SHARED = 0.5
+_CANDIDATES = ("N", "NK", "NB", "NG", "NBK")
+"""Models of the noise: a stretch at rest is too short to tell more."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,8 +68,8 @@ def calibrate_array(
     """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
 
     At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
-    come from its Allan curve, and so does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance
-    matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    come from the model of its noise, and so does the bias's uncertainty (`ColumnNoise.mean_uncertainty`); the
+    covariance matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
     covariance; Vaccaro and Zaki 2017). In motion: `align`.
 
     Parameters
@@ -123,6 +126,7 @@ def calibrate_array(
         )
     noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
     warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
+    warnings += [f"{still.name}: {line}" for line in _unseen(noises, rest.duration)]
     if fusion is not None and fusion.method == "feedback":
         warnings += [type(line)(f"{still.name}: {line}") for line in feedback_notes(elements.count, rest.rate)]
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
@@ -189,12 +193,24 @@ def _at_rest(still: Recording, elements: Elements) -> _AtRest:
     rate, _ = sampling_rate(still)
     _check_readings(still, elements)
     readings = _si(still, elements)
-    noise = tuple(
-        tuple(column_noise(readings[:, a, i], rate) for i in range(elements.count)) for a in range(len(elements.axes))
-    )
+    n = elements.count
+    columns = [readings[:, a, i] for a in range(len(elements.axes)) for i in range(n)]
+    each = columns_noise(columns, rate, candidates=_CANDIDATES)
+    noise = tuple(tuple(each[k : k + n]) for k in range(0, len(each), n))
     curves = tuple(tuple(one.curve for one in row) for row in noise)
     white = np.array([[curve.deviation[0] for curve in row] for row in curves])
     return _AtRest(readings.mean(axis=0), curves, noise, white, len(still) / rate, rate)
+
+
+def _unseen(noises: Mapping[str, ColumnNoise], duration: float) -> list[str]:
+    """Say by how much slower noise than a stretch shows could raise the uncertainties of the biases."""
+    most = max((each.unseen(duration) for each in noises.values()), default=1.0)
+    if most == 1:
+        return []
+    return [
+        f"the uncertainties of the biases hold the noise that {duration:.4g} s show; slower noise, which so short a "
+        f"stretch cannot show, would make them up to {most:.2g} times as large"
+    ]
 
 
 def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Alignment, list[str]]:
@@ -268,7 +284,7 @@ def _elements(
 ) -> tuple[list[dict[str, Any]], dict[str, Parameter]]:
     """The record's entry for each element, and the parameters in them."""
     axes = len(elements.axes)
-    spread = np.array([[c.coefficients.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
+    spread = np.array([[c.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
     one = axes == 1
 
     def scalar(values: Array) -> Any:

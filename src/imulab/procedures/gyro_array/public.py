@@ -40,8 +40,8 @@ def calibrate_array(
     """Calibrate the elements of an array from data at rest and, if there are some, data in motion.
 
     At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
-    come from its Allan curve, and so does the bias's uncertainty (`NoiseCoefficients.mean_uncertainty`); the covariance
-    matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    come from the model of its noise, and so does the bias's uncertainty (`ColumnNoise.mean_uncertainty`); the
+    covariance matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
     covariance; Vaccaro and Zaki 2017). In motion: scale factors, or a 3 x 3 alignment of each element.
 
     Parameters
