@@ -81,13 +81,6 @@ def export(
     >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
     >>> [file.name for file in il.export("ros", fit.calibration, "calibration")]
     ['imu_calib.yaml']
-
-    Examples
-    --------
-    >>> import imulab as il
-    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), gravity=9.81)
-    >>> [path.name for path in il.export("blob", [fit.calibration], "tables")]
-    ['unit.blob']
     """
     if to not in EXPORTERS:
         raise OptionError(f"to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")

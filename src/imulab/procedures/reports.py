@@ -85,11 +85,5 @@ def write_report(record: Record, path: str | Path) -> None:
     >>> import imulab as il
     >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
     >>> il.write_report(fit.calibration, "sn42.html")
-
-    Examples
-    --------
-    >>> import imulab as il
-    >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), gravity=9.81)
-    >>> il.write_report(fit.calibration, "sn42.html")
     """
     write_text(path, rendered(as_record(record, "write_report")))

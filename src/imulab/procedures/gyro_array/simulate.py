@@ -109,13 +109,6 @@ def simulate_array(
     >>> import imulab as il
     >>> il.simulate_array(elements=2, duration="10 s", fault=["stuck:1:5"]).units["gyro_2"]
     'deg/s'
-
-    Examples
-    --------
-    >>> import imulab as il
-    >>> still = il.simulate_array(experiment="static", duration=60.0)
-    >>> il.calibrate_array(still).calibration.procedure
-    'gyro_array'
     """
     noise = NoiseModel(
         white=in_si(white, "white", "rate", "deg/s"),
