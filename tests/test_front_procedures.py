@@ -1,5 +1,7 @@
 """Arrays, warm-up and centrifuge from data as people have it: the same results in every form, and as the commands'."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, ImulabError, OptionError
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
+from imulab.procedures.inputs import as_blocks
 
 TEMPERATURES = (-40.0, 0.0, 60.0)
 
@@ -118,6 +121,23 @@ def test_power_cycles_are_fitted_in_every_form_as_by_the_command(cycles, tmp_pat
     frames = [il.Recording.from_frame(each.to_frame(), metadata=dict(each.metadata)) for each in recordings]
     for form in (cycles, recordings, frames, [il.find_power_cycle(each) for each in recordings]):
         assert parameters(il.fit_warmup(form, **options).calibration) == expected
+
+
+def test_power_cycles_of_hours_are_averaged_as_they_are_read(tmp_path):
+    peaks = []
+    for duration in (500.0, 2000.0):
+        path = tmp_path / f"{duration:g}.csv"
+        il.write_csv(il.simulate_power_cycle(0.0, duration=duration, sample_rate=200.0), path)
+        tracemalloc.start()
+        made, source = as_blocks(path, {}, il.fit_warmup)
+        cycle = il.find_power_cycle(made, source=source)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 0.2 * 300_000 * 8 * 8  # of the 19 MB that 300,000 rows more take
+    whole = il.read(path)
+    assert cycle.source == whole.source
+    for name, values in vars(il.find_power_cycle(whole).bins).items():
+        np.testing.assert_allclose(getattr(cycle.bins, name), values, rtol=1e-9)
 
 
 @pytest.mark.parametrize("single", ["cycle.csv", il.Recording({}, {}), np.zeros((3, 3)), None, 3, {"time": [0]}])

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from importlib.resources import files
 
 import numpy as np
@@ -420,3 +421,17 @@ def test_records_are_compared_from_their_files_as_by_the_command(tmp_path, capsy
     assert set(printed) == {"changes", "probability", "left_out", "models"}
     with pytest.raises(OptionError, match="compare_records: expected a record or the name of its file, found int 3"):
         il.compare_records(tmp_path / "1.json", 3)
+
+
+def test_ten_million_rows_are_drawn_in_two_seconds_with_their_spikes():
+    samples = np.random.default_rng(1).normal(size=10_000_000)
+    samples[1_234_567], samples[7_654_321], samples[5_000_000] = 40.0, -55.0, np.nan
+    recording = il.Recording({"time": np.arange(10_000_000) / 1e3, "gyro_x": samples}, {"time": "s", "gyro_x": "deg/s"})
+    begun = time.process_time()
+    (drawn,) = recording.plot("gyro").to_dict()["data"]
+    assert time.process_time() - begun < 2
+    x, y = np.array(drawn["x"]), np.array(drawn["y"], dtype=np.float64)
+    assert len(y) <= 4000
+    assert (y.max(), y.min()) == (40.0, -55.0)
+    assert x[np.argmax(y)] == pytest.approx(1234.567, abs=10_000 / 2000)  # a column of pixels
+    assert x[np.argmin(y)] == pytest.approx(7654.321, abs=10_000 / 2000)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
@@ -14,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.frames import Frame, columns_of_arrays, is_frame
 from imulab.quantities import chosen
-from imulab.readers import Layout, read
+from imulab.readers import Layout, read, read_blocks
 from imulab.readers.selection import Selection, of_element, windowed
-from imulab.recording import Recording
+from imulab.recording import Recording, Source
 from imulab.records.calibration import Calibration
 
 Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mapping[str, ArrayLike]
@@ -64,6 +66,7 @@ class Reading(Sampling, total=False):
 
 _OF_ARRAYS = ("rate", "time", "unit", "units")
 _OF_FILES = ("layout", "topic", "instance")
+_TITLED = "a file says itself, by its titles or a layout"
 _EXPECTED = "a file name, a Recording, a data frame of pandas or polars, or arrays"
 
 
@@ -101,7 +104,7 @@ def as_recording(
     given = {key: value for key, value in reading.items() if value is not None}
     part = _part(given, called)
     if isinstance(data, str | os.PathLike):
-        _refuse(given, _OF_ARRAYS, called, "a file says itself, by its titles or a layout")
+        _refuse(given, _OF_ARRAYS, called, _TITLED)
         return read(os.fspath(data), **_of(given, _OF_FILES), **part)
     _refuse(given, _OF_FILES, called, "only files have that")
     if isinstance(data, Recording):
@@ -119,6 +122,24 @@ def as_recording(
         named = {"accel": samples} if columns is None else columns(samples)
     whole = {"rate": None, "unit": None, "units": None, **arrays, "name": "arrays"}
     return _cut(Recording(*columns_of_arrays({**_of(given, ("time",)), **named}, **whole), name="arrays"), **part)
+
+
+def as_blocks(
+    data: Data, reading: Mapping[str, Any] | Reading | Sampling, function: Callable[..., Any], name: str = "data"
+) -> tuple[Iterator[Recording], Source | None]:
+    """Return data in blocks, for what averages them, and the file that they are from; else as for `as_recording`."""
+    if not isinstance(data, str | os.PathLike):
+        whole = as_recording(data, reading, function, name=name)
+        return iter((whole,)), whole.source
+    check_keywords(reading, function)
+    given = {key: value for key, value in reading.items() if value is not None}
+    _refuse(given, _OF_ARRAYS, function.__name__, _TITLED)
+    part = _part(given, function.__name__)
+    path, source = Path(data), None
+    if path.is_file():
+        with path.open("rb") as stream:
+            source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
+    return read_blocks(path, **_of(given, _OF_FILES), **part), source
 
 
 def as_record(record: Calibration | str | os.PathLike[str], called: str) -> Calibration:

@@ -11,7 +11,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.frames import is_frame
-from imulab.procedures.inputs import Data, Reading, as_recording
+from imulab.procedures.inputs import Data, Reading, as_blocks
 from imulab.procedures.result import Result
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS
 from imulab.procedures.warmup.curves import Curves, make_curves
@@ -171,7 +171,8 @@ def fit_warmup(
 
 def _averaged(data: Data, reading: Mapping[str, Any]) -> Cycle:
     """Return one power cycle, averaged over bins of a second."""
-    return find_power_cycle(as_recording(data, reading, fit_warmup, name="cycles"))
+    blocks, source = as_blocks(data, reading, fit_warmup, name="cycles")
+    return find_power_cycle(blocks, source=source)
 
 
 def _covariance(curves: Curves, chosen: Judged, by_unit: bool) -> Array | None:
