@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from imulab._version import VERSION
-from imulab.cli import allan, array, centrifuge, convert, export, fleet, noise, records, tumble, warmup
+from imulab.cli import allan, array, centrifuge, convert, export, fleet, live, noise, records, tumble, warmup
 from imulab.cli.common import offer
 
 _SETTINGS: dict[str, Any] = {
@@ -40,6 +40,7 @@ _SUMMARIES = {
     "demo": "Run all procedures on simulated instruments.",
     "convert": "Write a recording of any kind as CSV or Parquet.",
     "export": "Write firmware, a blob, or another program's files.",
+    "live": "Guide a test while the unit is connected.",
     "allan": "Print Allan deviation and noise coefficients.",
     "tumble plan": "Choose the attitudes to measure.",
     "tumble simulate": "Simulate a recording of a tumble test.",
@@ -84,6 +85,7 @@ def command(arguments: Sequence[str] = ()) -> Any:
         app.command("convert")(convert.convert)
         app.command("export")(export.export)
         app.command("allan")(allan.allan)
+        app.command("live")(live.live)
     root: Any = typer.main.get_command(app)
     for path, summary in _SUMMARIES.items():
         found = root

@@ -162,7 +162,7 @@ class Stream:
 
     def _recognised(self, head: bytes) -> Decoder:
         """Return the decoder of a stream by its first bytes."""
-        if self._layout is not None:
+        if self._layout is not None and not self._layout.if_needed:
             return Laid(self._layout, self.counts)
         if looks_like_msp(head):
             return Msp(self.counts)
@@ -183,6 +183,8 @@ class Stream:
             return MotionCal(self.counts)
         if b"I" in kinds and _share(lines, lambda line: line[:2] in ("I,", "M,", "T,")) > 0.5:
             return XImu3(kinds, self.counts)
+        if self._layout is not None:
+            return Laid(self._layout, self.counts)
         raise self._unknown(head, [line for line in lines if line])
 
     def _unknown(self, head: bytes, lines: list[str]) -> UnknownFormatError:

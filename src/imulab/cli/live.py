@@ -1,0 +1,153 @@
+"""``imulab live``: a guided test while the unit is connected, from the plug to the record."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from imulab.cli.options import GivenFiles, LayoutFile, OutputFile, ReportFile, check_outputs, note, whole_number
+from imulab.errors import OptionError
+
+if TYPE_CHECKING:
+    from imulab.live.formats import UnknownFormatError
+    from imulab.live.runner import Runner
+    from imulab.readers.layout import Layout
+
+_WAIT = 0.05
+_EVERY = 0.1
+
+
+def live(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="serial:PORT[@BAUD] (serial: lists ports), udp:PORT, tcp:HOST:PORT, -, replay:FILE[@SPEED], "
+            "simulate[:key=value,..].",
+        ),
+    ],
+    save: Annotated[str | None, typer.Option("--save", metavar="REC.csv", help="Recording to write.")] = None,
+    output: OutputFile = None,
+    report: ReportFile = None,
+    gravity: Annotated[
+        str | None, typer.Option(metavar="G", help="Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002.")
+    ] = None,
+    latitude: Annotated[str | None, typer.Option(metavar="DEG", help="Latitude, deg, for normal gravity.")] = None,
+    height: Annotated[str | None, typer.Option(metavar="M", help="Height above the ellipsoid, m.")] = None,
+    order: Annotated[str, typer.Option(metavar="auto|0..5|blend", help="Order of the fit.")] = "auto",
+    target: Annotated[
+        str | None,
+        typer.Option(metavar='"bias 100 ug, .."', help="Standard uncertainties at which it is enough."),
+    ] = None,
+    attitudes: Annotated[
+        str | None, typer.Option(metavar="N", help="Number of attitudes, instead of a target.")
+    ] = None,
+    layout: LayoutFile = None,
+    plain: Annotated[bool, typer.Option("--plain", help="A line for each event; ends when it is enough.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file of --save.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", help="The simulated unit does what the guide says.")] = False,
+) -> None:
+    """Guide a tumble test of a unit that is connected: what to do next, when a hold is accepted, when it is enough.
+
+    The recording is written out every second; at its end the record is that of `imulab tumble fit` on it.
+    """
+    from imulab.cli.result import finish
+    from imulab.gravity import gravity_option
+    from imulab.live.formats import UnknownFormatError
+    from imulab.live.runner import Runner
+    from imulab.live.session import Session
+    from imulab.live.sources import open_source
+    from imulab.live.targets import read_targets
+    from imulab.procedures.registry import PROCEDURES
+    from imulab.procedures.run import FLAG, run_task
+
+    if source == "serial:":
+        _list_ports()
+        return
+    if save is None:
+        raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
+    texts = {"order": order, "gravity": gravity, "latitude": latitude, "height": height}
+    values = PROCEDURES["tumble"].task.values({key: text for key, text in texts.items() if text is not None}, FLAG)
+    planned = None if attitudes is None else whole_number(attitudes, "--attitudes")
+    if planned is not None and not 4 <= planned <= 200:
+        raise OptionError(f"--attitudes {planned}: expected 4 to 200")
+    if planned is not None and target is not None:
+        raise OptionError("--attitudes together with --target: expected one or the other")
+    session = Session(values["order"], gravity_option(gravity, latitude, height, FLAG), read_targets(target), planned)
+    replayed = [source.partition(":")[2].rpartition("@")[0] or source.partition(":")[2]]
+    check_outputs([save, output, report], [name for name in (*replayed, layout) if name])
+    known = _layout(layout)
+    runner = Runner.open(lambda: open_source(source, layout, follow=follow), session, save, known, resume=resume)
+    try:
+        (_plain if plain or not sys.stdout.isatty() else _drawn)(runner, typed=source != "-")
+    except UnknownFormatError as error:
+        _offer(error)
+        raise
+    finally:
+        runner.close()
+    record = run_task("tumble", [save], texts, GivenFiles())
+    finish(record, output, report, json=False)
+    note(f"the recording is {save}; imulab tumble fit {save} makes the same record")
+
+
+def _layout(name: str | None) -> Layout | None:
+    from dataclasses import replace
+
+    from imulab.readers.layout import IfNeeded, load_layout
+
+    if name is None:
+        return None
+    return replace(load_layout(str(name)), if_needed=True) if isinstance(name, IfNeeded) else load_layout(name)
+
+
+def _list_ports() -> None:
+    from imulab.live.sources import serial_ports
+
+    ports = serial_ports()
+    for port, what in ports:
+        print(f"serial:{port}  {what}")
+    if not ports:
+        print("no serial port on this machine")
+
+
+def _offer(error: UnknownFormatError) -> None:
+    """Show the first lines of an unknown stream, and a layout to start from."""
+    for line in error.lines:
+        print(f"  {line}", file=sys.stderr)
+    if error.guess is not None:
+        head = f"# A guess ({error.guess.why}); check it, save it as layout.toml, and add --layout layout.toml:"
+        print(f"{head}\n{error.guess.toml}", file=sys.stderr)
+
+
+def _plain(runner: Runner, *, typed: bool) -> None:
+    """Print a line for each event, until it is enough or the stream ends."""
+    while not runner.ended and not runner.session.enough:
+        for event in runner.step(_WAIT):
+            print(f"{event.time:8.1f} s  {event.text}", flush=True)
+
+
+def _drawn(runner: Runner, *, typed: bool) -> None:
+    """Draw the view until a person finishes or the stream ends."""
+    from time import monotonic
+
+    from rich.live import Live
+
+    from imulab.live.terminal import draw, keys, pressed
+
+    with keys(wanted=typed) as usable, Live(auto_refresh=False, transient=True) as screen:
+        drawn = 0.0
+        while not runner.ended and not (runner.session.enough and not usable):
+            events = runner.step(_WAIT)
+            key = pressed(usable)
+            if key == "q":
+                break
+            if key == "u":
+                events += runner.drop()
+            for event in events:
+                if event.kind in ("accepted", "knocked", "warning", "dropped", "enough"):
+                    screen.console.print(f"{event.time:8.1f} s  {event.text}", markup=False, highlight=False)
+            if events or monotonic() - drawn > _EVERY:
+                screen.update(draw(runner.session.view()), refresh=True)
+                drawn = monotonic()

@@ -1,0 +1,287 @@
+"""What the attitudes so far say, and which one to take next: the fit after each, and the plan of those to come."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import ImulabError, ObservabilityError
+from imulab.gravity import Gravity
+from imulab.live.targets import Target, predicted_share, share_of
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.fit import TumbleFit, fit_tumble
+from imulab.procedures.tumble.model import parameter_count, parameter_names
+from imulab.procedures.tumble.optimal import Search, information_rows
+from imulab.procedures.tumble.plan import MOST_ATTITUDES, plan_tumble
+from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
+from imulab.recording import Array, Recording
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+_USUAL_ORDER = 3
+"""The order that is planned for under ``auto``: its attitudes show what an order 2 would leave in the scale factors."""
+_MORE = 1.5
+"""Attitudes over parameters where neither a number nor a target is given."""
+_SPARE = 4
+"""Attitudes beyond the parameters without which a fit can neither tell a knocked one nor whether its order is right."""
+_NEAR = np.cos(np.radians(12.0))
+_FIVE = 5
+_LOWERS = 0.05
+_LONGEST = 10.0
+_ROUNDS = 4
+_GUESSED_NOISE = 1e-4
+_PRIOR = 1e-2
+"""Before they are measured, parameters are known to about this in units of g: enough to weigh one hold."""
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """An attitude that was accepted: mean output, covariance of the mean, times and length, s."""
+
+    number: int
+    mean: Array
+    covariance: Array
+    start: float
+    stop: float
+    seconds: float
+    dropped: bool = False
+
+
+@dataclass
+class Guide:
+    """The attitudes of a session and the plan of those to come.
+
+    Attributes
+    ----------
+    order
+        Of the fit, as `fit_tumble` takes it.
+    gravity
+        Local gravity, or None: that of the stream's head, or standard gravity.
+    targets
+        What the parameters are to be known to.
+    planned
+        Number of attitudes that the person wants, or None.
+    unit
+        Of the outputs.
+    metadata
+        Of the stream's head.
+    """
+
+    order: int | str = "auto"
+    gravity: Gravity | None = None
+    targets: tuple[Target, ...] = ()
+    planned: int | None = None
+    unit: str = "m/s^2"
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    attitudes: list[Attitude] = field(default_factory=list)
+    fit: TumbleFit | None = None
+    why_not: str = ""
+    _outstanding: Array = field(default_factory=lambda: np.empty((0, 3)))
+    _known: bool = False
+
+    @property
+    def kept(self) -> list[Attitude]:
+        """The attitudes that were not dropped."""
+        return [each for each in self.attitudes if not each.dropped]
+
+    @property
+    def model_order(self) -> int:
+        """The order that attitudes are planned for."""
+        return self.order if isinstance(self.order, int) else _USUAL_ORDER
+
+    @property
+    def local_gravity(self) -> float:
+        """Local gravity as far as it is known, m/s^2."""
+        if self.fit is not None:
+            return model_of(self.fit.calibration).gravity.value
+        return self.gravity.value if self.gravity else STANDARD_GRAVITY
+
+    @property
+    def one_g(self) -> float:
+        """Length of a reading at rest, in the unit of the outputs."""
+        if parse_unit(self.unit).quantity == "acceleration":
+            return from_si(self.local_gravity, self.unit)
+        lengths = [float(np.linalg.norm(each.mean)) for each in self.kept]
+        return float(np.median(lengths)) if lengths else 1.0
+
+    def accept(self, attitude: Attitude) -> None:
+        """Take an attitude, fit anew and plan what comes."""
+        self.attitudes.append(attitude)
+        self.refit()
+        direction = self.directions()[-1]
+        near = self._outstanding @ direction if len(self._outstanding) else np.empty(0)
+        if near.size and near.max() > _NEAR:
+            self._outstanding = np.delete(self._outstanding, int(np.argmax(near)), axis=0)
+        else:
+            self._known = False
+
+    def lengthen(self, attitude: Attitude) -> None:
+        """Put a longer hold of the last attitude in its place."""
+        self.attitudes[-1] = attitude
+
+    def drop(self, number: int) -> None:
+        """Do without an attitude."""
+        self.attitudes[number - 1] = replace(self.attitudes[number - 1], dropped=True)
+        self.refit()
+        self._known = False
+
+    def refit(self) -> None:
+        """Fit the attitudes that are kept."""
+        try:
+            self.fit, self.why_not = fit_tumble(self._as_found(), order=self.order, gravity=self.gravity), ""
+        except ImulabError as error:
+            self.fit, self.why_not = None, str(error)
+
+    def _as_found(self) -> Attitudes:
+        kept = self.kept
+        mean = np.array([each.mean for each in kept])
+        columns = {f"accel_{axis}": mean[:, k].copy() for k, axis in enumerate("xyz")}
+        recording = Recording(columns, dict.fromkeys(columns, self.unit), self.metadata, "live recording")
+        rows = np.arange(1.0, len(kept) + 1)
+        return Attitudes(
+            mean=mean,
+            covariance=np.array([each.covariance for each in kept]),
+            samples=np.ones(len(kept), dtype=np.int64),
+            start=rows,
+            stop=rows,
+            unit=self.unit,
+            recording=recording,
+        )
+
+    def directions(self) -> Array:
+        """Return the upward direction of the body in each attitude that is kept, shape (n, 3)."""
+        if not self.kept:
+            return np.empty((0, 3))
+        if self.fit is not None:
+            force = np.array(attitudes_of(self.fit.calibration).force)
+        else:
+            force = np.array([each.mean for each in self.kept])
+        directions: Array = force / np.linalg.norm(force, axis=1, keepdims=True)
+        return directions
+
+    def residuals(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Return ``|f| - g`` of each attitude that is kept, m/s^2, and whether it agrees with the others, (n,)."""
+        count = len(self.kept)
+        if self.fit is None:
+            return np.full(count, np.nan), np.ones(count, dtype=np.bool_)
+        return self.fit.residuals, self.fit.down_weights > 0
+
+    def noise(self) -> float:
+        """Return the noise of |f| in the usual attitude, in units of g, with the scatter beyond that of the holds."""
+        own = [self._own_noise(each.mean, each.covariance) for each in self.kept]
+        usual = float(np.median(own)) if own else _GUESSED_NOISE
+        return float(np.hypot(usual, self._excess()))
+
+    def _own_noise(self, mean: Array, covariance: Array) -> float:
+        up = mean / np.linalg.norm(mean)
+        return float(np.sqrt(up @ covariance @ up)) / self.one_g
+
+    def _excess(self) -> float:
+        if self.fit is None:
+            return 0.0
+        return float(fit_of(self.fit.calibration).excess.value) / self.local_gravity
+
+    def wants_longer(self, mean: Array, covariance: Array, seconds: float) -> bool:
+        """Return whether twice as long a hold would lower the standard uncertainty of some parameter by over 5 %.
+
+        The attitudes that are still to come count as if they were there, each with the usual noise.
+        """
+        if seconds >= _LONGEST:
+            return False
+        own, excess, usual = self._own_noise(mean, covariance), self._excess(), self.noise()
+        others = np.vstack([self.directions(), self.outstanding()])
+        rows = information_rows(others, self.model_order) / usual
+        row = information_rows((mean / np.linalg.norm(mean))[None], self.model_order)[0]
+        base = rows.T @ rows + np.eye(rows.shape[1]) / _PRIOR**2
+        now, longer = (
+            np.diag(np.linalg.inv(base + np.outer(row, row) / (own**2 / times + excess**2))) for times in (1.0, 2.0)
+        )
+        return bool(np.sqrt((longer / now).min()) < 1 - _LOWERS)
+
+    @property
+    def met(self) -> bool:
+        """Whether the targets are met, or, without any, the number of attitudes is reached."""
+        if self.targets:
+            enough = len(self.kept) >= parameter_count(self.model_order) + _SPARE
+            return enough and self.fit is not None and max(self.shares()) <= 1.0
+        return self.fit is not None and len(self.kept) >= self.wanted()
+
+    def shares(self) -> list[float]:
+        """Return the worst standard uncertainty over each target; infinite before a fit."""
+        if self.fit is None:
+            return [float("inf")] * len(self.targets)
+        return [share_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
+
+    def wanted(self) -> int:
+        """Return how many attitudes the session will need in all, as far as can be told."""
+        if self.planned is not None or not self.targets:
+            return self.planned or int(np.ceil(_MORE * parameter_count(self.model_order)))
+        return len(self.kept) + max(len(self.outstanding()), int(not self.met))
+
+    def outstanding(self) -> Array:
+        """Return the attitudes that are planned, shape (k, 3)."""
+        if not self._known:
+            self._known = True
+            self._outstanding = self._plan()
+        return self._outstanding
+
+    def _plan(self) -> Array:
+        there = self.directions()
+        spare = _SPARE if self.targets else 0
+        least = max(parameter_count(self.model_order) + spare - len(there), 1)
+        if self.planned is not None or not self.targets:
+            left = self.wanted() - len(there)
+            return self._planned(max(left, least), there) if left > 0 or least > 1 else np.empty((0, 3))
+        count, noise = max(least, 3), self.noise()
+        tried: dict[int, Array] = {}
+        for _ in range(_ROUNDS):
+            tried[count] = self._planned(count, there)
+            covariance = Search(self.model_order, "A", there).covariance(tried[count])
+            share = self._predicted(covariance, noise)
+            # Variances fall as the number of attitudes rises, in proportion.
+            need = int(np.ceil((count + len(there)) * share**2)) - len(there)
+            need = min(max(need, least), MOST_ATTITUDES)
+            if need in tried or need == count:
+                break
+            count = need
+        return tried[min(tried, key=lambda each: abs(each - need))]
+
+    def _predicted(self, covariance: Array, noise: float) -> float:
+        sizes = (noise * np.sqrt(np.diag(covariance))).tolist()
+        named = dict(zip(parameter_names(self.model_order), sizes, strict=True))
+        return max(predicted_share(target, named, self.local_gravity) for target in self.targets)
+
+    def _planned(self, count: int, there: Array) -> Array:
+        try:
+            return plan_tumble(attitudes=count, order=self.model_order, already=there).directions
+        except ObservabilityError:  # readings that no unit at rest has, as of a dead axis: a plan as if there were none
+            fewest = max(count, parameter_count(self.model_order))
+            return plan_tumble(attitudes=fewest, order=self.model_order).directions
+
+    def next_direction(self) -> Array | None:
+        """Return the upward direction to take next: of those planned the one that lowers the worst axis most."""
+        waiting = self.outstanding()
+        if not len(waiting):
+            if self.met:
+                return None
+            self._outstanding = waiting = self._planned(1, self.directions())
+        search = Search(self.model_order, "A", self.directions())
+        rows = information_rows(waiting, self.model_order)
+        variance = np.diag(search.covariance(np.empty((0, 3)))).reshape(-1, 3)
+        weight = (variance / variance.mean(axis=1, keepdims=True)).ravel()
+        best: Array = waiting[int(np.argmax(search.gain(rows, np.empty((0, rows.shape[1])), weight)))]
+        return best
+
+    def five_more(self) -> str:
+        """Say what five more attitudes would bring for the worst bias."""
+        if self.fit is None:
+            return ""
+        there = self.directions()
+        search = Search(self.model_order, "A", there)
+        more = self._planned(_FIVE, there)
+        now, then = (np.sqrt(np.diag(search.covariance(each))[:3].max()) for each in (np.empty((0, 3)), more))
+        worst = max(u for axis in "xyz" if (u := self.fit.calibration.parameters[f"bias_{axis}"].standard_uncertainty))
+        micro = 1e6 * worst / self.local_gravity
+        return f"five more would bring the worst bias from {micro:.3g} to about {micro * then / now:.3g} ug"

@@ -1,0 +1,126 @@
+"""A session with its source and its recording: what a terminal and a page run alike, a step at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from imulab.errors import ReadError
+from imulab.live.formats import Stream
+from imulab.live.recorder import Recorder
+from imulab.live.session import Event, Session
+from imulab.live.sources import Source
+from imulab.readers.layout import Layout
+from imulab.recording import Recording
+
+_SILENT = 3.0
+_BEFORE, _BEHIND = 1.0, 0.6
+"""What is cut out with an attitude that is dropped, s: the settling before it, and the moment of taking it up."""
+
+
+class Runner:
+    """Brings samples from the source to the session and the recording."""
+
+    def __init__(self, source: Source, session: Session, recorder: Recorder, layout: Layout | None = None) -> None:
+        self.source, self.session, self.recorder = source, session, recorder
+        self._stream = Stream(source.name, layout, polled=source.polled)
+        self._heard = source.now()
+        self._silent = False
+        session.source = source.name
+        for block in recorder.before():
+            session.feed(block)
+
+    @classmethod
+    def open(
+        cls, source: Callable[[], Source], session: Session, save: str, layout: Layout | None, *, resume: bool
+    ) -> Runner:
+        """Open the recording and the source; where the source cannot be opened no empty recording stays behind."""
+        recorder = Recorder(save, resume=resume)
+        try:
+            opened = source()
+            try:
+                return cls(opened, session, recorder, layout)
+            except BaseException:
+                opened.close()
+                raise
+        except BaseException:
+            recorder.close()
+            raise
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will come."""
+        return self.source.ended
+
+    def step(self, wait: float) -> list[Event]:
+        """Take what has come, after `wait` seconds at most, and return what happened.
+
+        Raises
+        ------
+        ReadError
+            The connection is lost, or the stream is none of the known; the recording so far is kept.
+        OptionError
+            The recording cannot be written on.
+        DataError
+            The stream is not one of an accelerometer triad.
+        """
+        events: list[Event] = []
+        arrived = self.source.get(wait)
+        for one in arrived:
+            blocks = [one.data] if isinstance(one.data, Recording) else self._stream.feed(one.data, one.time)
+            events += self._take(blocks, one.time)
+            self._answer()
+        now = self.source.now()
+        if not arrived:
+            events += self._take(self._stream.feed(b"", now), now)
+            self._answer()
+            self.recorder.tick(now)
+        if self.source.ended:
+            events += self._take(self._stream.finish(), now)
+        events += self._listen(bool(arrived), now)
+        if self.source.lost:
+            kept = len(self.session.guide.kept)
+            raise ReadError(
+                f"{self.source.lost} {self.recorder.path} keeps {kept} attitude{'s' * (kept != 1)}: --resume goes on "
+                "with it"
+            )
+        if self.session.state == "accepted" and not self.session.enough and self.session.next is not None:
+            self.source.turn_to(self.session.next)
+        return events
+
+    def drop(self) -> list[Event]:
+        """Drop the attitude that was named, or the last, from the session and from the recording."""
+        times = self.session.drop()
+        if times is not None:
+            self.recorder.cut(times[0] - _BEFORE, times[1] + _BEHIND)
+        return self.session.events
+
+    def close(self) -> None:
+        """End the source, and write out the recording."""
+        self.source.close()
+        self.recorder.close()
+
+    def _take(self, blocks: list[Recording], now: float) -> list[Event]:
+        events: list[Event] = []
+        for block in blocks:
+            lies = self.session.dropping
+            placed = self.recorder.placed(block)
+            events += self.session.feed(placed, self._stream.counts)
+            if not lies:  # in an attitude that was dropped nothing is recorded until it is left
+                self.recorder.write(placed, now)
+        return events
+
+    def _answer(self) -> None:
+        if self._stream.to_send:
+            self.source.send(self._stream.to_send)
+
+    def _listen(self, heard: bool, now: float) -> list[Event]:
+        """Say that nothing comes any more, or again."""
+        if heard:
+            self._heard = now
+            again, self._silent = self._silent, False
+            return [Event("again", "samples come again", self.recorder.last)] if again else []
+        if self._silent or now - self._heard < _SILENT or self.source.ended:
+            return []
+        self._silent = True
+        text = f"nothing has come from {self.source.name} for {_SILENT:.0f} s: is the unit on, and does it send?"
+        return [Event("warning", text, self.recorder.last)]

@@ -1,0 +1,281 @@
+"""A guided session: blocks of samples go in, events come out, and a view says at any moment what is to be seen.
+
+No clock, no thread and no file is in here: the same samples give the same events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from imulab.errors import DataError
+from imulab.gravity import Gravity
+from imulab.live.guide import Attitude, Guide
+from imulab.live.holds import SHORTEST, SURE, Hold, Moment, Stillness
+from imulab.live.stamps import Counts
+from imulab.live.targets import Target
+from imulab.live.view import Held, Known, View, in_words
+from imulab.live.warnings import Watch
+from imulab.procedures.reports import parameter_rows
+from imulab.recording import Array, Recording
+from imulab.units import to_si
+
+_ADVICE = {
+    "waiting": "waiting for samples",
+    "moving": "put the unit down",
+    "settling": "hands off",
+    "still": "hold still",
+}
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened at a time of the recording, s: its kind, for programs, and a sentence."""
+
+    kind: str
+    text: str
+    time: float
+
+
+@dataclass
+class Session:
+    """The state of a session.
+
+    Attributes
+    ----------
+    order, gravity, targets, planned
+        As for `Guide`.
+    source
+        What is shown as the source.
+    """
+
+    order: int | str = "auto"
+    gravity: Gravity | None = None
+    targets: tuple[Target, ...] = ()
+    planned: int | None = None
+    source: str = ""
+    state: str = "waiting"
+    events: list[Event] = field(default_factory=list)
+    _guide: Guide | None = None
+    _still: Stillness = field(default_factory=Stillness)
+    _watch: Watch = field(default_factory=Watch)
+    _counts: Counts = field(default_factory=Counts)
+    _format: str = ""
+    _samples: int = 0
+    _first: float | None = None
+    _time: float = 0.0
+    _reading: Array | None = None
+    _temperature: float | None = None
+    _seconds: float = 0.0
+    _accepted: Attitude | None = None
+    _dropping: bool = False
+    _next: Array | None = None
+    _enough: str = ""
+    _aside: frozenset[int] = frozenset()
+
+    def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
+        """Take samples, with what was wrong with the stream so far, and return what happened.
+
+        Raises
+        ------
+        DataError
+            They are no samples of an accelerometer triad over time.
+        """
+        self.events = []
+        if not len(block):
+            return []
+        times = block.time
+        if times is None or not all(f"accel_{axis}" in block for axis in "xyz"):
+            raise DataError(
+                f"{self.source or block.name}: expected time and accel_x accel_y accel_z, found "
+                f"{' '.join(block.columns)}"
+            )
+        if self._guide is None:
+            self._begin(block)
+        self._counts = counts or self._counts
+        self._first = float(times[0]) if self._first is None else self._first
+        self._time, self._samples = float(times[-1]), self._samples + len(block)
+        if "temperature" in block and block.units["temperature"] in ("degC", "K"):
+            self._temperature = float(to_si(float(block.column("temperature")[-1]), block.units["temperature"]))
+        self._warn([*self._watch.block(block, self._time), *self._watch.counts(self._counts, self._samples)])
+        for moment in self._still.feed(times, block.triad("accel")):
+            self._at(moment)
+        return self.events
+
+    @property
+    def guide(self) -> Guide:
+        """The attitudes and the plan; there once samples have come."""
+        if self._guide is None:
+            self._guide = Guide(self.order, self.gravity, self.targets, self.planned)
+        return self._guide
+
+    @property
+    def enough(self) -> bool:
+        """Whether the target is met."""
+        return bool(self._enough)
+
+    @property
+    def next(self) -> Array | None:
+        """The upward direction of the body to take next, shape (3,)."""
+        return self._next
+
+    @property
+    def dropping(self) -> bool:
+        """Whether the unit still lies in an attitude that was dropped."""
+        return self._dropping
+
+    def drop(self) -> tuple[float, float] | None:
+        """Drop the attitude that was named as knocked, or else the last; return its times, s, None without any."""
+        kept = self.guide.kept
+        if not kept:
+            return None
+        knocked = [each for each in kept if each.number in self._aside]
+        gone = (knocked or kept)[-1]
+        self.events = []
+        self.guide.drop(gone.number)
+        if self._accepted is gone and self.state in ("still", "accepted"):
+            self._dropping = True
+        self._say("dropped", f"attitude {gone.number} is dropped")
+        self._look()
+        self._plan()
+        return gone.start, gone.stop
+
+    def view(self) -> View:
+        """Return what is to be seen now."""
+        guide = self.guide
+        residuals, agree = guide.residuals()
+        directions = guide.directions()
+        held = tuple(
+            Held(each.number, tuple(up), None if np.isnan(off) else float(off), not good, each.seconds)
+            for each, up, off, good in zip(guide.kept, directions.tolist(), residuals, agree, strict=True)
+        )
+        known: tuple[Known, ...] = ()
+        if guide.fit is not None:
+            rows = parameter_rows(guide.fit.calibration)
+            known = tuple(Known(row.name, row.value, row.standard_uncertainty, row.unit) for row in rows)
+        seconds = self._time - (self._first or 0.0)
+        reading = self._reading
+        return View(
+            source=self.source,
+            format=self._format,
+            state=self.state,
+            advice=self._advice(),
+            seconds=seconds,
+            samples=self._samples,
+            rate=(self._samples - 1) / seconds if seconds > 0 else 0.0,
+            counts=Counts(**vars(self._counts)),
+            up=None if reading is None else tuple((reading / (np.linalg.norm(reading) or 1.0)).tolist()),
+            length=None if reading is None else float(np.linalg.norm(reading)),
+            unit=guide.unit,
+            temperature=self._temperature,
+            hold=self._seconds,
+            attitudes=held,
+            wanted=guide.wanted() if guide.kept else (guide.planned or 0),
+            parameters=known,
+            targets=tuple(zip((f"{t.stem} {t.text}" for t in self.targets), guide.shares(), strict=True)),
+            next=None if self._next is None else tuple(self._next.tolist()),
+            next_words="" if self._next is None else in_words(self._next),
+            enough=self._enough,
+            why_not=guide.why_not,
+            warnings=tuple(self._watch.said.values()),
+        )
+
+    def _begin(self, block: Recording) -> None:
+        guide = self.guide
+        guide.unit, guide.metadata = block.triad_unit("accel"), block.metadata
+        self._format = block.metadata.get("format", "")
+        rate = f", {self._format}" if self._format else ""
+        self._say("format", f"{self.source or block.name}{rate}: {' '.join(block.columns)}")
+        self._plan()
+
+    def _at(self, moment: Moment) -> None:
+        """Take a tenth of a second."""
+        self._reading, self._time = moment.mean, moment.time
+        self._warn(self._watch.moment(moment))
+        if moment.ended is not None:
+            self._ended(moment.ended)
+        state = moment.state
+        if state != "still":
+            self._dropping = self._dropping and state == "settling"
+            self._seconds = 0.0
+        hold = moment.hold
+        if hold is not None:
+            self._seconds = hold.seconds
+            if self._accepted is not None and self._accepted.start == hold.start:
+                state = "accepted"
+            elif not self._dropping and hold.blocks >= SURE:
+                self._warn(self._watch.hold(hold, self.guide.unit, self.guide.local_gravity))
+                if not self.guide.wants_longer(hold.mean, hold.covariance, hold.seconds):
+                    self._accept(hold)
+                    state = "accepted"
+        if state != self.state:
+            self.state = state
+            self._say("state", self._advice())
+
+    def _ended(self, hold: Hold) -> None:
+        """Take a hold that has ended: any that is long enough counts, and the last is known as well as it lasted."""
+        last = self._accepted
+        if last is not None and last.start == hold.start:
+            if not last.dropped and self.guide.attitudes[-1] is last:
+                self._accepted = self._attitude(last.number, hold)
+                self.guide.lengthen(self._accepted)
+        elif hold.blocks >= SHORTEST and not self._dropping:
+            self._accept(hold)
+
+    def _accept(self, hold: Hold) -> None:
+        number = len(self.guide.attitudes) + 1
+        self._accepted = self._attitude(number, hold)
+        self.guide.accept(self._accepted)
+        self._say("accepted", f"attitude {number} accepted after {hold.seconds:.1f} s")
+        self._look()
+        self._plan()
+
+    def _attitude(self, number: int, hold: Hold) -> Attitude:
+        return Attitude(number, hold.mean, hold.covariance, hold.start, hold.stop, hold.seconds)
+
+    def _look(self) -> None:
+        """Name the attitudes that disagree with the others."""
+        residuals, agree = self.guide.residuals()
+        aside = {e.number: off for e, off, good in zip(self.guide.kept, residuals, agree, strict=True) if not good}
+        for number, off in aside.items():
+            if number not in self._aside:
+                milli = 1e3 * off / self.guide.local_gravity
+                self._say(
+                    "knocked",
+                    f"attitude {number} is off by {milli:+.2g} mg: knocked? put it down again, or press u to drop it",
+                )
+        self._aside = frozenset(aside)
+
+    def _plan(self) -> None:
+        guide, was = self.guide, self._enough
+        if guide.met:
+            self._enough = f"enough: {guide.five_more()}"
+            self._next = guide.next_direction()
+            if not was:
+                self._say("enough", self._enough)
+            return
+        self._enough = ""
+        self._next = guide.next_direction()
+        if self._next is not None:
+            left = guide.wanted() - len(guide.kept)
+            self._say("next", f"next: {in_words(self._next)} ({max(left, 1)} to go)")
+
+    def _advice(self) -> str:
+        if self._dropping:
+            return "dropped: turn the unit to the next attitude"
+        if self.state == "accepted":
+            if self._enough or self._next is None:
+                return self._enough or "accepted"
+            return f"accepted; turn it: {in_words(self._next)}"
+        if self.state == "moving" and self._next is not None:
+            return f"turn it: {in_words(self._next)}, and put it down"
+        return _ADVICE[self.state]
+
+    def _warn(self, texts: Sequence[str]) -> None:
+        for text in texts:
+            self._say("warning", text)
+
+    def _say(self, kind: str, text: str) -> None:
+        self.events.append(Event(kind, text, self._time))

@@ -1,0 +1,136 @@
+"""What the guide saves: attitudes until the worst bias is known, against random ones and against a plan made before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from imulab.gravity import Gravity
+from imulab.live.guide import Attitude, Guide
+from imulab.live.targets import Target, read_targets, share_of
+from imulab.procedures.tumble.plan import plan_tumble
+from imulab.procedures.tumble.simulate import simulate_tumble
+from imulab.units import STANDARD_GRAVITY as G
+
+BIAS = Target("bias", 100e-6 * G, "100 ug")
+NOISE = 120e-6 * G
+MOST = 80
+
+
+class Unit:
+    """A unit of the simulator, put down where one likes; noise of the means as stated."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        head = simulate_tumble(attitudes=2, order=2, seed=seed, gravity=G).metadata
+        self.truth = {key.removeprefix("truth_"): float(text) for key, text in head.items() if key[:6] == "truth_"}
+
+    def at(self, up: np.ndarray, number: int) -> Attitude:
+        # The equations of methods/tumble.md: s = T f, A = s + k2 s^2, M = S (A + b).
+        t = self.truth
+        f = G * up
+        s = np.array(
+            [
+                f[0],
+                t["misalignment_yx"] * f[0] + f[1],
+                t["misalignment_zx"] * f[0] + t["misalignment_zy"] * f[1] + f[2],
+            ]
+        )
+        each = [(t[f"scale_factor_{a}"], t[f"bias_{a}"], t[f"k2_{a}"]) for a in "xyz"]
+        mean = np.array([scale * (x + k2 * x**2 + b) for x, (scale, b, k2) in zip(s, each, strict=True)])
+        mean += NOISE * self.rng.standard_normal(3)
+        return Attitude(number, mean, NOISE**2 * np.eye(3), 5.0 * number, 5.0 * number + 3, 3.0)
+
+    def anywhere(self) -> np.ndarray:
+        up = self.rng.standard_normal(3)
+        return up / np.linalg.norm(up)
+
+
+def attitudes_needed(seed: int, *, guided: bool) -> int:
+    unit, guide = Unit(seed), Guide(2, Gravity(G, "test"), (BIAS,))
+    for number in range(1, MOST):
+        up = guide.next_direction() if guided else unit.anywhere()
+        if up is None:
+            up = unit.anywhere()
+        guide.accept(unit.at(up, number))
+        if guide.fit is not None and share_of(BIAS, guide.fit.calibration, G) <= 1:
+            return number
+    return MOST
+
+
+PLANS: dict[int, np.ndarray] = {}
+
+
+def attitudes_planned(seed: int) -> int:
+    """The least number of attitudes, planned for that number before the session, that gets the unit's bias to it."""
+    for count in range(12, MOST):
+        if count not in PLANS:
+            PLANS[count] = plan_tumble(attitudes=count, order=2).directions
+        unit, guide = Unit(seed), Guide(2, Gravity(G, "test"), (BIAS,))
+        for number, up in enumerate(PLANS[count], start=1):
+            guide.attitudes.append(unit.at(up, number))
+        guide.refit()
+        if guide.fit is not None and share_of(BIAS, guide.fit.calibration, G) <= 1:
+            return count
+    return MOST
+
+
+def hold_to_the_promise(units: int) -> None:
+    guided = np.array([attitudes_needed(seed, guided=True) for seed in range(1, units + 1)])
+    wild = np.array([attitudes_needed(seed, guided=False) for seed in range(1, units + 1)])
+    planned = np.array([attitudes_planned(seed) for seed in range(1, units + 1)])
+    print(f"guided {guided.mean():.1f}, random {wild.mean():.1f}, planned {planned.mean():.1f}")
+    assert guided.mean() <= 0.75 * wild.mean()
+    assert guided.mean() <= 1.1 * planned.mean()
+
+
+def test_the_guide_saves_a_quarter_of_the_attitudes():
+    hold_to_the_promise(3)
+
+
+@pytest.mark.slow
+def test_the_guide_saves_a_quarter_of_the_attitudes_of_many_units(reduced):
+    hold_to_the_promise(5 if reduced else 20)
+
+
+def test_an_attitude_put_down_elsewhere_counts_and_is_planned_around():
+    unit, guide = Unit(7), Guide(1, Gravity(G, "test"), planned=13)
+    for number in range(1, 14):
+        up = guide.next_direction()
+        guide.accept(unit.at(unit.anywhere() if number in (3, 6) else up, number))
+    assert guide.met
+    assert guide.next_direction() is None
+
+
+def test_a_dropped_attitude_is_out_of_the_fit():
+    unit, guide = Unit(8), Guide(1, Gravity(G, "test"), planned=16)
+    for number in range(1, 15):
+        attitude = unit.at(guide.next_direction(), number)
+        if number == 9:
+            attitude = Attitude(9, attitude.mean * 1.02, attitude.covariance, 0.0, 3.0, 3.0)
+        guide.accept(attitude)
+    agree = guide.residuals()[1]
+    assert np.flatnonzero(~agree).tolist() == [8]
+    guide.drop(9)
+    assert guide.residuals()[1].all()
+    assert len(guide.directions()) == 13
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("bias", "expected a list such as"),
+        ("bais 100 ug", "did you mean 'bias'"),
+        ("bias 100 ppm", "acceleration"),
+        ("scale_factor -5 ppm", "above 0"),
+    ],
+)
+def test_targets_that_cannot_be_are_refused(text, said):
+    with pytest.raises(Exception, match=said):
+        read_targets(text)
+
+
+def test_targets_are_read():
+    bias, scale = read_targets("bias 100 ug, scale_factor 200 ppm")
+    assert (bias.stem, scale.stem) == ("bias", "scale_factor")
+    np.testing.assert_allclose([bias.value, scale.value], [100e-6 * G, 200e-6])
