@@ -51,8 +51,8 @@ def plan_tumble(
     attitudes
         Number of attitudes to choose.
     noise
-        Of |f| in one attitude: m/s^2, or a text such as ``"20ug"``; or the recording or record, or its file, that has
-        it.
+        Of ``|f|`` in one attitude: m/s^2, or a text such as ``"20ug"``; or the recording or record, or its file, that
+        has it.
     order
         Order of the model, 0 to 5; attitudes for order 3 show what an order 2 would silently leave in scale factors.
     criterion
