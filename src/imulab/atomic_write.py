@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, file_name
 
 _UMASK = threading.Lock()
 
@@ -23,7 +23,7 @@ def real_path(path: str | Path) -> Path:
     OptionError
         The links go round in a circle.
     """
-    found = Path(os.path.realpath(path))
+    found = Path(os.path.realpath(file_name(path)))
     if found.is_symlink():
         raise OptionError(f"{path}: cannot be written: too many levels of symbolic links")
     return found

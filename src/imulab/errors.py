@@ -6,6 +6,7 @@ found. The command line prints the message alone and exits with 2.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 
 
@@ -37,6 +38,19 @@ def meant(known: Iterable[str], found: object, alike: float = 0.6) -> str:
     names = {name.lower(): name for name in known}
     close = get_close_matches(str(found).lower(), names, n=1, cutoff=alike)
     return f"; did you mean {names[close[0]]!r}?" if close else ""
+
+
+def file_name(value: object) -> str | os.PathLike[str]:
+    """Return the name of a file.
+
+    Raises
+    ------
+    OptionError
+        It is something else.
+    """
+    if isinstance(value, str | os.PathLike):
+        return value
+    raise OptionError(f"expected the name of a file, found {quoted(value)}")
 
 
 class ImulabError(Exception):

@@ -157,6 +157,8 @@ def columns_of_frame(
     OptionError
         Time is stated twice.
     """
+    if not is_frame(frame):
+        raise DataError(f"expected a data frame of pandas or polars, found {quoted(frame)}")
     where = "a title such as '{name} [{unit}]', or units={{'{sensor}': '{unit}'}}"
     found = Units(name, units or {}, unit, where)
     titles = {original: _joined(original) for original in frame.columns}

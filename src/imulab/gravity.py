@@ -7,11 +7,12 @@ Source: NIMA TR8350.2 (World Geodetic System 1984), third edition, equations 4-1
 from __future__ import annotations
 
 import math
+import numbers
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, quoted
 from imulab.quantities import quantity
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.verdict import Note
@@ -87,8 +88,12 @@ def local_gravity(given: float | str | Gravity | None, recording: Recording) -> 
         )
     elif isinstance(given, str):
         local = stated_gravity(given, "gravity")
+    elif isinstance(given, Gravity):
+        local = given
+    elif isinstance(given, numbers.Real):
+        local = Gravity(float(given), "argument")
     else:
-        local = given if isinstance(given, Gravity) else Gravity(float(given), "argument")
+        raise OptionError(f"gravity {quoted(given)}: expected a number, m/s^2, or a text such as '9.81362+-0.00002'")
     _check_possible(local.value)
     return local
 
@@ -258,6 +263,9 @@ def normal_gravity(latitude: float, height: float = 0.0) -> float:
     >>> [round(il.normal_gravity(at, height), 5) for at, height in zip(latitudes, (0.0, 0.0, 1000.0))]
     [9.78033, 9.83218, 9.80311]
     """
+    for called, value in (("latitude", latitude), ("height", height)):
+        if not isinstance(value, numbers.Real):
+            raise OptionError(f"{called} {quoted(value)}: expected a number, in rad and m")
     if not abs(latitude) <= math.pi / 2 * (1 + 1e-12):
         raise OptionError(f"latitude {math.degrees(latitude):g} deg: expected -90 to 90 deg")
     if not -500.0 <= height <= 10000.0:

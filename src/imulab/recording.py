@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.columns import check_unit, element_number, expected_quantities
-from imulab.errors import DataError, UnitError
+from imulab.errors import DataError, UnitError, quoted
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
@@ -69,6 +69,9 @@ class Recording:
     corrected_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for what in ("columns", "units", "metadata"):
+            if not isinstance(getattr(self, what), Mapping):
+                raise DataError(f"{what}: expected a mapping from names, found {quoted(getattr(self, what))}")
         lengths = {len(column) for column in self.columns.values()}
         if len(lengths) > 1:
             raise DataError(f"{self.name}: columns of different length: {sorted(lengths)}")

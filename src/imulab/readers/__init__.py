@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from imulab.errors import ImulabError, ReadError, UnitError
+from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import IfNeeded, Layout, load_layout
 from imulab.readers.selection import Selection, of_element, windowed
@@ -282,7 +282,7 @@ def is_pipe(file: str | Path) -> bool:
 
 def _name(file: str | Path) -> str:
     """What messages and records call a file; bytes that are no UTF-8 are written as escapes."""
-    return "standard input" if str(file) == "-" else os.fsencode(file).decode("utf-8", "backslashreplace")
+    return "standard input" if str(file) == "-" else os.fsencode(file_name(file)).decode("utf-8", "backslashreplace")
 
 
 def _layout(layout: str | Path | Layout | None) -> Layout | None:

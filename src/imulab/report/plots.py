@@ -15,7 +15,7 @@ from typing import Any, overload
 from uuid import uuid4
 
 from imulab.atomic_write import replacing, write_text
-from imulab.errors import OptionError, listed
+from imulab.errors import OptionError, file_name, listed
 from imulab.report import json_for_script, render_page
 from imulab.report.elements import INK, Exhibits, Figure
 
@@ -146,7 +146,7 @@ class Plots(Sequence[Plot]):
 
 def _kind(path: str | Path) -> str:
     """Return the ending of a name that a figure can be saved under."""
-    kind = Path(path).suffix.lower().removeprefix(".")
+    kind = Path(file_name(path)).suffix.lower().removeprefix(".")
     if kind not in ("html", *PICTURES):
         raise OptionError(f"{path}: expected a name that ends in .html, .png, .svg or .pdf")
     return kind

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from imulab.atomic_write import replacing
-from imulab.errors import OptionError
+from imulab.errors import DataError, OptionError, file_name, quoted
 from imulab.recording import CORRECTED_BY, Recording
 from imulab.writers.decimals import decimal_rows
 
@@ -31,7 +31,7 @@ def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
     OptionError
         The name ends in neither .csv nor .parquet, or the file cannot be written there.
     """
-    kind = Path(path).suffix.lower()
+    kind = Path(file_name(path)).suffix.lower()
     if kind not in (".csv", ".parquet"):
         raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv or .parquet")
     with replacing(path) as stream:
@@ -68,7 +68,7 @@ def write_csv(blocks: Recording | Iterable[Recording], path: str | Path) -> None
     >>> len(il.read("recording.csv")) > 0
     True
     """
-    if Path(path).suffix.lower() != ".csv":
+    if Path(file_name(path)).suffix.lower() != ".csv":
         raise OptionError(f"{path}: cannot write this kind of file; expected a name that ends in .csv")
     write(blocks, path)
 
@@ -127,7 +127,10 @@ def _pyarrow() -> Any:
 
 
 def _several(blocks: Recording | Iterable[Recording]) -> Iterator[Recording]:
-    yield from [blocks] if isinstance(blocks, Recording) else blocks
+    for block in [blocks] if isinstance(blocks, Recording) else blocks:
+        if not isinstance(block, Recording):
+            raise DataError(f"expected a Recording to write, found {quoted(block)}")
+        yield block
 
 
 def _title(name: str, unit: str) -> str:

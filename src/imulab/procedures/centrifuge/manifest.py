@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from imulab.errors import ReadError, UnitError
+from imulab.errors import ReadError, UnitError, file_name
 from imulab.procedures.centrifuge.entries import Window, example, overlap, quantity_of, window_of, window_text
 from imulab.procedures.centrifuge.model import specific_force
 from imulab.quantity_entries import check_keys, number_of, scale_factor_of, unit_of
@@ -109,7 +109,7 @@ def load_manifest(path: str | Path, name: str | None = None) -> Manifest:
     UnitError
         A unit is unknown or of another quantity.
     """
-    name = name or str(path)
+    name = name or str(file_name(path))
     table = load_toml(path, name, "manifest")
     return parse_manifest(table, name)
 
