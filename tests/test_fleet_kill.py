@@ -248,7 +248,7 @@ def test_a_lost_scheduler_is_said_in_one_line(cluster, tmp_path):
     _, error = process.communicate(timeout=90)
     assert process.returncode == 2
     assert error.count("\n") == 1
-    assert f"imulab: scheduler {cluster.address}: the connection is lost" in error
+    assert f"imulab: --scheduler {cluster.address}: the connection is lost" in error
 
 
 def test_a_scheduler_without_workers_is_said(cluster, fleet, tmp_path):
@@ -256,7 +256,7 @@ def test_a_scheduler_without_workers_is_said(cluster, fleet, tmp_path):
     process = on(cluster, fleet, tmp_path / "out")
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert error == f"imulab: scheduler {cluster.address}: has no workers (waited 10 s)\n"
+    assert error == f"imulab: --scheduler {cluster.address}: has no workers (waited 10 s)\n"
     assert time.monotonic() - begin < 45
     assert not (tmp_path / "out").exists()
 
@@ -272,7 +272,7 @@ def test_an_unreachable_scheduler_is_reported_with_its_address(fleet, tmp_path, 
     _, error = process.communicate(timeout=60)
     assert process.returncode == 2
     assert error.count("\n") == 1
-    assert error.startswith(f"imulab: scheduler {address}: cannot be reached")
+    assert error.startswith(f"imulab: --scheduler {address}: cannot be reached")
     assert time.monotonic() - begin < 45
     assert not (tmp_path / "out").exists()
 

@@ -137,7 +137,7 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
 
 def _fitted(column: dict[str, Any], factor: float, name: str, colour: str) -> list[dict[str, Any]]:
     """The Allan deviation of the model, where there is one."""
-    known = [(t, d) for t, d in zip(column["tau"], column["fitted"] or [], strict=False) if d is not None]
+    known = [(t, d) for t, d in zip(column["tau"], column.get("fitted") or [], strict=False) if d is not None]
     if not known:
         return []
     tau, deviation = np.array(known).T
