@@ -13,7 +13,6 @@ import imulab as il
 from imulab.cli.show import describe_blob, describe_record
 from imulab.device.blob import make_blob
 from imulab.errors import ImulabError, RecordError
-from imulab.exporters import ExportOptions
 from imulab.procedures.changes import compare_records
 from imulab.procedures.gyro_array.simulate import simulate_array
 from imulab.procedures.loading import load_any, loads
@@ -133,7 +132,7 @@ def test_a_mutated_record_works_or_is_refused_in_words(procedure, real, tmp_path
         for method in ("robust", "covariance", "kalman") if procedure == "gyro_array" else ():
             tried(il.fuse, recording, il.FuseOptions(method=method, calibration=forged))
         for target in ("px4", "ardupilot", "kalibr", "openvins", "ros") if procedure == "tumble" else ():
-            tried(il.export, target, [forged], tmp_path / target, options=ExportOptions(lossy=True))
+            tried(il.export, target, [forged], tmp_path / target, lossy=True)
     assert loaded >= 10
 
 

@@ -227,7 +227,7 @@ def test_a_fixed_order_states_its_leave_one_out_error():
         ({"gravity": 0.0}, "gravity 0: expected 0.5 to 50"),
         ({"gravity": -9.8}, "gravity -9.8: expected 0.5 to 50"),
         (
-            {"hold": 3600.0, "sample_rate": 1e5},
+            {"hold": 3600.0, "rate": 1e5},
             r"8\.64e\+09 samples of all attitudes together: expected at most 1e\+07",
         ),
         ({"hold": 0.1}, "hold 0.1: expected 0.5 to 3600"),
