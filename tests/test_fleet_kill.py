@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -132,6 +133,20 @@ def test_an_interrupt_of_the_terminal_ends_all_processes_without_a_word(fleet, r
     done = command("fleet", "run", fleet, "-o", folder, "--workers", 2)
     assert done.communicate()[1] == ""
     check_complete(folder, reference, before)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
+def test_no_process_of_a_run_hears_an_interrupt(fleet, tmp_path):
+    """Held back before they start: one that is still starting would end with a traceback."""
+    process = command("fleet", "run", fleet, "-o", tmp_path / "out", "--workers", 2)
+    wait_for(lambda: list((tmp_path / "out").glob("*.json")))
+    held_back = []
+    for worker in workers_of(process.pid):
+        status = Path(f"/proc/{worker}/status").read_text()
+        held_back.append(int(re.search(r"SigBlk:\s*(\w+)", status)[1], 16) >> (signal.SIGINT - 1) & 1)
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert held_back == [1, 1]
 
 
 def test_two_runs_at_once_the_second_is_refused(fleet, tmp_path):

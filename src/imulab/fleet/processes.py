@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing import resource_tracker
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -57,8 +58,10 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
         "loky", n_jobs=max(2, processes), inner_max_num_threads=1, initializer=_begin, initargs=(os.getpid(),)
     )
     try:
-        with config, Parallel(return_as="generator_unordered", max_nbytes=None) as parallel, ExitStack() as stack:
-            with _no_interrupts():
+        with ExitStack() as stack:
+            with _no_interrupts():  # joblib starts processes and threads as soon as it is entered
+                stack.enter_context(config)
+                parallel = stack.enter_context(Parallel(return_as="generator_unordered", max_nbytes=None))
                 results = parallel(delayed(function)(*call) for call in calls)
                 stack.callback(_close, results)
             for result in results:  # noqa: UP028 - `yield from` would close them too, with a warning
@@ -83,6 +86,8 @@ def _no_interrupts() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
+    # Python's own helper process lets interrupts through again where it is started after they were held back.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
