@@ -91,7 +91,7 @@ SCENARIOS = [
     _row("behind a low-pass filter of 42 Hz", "", "correlated from sample to sample", corner=42.0),
     _row("behind a low-pass filter of 5 Hz", "", "correlated from sample to sample", corner=5.0),
     _row("a line of five sigma at 17.3 Hz, taken out", "line", "spectral lines"),
-    _row("irregular sway of 0.2 deg/s: no number for B", "sway", "not that of white noise", trials=20),
+    _row("irregular sway of 0.2 deg/s: no number for B", "sway", "not that of the model", trials=20),
     _row("steps of six sigma: no number", "coarse", "steps that are", states=False, trials=30),
     _row("milliseconds labelled s", "ms as s", "unit of time", states=False, trials=20),
     _row("the rate doubles after a third", "rate", "sampling rate changes", trials=60),

@@ -67,16 +67,6 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
         Fewer than 3 samples, or samples that are not finite.
     OptionError
         `taus` or `rate` cannot be used.
-
-    Examples
-    --------
-    Readings that alternate by 1 differ by 2 from one to the next, and not at all in pairs:
-
-    >>> import numpy as np
-    >>> import imulab as il
-    >>> curve = il.allan_deviation(np.tile([1.0, -1.0], 8), rate=10.0, taus=np.array([0.1, 0.2]))
-    >>> curve.tau.tolist(), [round(float(each), 6) for each in curve.deviation]
-    ([0.1, 0.2], [1.414214, 0.0])
     """
     data = np.asarray(samples, dtype=np.float64)
     if data.ndim != 1 or len(data) < _FEWEST:

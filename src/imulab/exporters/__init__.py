@@ -61,26 +61,7 @@ def export(
 ) -> list[Path]:
     """Write records in the form of another program.
 
-    Parameters
-    ----------
-    target
-        One of `EXPORTERS`.
-    records
-        The unit's records.
-    folder
-        Where to; made where it is not there.
-
-    Returns
-    -------
-    list
-        The files written.
-
-    Raises
-    ------
-    OptionError
-        An unknown target, or one that cannot hold the records; nothing is written then.
-    RecordError
-        A record lacks what is needed.
+    Arguments, result and what is raised are those of `imulab.export`, the options in one value.
     """
     if target not in EXPORTERS:
         raise OptionError(f"unknown target {target!r}; known targets: {listed(EXPORTERS, target)}")

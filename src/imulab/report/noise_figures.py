@@ -96,6 +96,7 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
     """Return the Allan curves of columns of one unit, as `imulab.estimation.column_noise.analyse` found them."""
     unit, factor = shown_unit(columns[names[0]]["unit"], "bias_instability")
     traces: list[dict[str, Any]] = []
+    fitted: list[dict[str, Any]] = []
     lowest: list[tuple[float, float, str]] = []
     for k, name in enumerate(names):
         column = columns[name]
@@ -112,7 +113,7 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
                     line={"color": _COLOURS[k], "dash": DASHES[k]}, marker={"symbol": SYMBOLS[k], "size": 6},
                     hovertemplate=f"{name}<br>%{{x:.3g}} s: %{{y:.3g}} {unit}<extra></extra>"),
         ]  # fmt: skip
-        traces += _fitted(column, factor, name, _COLOURS[k])
+        fitted += _fitted(column, factor, name, _COLOURS[k])
     message = "All samples are the same."
     if lowest:
         level, at_time, which = min(lowest)
@@ -122,10 +123,10 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
         title=f"Allan deviation, {', '.join(names)}",
         message=message,
         caption="Deviation between neighbouring means over the averaging time. Shaded: 95 % interval, "
-        "wide on the right where there are few averages. Dotted: the model that the coefficients are of. "
-        "Slope −1/2: white noise. Flat: bias instability. Slope "
-        "+1/2: a random walk of the zero.",
-        traces=traces,
+        "wide on the right where there are few averages. "
+        + ("Dotted: the model that the coefficients are of. " if fitted else "")
+        + "Slope −1/2: white noise. Flat: bias instability. Slope +1/2: a random walk of the zero.",
+        traces=traces + fitted,
         layout={
             "xaxis": {**log, "title": {"text": "averaging time, s"}},
             "yaxis": {**log, "title": {"text": f"Allan deviation, {unit}"}, "automargin": True},

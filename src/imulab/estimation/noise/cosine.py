@@ -24,7 +24,6 @@ _MEANS = 1 << 21
 _SHARE = 32
 """Of the means' frequencies only the lowest 32nd is used: averaging takes .08 % from a slow noise at its end."""
 SLOW = 1 << 19
-_LONG = 1 << 18  # samples up to which loading scipy takes longer than its transform saves
 
 
 @dataclass(frozen=True)
@@ -89,10 +88,6 @@ def cosine_coefficients(samples: Array) -> Array:
     ['1.9598', '0.5000', '0.8118']
     """
     centred, n = samples - samples.mean(), len(samples)
-    if n > _LONG:
-        from scipy.fft import dct
-
-        return np.asarray(dct(centred, norm="ortho", overwrite_x=True))[1:]
     # Even samples, then odd ones backwards: their Fourier transform, turned, is the cosine transform.
     turned = np.fft.rfft(np.concatenate([centred[::2], centred[1::2][::-1]]))
     turned *= np.exp(-0.5j * np.pi / n * np.arange(len(turned)))

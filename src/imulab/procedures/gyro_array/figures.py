@@ -82,9 +82,9 @@ def _elements_table(record: ArrayRecord) -> ReportTable:
     return ReportTable(
         title="Elements",
         caption="Value ± standard uncertainty. Bias is the plain mean at rest, the part that all share (Earth rate "
-        "too) included. Angle random walk (ARW), bias instability and rate random walk (RRW) are read from the Allan "
-        "curves below; 0 ± u means that the recording is too short or the effect too small to be seen, not determined "
-        "that the curve is not that of such noises (the warnings say why).",
+        "too) included. Angle random walk (ARW), bias instability and rate random walk (RRW) are those of the noise "
+        "model whose Allan curves are below; 0 ± u means that the recording is too short or the effect too small to be "
+        "seen, not determined that the noise is not that of the model (the warnings say why).",
         columns=[
             "gyro",
             "bias, deg/s",

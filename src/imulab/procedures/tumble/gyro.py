@@ -113,37 +113,8 @@ def fit_gyro(
 ) -> GyroFit:
     """Calibrate a gyroscope triad from the turns between static attitudes.
 
-    Parameters
-    ----------
-    record
-        Tumble record of the accelerometers.
-    attitudes
-        From `find_attitudes` on the accelerometers' recording.
-    recording
-        Columns ``time`` and ``gyro_x``, ``_y``, ``_z`` on the same clock; may be the accelerometers' own recording.
-    fit_bias
-        Fit the biases to the turns too, instead of taking them from the outputs at rest.
-    sensitivity
-        Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the outputs at rest show it and
-        the turns miss less with it.
-    clock
-        Relative standard uncertainty of the rate of the clock: common to the three scale factors.
-    clock_of
-        Whose time counts where the two triads have clocks of their own: ``gyro``, or ``accel``: the gyroscopes' is
-        carried over to it.
-
-    Raises
-    ------
-    RecordError
-        The record is no tumble record.
-    SegmentError
-        Fewer than eight turns between attitudes.
-    DataError
-        The columns are missing or not finite, or the gyroscopes do not turn as gravity does.
-    ObservabilityError
-        The turns cannot separate the parameters.
-    OptionError
-        `sensitivity`, `clock` or `clock_of` has a value that cannot be.
+    The options and what is raised are those of `imulab.fit_gyro`; `attitudes` are of the accelerometers' recording, and
+    `recording`, which may be the same, has ``time`` and ``gyro_x``, ``_y``, ``_z`` on the same clock.
     """
     _check_request(record, attitudes, sensitivity, clock, clock_of)
     unit = recording.triad_unit("gyro")
