@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -125,6 +126,24 @@ def test_memory_that_one_unit_has_used_is_kept_for_the_next():
     (kept,) = processes.run(faults_of_a_second_use, [()], 1)
     pages = 5 * (3 << 20) // resource.getpagesize()
     assert kept < 0.05 * pages
+
+
+def test_what_is_ended_in_vain_ends_without_a_word(capfd):
+    """As joblib's thread does now and then, which looks for work that has just been dropped."""
+
+    def results():
+        try:
+            yield 1
+        finally:
+            thread = threading.Thread(target={}.__getitem__, args=(112,))
+            thread.start()
+            thread.join()
+
+    given, hook = results(), threading.excepthook
+    next(given)
+    processes._close(given)
+    assert threading.excepthook is hook
+    assert capfd.readouterr().err == ""
 
 
 def test_calls_that_nobody_waits_for_any_more_are_not_begun(tmp_path):

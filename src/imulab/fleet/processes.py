@@ -71,9 +71,15 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
 
 
 def _close(results: Generator[object, None, None]) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that work was in vain
-        results.close()
+    """End what is in vain without a word: joblib warns, and its thread may look for work that was just dropped."""
+    hook = threading.excepthook
+    threading.excepthook = lambda _: None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            results.close()
+    finally:
+        threading.excepthook = hook
 
 
 @contextmanager
