@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from imulab.errors import UnitError
-from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_scale_factor, parse_unit, to_si
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_scale_factor, parse_unit, si_unit, to_si
 
 # What one of each unit is in SI (SI brochure, 9th edition, tables 1, 4, 7 and 8; IAU: 1 arcsec = pi/648000 rad; gravity
 # 3rd CGPM 1901; 0 degC = 273.15 K). The digits of pi/180 and pi/648000 are OEIS A019685 and A209538.
@@ -206,3 +206,12 @@ def test_a_scale_factor_is_an_output_per_unit_of_what_is_measured(text, output, 
 def test_what_is_no_scale_factor_is_refused_with_an_example(text):
     with pytest.raises(UnitError, match="expected an output per unit of what is measured, such as V/"):
         parse_scale_factor(text)
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [("mg", "m/s^2"), ("deg/h", "rad/s"), ("K", "degC"), ("ms", "s"), ("kHz", "Hz"), ("mV", "mV"), ("count", "count"),
+     ("count/(deg/s)", "count/(deg/s)"), ("dps", "rad/s")],
+)  # fmt: skip
+def test_values_in_si_have_the_si_unit_of_their_quantity(unit, expected):
+    assert si_unit(unit) == expected

@@ -3,23 +3,53 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 
 from imulab.errors import UnitError, quoted
 from imulab.printable import has_hidden
 from imulab.units import parse_unit
 
-_QUANTITIES = {
-    "time": ("time",),
-    "accel": ("acceleration", "output"),
-    "gyro": ("rate", "output"),
-    "dtg": ("rate", "output"),
-    "fog": ("rate", "output"),
-    "temperature": ("temperature", "output"),
-    "table_angle": ("angle", "output"),
+
+@dataclass(frozen=True)
+class Kind:
+    """What columns of one name measure (None: any unit passes), a unit for messages, and what such sensors are called.
+
+    `triad`: the sensors have three axes, which may come as one array of shape (n, 3).
+    """
+
+    quantity: str | None
+    example: str
+    sensors: str = ""
+    triad: bool = False
+
+
+KINDS = {
+    "time": Kind("time", "s"),
+    "accel": Kind("acceleration", "m/s^2", "accelerometers", triad=True),
+    "gyro": Kind("rate", "deg/s", "gyroscopes", triad=True),
+    "mag": Kind(None, "uT", "magnetometers", triad=True),
+    "dtg": Kind("rate", "deg/s", "tuned gyroscopes"),
+    "fog": Kind("rate", "deg/s", "fibre-optic gyroscopes"),
+    "temperature": Kind("temperature", "degC"),
+    "table_angle": Kind("angle", "deg"),
 }
-_ELEMENT = re.compile(r"(?:accel|gyro)(?:_[xyz])?_(\d+)")
+"""The vocabulary: a column is called by one of these names, or by one with ``_`` and more behind it."""
+TRIADS = tuple(name for name, kind in KINDS.items() if kind.triad)
+INERTIAL = tuple(name for name, kind in KINDS.items() if kind.quantity in ("acceleration", "rate"))
+"""The sensors whose noise a recording at rest shows."""
+_ELEMENT = re.compile(rf"(?:{'|'.join(TRIADS)})(?:_[xyz])?_(\d+)")
 _CLOCK = re.compile(r"(?:t|time|timestamp|seconds)(?:(?: ?\(|[ _.])(s|ms|us|ns|min|h)\)?)?")
 """What loggers call the time, and the unit in it."""
+
+
+def kind_of(column: str) -> str | None:
+    """Return the name in the vocabulary that a column such as ``gyro_x_3`` is of, None for others."""
+    return next((name for name in KINDS if column == name or column.startswith(f"{name}_")), None)
+
+
+def triad(sensor: str) -> list[str]:
+    """Return the names of the three columns of a sensor: ``accel_x``, ``accel_y``, ``accel_z``."""
+    return [f"{sensor}_{axis}" for axis in "xyz"]
 
 
 def element_number(column: str, stem: str = "") -> int | None:
@@ -74,18 +104,19 @@ def check_name(name: str, title: str, file: str) -> None:
 
 def expected_quantities(name: str) -> tuple[str, ...] | None:
     """Return what a column of the vocabulary measures, or may; None for other columns."""
-    stem = name.removeprefix("truth_").removeprefix("std_")
-    for prefix, quantities in _QUANTITIES.items():
-        if stem == prefix or stem.startswith(prefix + "_"):
-            return quantities
-    return None
+    kind = kind_of(_measured(name))
+    quantity = None if kind is None else KINDS[kind].quantity
+    return None if quantity is None else ("time",) if quantity == "time" else (quantity, "output")
 
 
 def example_unit(name: str) -> str:
     """Return a unit that a column of the vocabulary can have, for a message."""
-    return {"time": "s", "acceleration": "m/s^2", "rate": "deg/s", "temperature": "degC", "angle": "deg"}[
-        (expected_quantities(name) or ("time",))[0]
-    ]
+    return KINDS[kind_of(_measured(name)) or "time"].example
+
+
+def _measured(name: str) -> str:
+    """Return the column that a truth or a standard deviation is of."""
+    return name.removeprefix("truth_").removeprefix("std_")
 
 
 def check_unit(name: str, unit: str, file: str) -> None:

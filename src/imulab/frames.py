@@ -12,12 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.columns import check_name, example_unit, expected_quantities
+from imulab.columns import TRIADS, check_name, example_unit, expected_quantities
 from imulab.errors import DataError, OptionError, UnitError, listed, meant, quoted
 from imulab.units import parse_unit
 
-TRIADS = ("accel", "gyro", "mag")
-"""Sensors of three axes, which may come as one array of shape (n, 3)."""
 DEFAULT_UNITS = {"time": "s", "temperature": "degC"}
 """Units of arrays that are given without one; a data frame states all its units."""
 _LIBRARIES = ("pandas", "polars")
@@ -82,8 +80,7 @@ class Units:
             return default
         if quantities is None and sensor not in TRIADS:
             return "1"
-        example = "uT" if quantities is None else example_unit(column)
-        how = self.where.format(name=column, sensor=sensor, unit=example)
+        how = self.where.format(name=column, sensor=sensor, unit=example_unit(column))
         raise UnitError(f"{self.name}: column {column} has no unit; expected {how}")
 
     def check_used(self, columns: Iterable[str]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imulab.columns import check_unit, element_number, expected_quantities
+from imulab.columns import check_unit, element_number, expected_quantities, triad
 from imulab.errors import DataError, UnitError, quoted
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.printable import has_hidden, printable
@@ -158,7 +158,7 @@ class Recording:
         DataError
             A column is missing.
         """
-        return np.column_stack([self.column(f"{sensor}_{axis}") for axis in "xyz"])
+        return np.column_stack([self.column(name) for name in triad(sensor)])
 
     def triad_unit(self, sensor: str) -> str:
         """Return the unit that the three columns of a triad share.
@@ -168,7 +168,7 @@ class Recording:
         UnitError
             They have different units.
         """
-        names = [f"{sensor}_{axis}" for axis in "xyz"]
+        names = triad(sensor)
         for name in names:
             self.column(name)
         units = {name: parse_unit(self.units[name]).symbol for name in names}

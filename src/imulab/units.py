@@ -187,6 +187,21 @@ def from_si(values: float | NDArray[np.float64], unit: str) -> float | NDArray[n
     return (values - known.offset) / known.factor
 
 
+def si_unit(symbol: str) -> str:
+    """Return the unit that `to_si` gives values of a unit in: counts and volts keep theirs.
+
+    Raises
+    ------
+    UnitError
+        The unit is not known.
+    """
+    unit = parse_unit(symbol)
+    if unit.factor == 1.0 and unit.offset == 0.0:
+        return unit.symbol
+    of_it = (other for other in _UNITS.values() if other.quantity == unit.quantity)
+    return next((other.symbol for other in of_it if other.factor == 1.0 and other.offset == 0.0), unit.symbol)
+
+
 def conversion_factor(source: str, target: str) -> float:
     """Return the factor that turns an interval in `source` into one in `target`.
 

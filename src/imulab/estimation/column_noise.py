@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.columns import INERTIAL, kind_of
 from imulab.errors import DataError
 from imulab.estimation.allan import AllanCurve, allan_deviation
 from imulab.estimation.noise.analysis import Analysis, analyses
@@ -29,10 +30,9 @@ from imulab.estimation.rows import leave_out
 from imulab.estimation.sampling import bridged, sampling_rate, steady_part
 from imulab.estimation.steps import Step, find_step
 from imulab.recording import Array, Recording
-from imulab.units import from_si, parse_unit
+from imulab.units import from_si, parse_unit, si_unit
 from imulab.verdict import Note
 
-_SENSORS = ("gyro", "dtg", "fog", "accel")
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 """How far the zero of a sensor at rest may drift, SI, and the unit to say it in."""
 _NOISE_REACH = 20.0
@@ -88,7 +88,7 @@ class ColumnNoise:
 
 def noise_columns(recording: Recording) -> Iterator[str]:
     """Yield the names of the columns that hold outputs of inertial sensors."""
-    return (name for name in recording.columns if name.split("_")[0] in _SENSORS)
+    return (name for name in recording.columns if kind_of(name) in INERTIAL)
 
 
 def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
@@ -105,12 +105,12 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     names = list(noise_columns(recording))
     if not names:
         raise DataError(
-            f"{recording.name}: no sensor column (gyro_.. accel_.. dtg_.. fog); found {' '.join(recording.columns)}"
+            f"{recording.name}: no sensor column ({' '.join(INERTIAL)}); found {' '.join(recording.columns)}"
         )
     notes = [f"{recording.name}: {note}" for note in recording.notes]
     recording, more = bridged(recording, names)
-    for sensor in dict.fromkeys(name.split("_")[0] for name in names):
-        left_out = leave_out(recording, [name for name in names if name.split("_")[0] == sensor])
+    for sensor in dict.fromkeys(map(kind_of, names)):
+        left_out = leave_out(recording, [name for name in names if kind_of(name) == sensor])
         left_out.check(0, len(recording), "the recording")
         more += [type(note)(f"{recording.name}: {note}") for note in left_out.notes()]
         recording = left_out.recording
@@ -128,17 +128,14 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         )
     )
     for name in names:
-        unit = {"rate": "rad/s", "acceleration": "m/s^2"}.get(
-            parse_unit(recording.units[name]).quantity, recording.units[name]
-        )
         samples = recording.si(name)
         if name not in moved and (step := find_step(samples)) is not None:
             notes.append(_step_line(recording, name, step))
         curve = noises[name].curve if taus == "octave" else allan_deviation(samples, rate, taus)
         columns[name] = {
-            "unit": unit,
+            "unit": si_unit(recording.units[name]),
             "mean": float(samples.mean()),
-            **coefficients_dict(noises[name].coefficients, unit),
+            **coefficients_dict(noises[name].coefficients, si_unit(recording.units[name])),
             "tau": curve.tau.tolist(),
             "deviation": curve.deviation.tolist(),
             "standard_uncertainty": curve.standard_uncertainty.tolist(),

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.columns import kind_of
 from imulab.errors import DataError
 from imulab.recording import Array, Recording
 from imulab.verdict import Note
@@ -109,7 +110,7 @@ def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
     values = [np.asarray(recording.column(name), dtype=np.float64) for name in names]
     if len(recording) < 2 * _AROUND:
         return LeftOut(recording, tuple(names), {})
-    never_zero = all(name.startswith("accel_") for name in names)
+    never_zero = all(kind_of(name) == "accel" for name in names)
     zero = zero_rows(values, never_zero)
     if not never_zero:
         zero &= ~_long_runs(zero)

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from imulab.columns import triad
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
-    AXES,
     UnitModel,
     accel_terms,
     held_accelerometers,
@@ -64,7 +64,7 @@ def noise_lines(options: ExportOptions, indent: str) -> list[str]:
 
 
 def _names(columns: Mapping[str, Any], sensor: str) -> list[str]:
-    return [f"{sensor}_{axis}" for axis in AXES if f"{sensor}_{axis}" in columns]
+    return [name for name in triad(sensor) if name in columns]
 
 
 def _value(column: Any, coefficient: str, name: str, file: str) -> float | None:
@@ -89,19 +89,19 @@ def bias_lines(unit: UnitModel) -> list[str]:
     """Return the constant biases as comments, in the units of the outputs."""
     lines = ["constant bias has no key here, the program estimates it; as measured:"]
     triads = [("accelerometers", unit.accel), ("gyroscopes", unit.gyro)]
-    for name, triad in triads:
-        if triad is not None:
-            values = ", ".join(repr(float(value)) for value in triad.scale * triad.bias)
-            lines.append(f"b of the {name} = [{values}] {triad.unit}")
+    for name, sensor in triads:
+        if sensor is not None:
+            values = ", ".join(repr(float(value)) for value in sensor.scale * sensor.bias)
+            lines.append(f"b of the {name} = [{values}] {sensor.unit}")
     return lines
 
 
 def unit_lines(unit: UnitModel) -> list[str]:
     """Return comments that warn of outputs that are not in SI."""
     lines = []
-    for name, triad in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
-        if triad is not None and triad.unit not in _UNITS.values():
-            lines.append(f"the {name}' outputs are in {triad.unit}: the messages must hold them as they are")
+    for name, sensor in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
+        if sensor is not None and sensor.unit not in _UNITS.values():
+            lines.append(f"the {name}' outputs are in {sensor.unit}: the messages must hold them as they are")
     return lines
 
 

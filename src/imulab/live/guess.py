@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY
 
@@ -116,7 +117,7 @@ def _guess(head: list[str], names: list[str | int], table: Array, seconds: float
 
 def _triad(stem: str, names: list[str | int], start: int, unit: str) -> list[str]:
     return [
-        f'{stem}_{axis} = {{ from = {json.dumps(names[start + k])}, unit = "{unit}" }}' for k, axis in enumerate("xyz")
+        f'{name} = {{ from = {json.dumps(names[start + k])}, unit = "{unit}" }}' for k, name in enumerate(triad(stem))
     ]
 
 

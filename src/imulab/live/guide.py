@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.columns import triad
 from imulab.errors import ImulabError, ObservabilityError
 from imulab.gravity import Gravity
 from imulab.live.targets import Target, predicted_share, share_of
@@ -137,7 +138,7 @@ class Guide:
     def _as_found(self) -> Attitudes:
         kept = self.kept
         mean = np.array([each.mean for each in kept])
-        columns = {f"accel_{axis}": mean[:, k].copy() for k, axis in enumerate("xyz")}
+        columns = {name: mean[:, k].copy() for k, name in enumerate(triad("accel"))}
         recording = Recording(columns, dict.fromkeys(columns, self.unit), self.metadata, "live recording")
         rows = np.arange(1.0, len(kept) + 1)
         return Attitudes(

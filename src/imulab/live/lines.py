@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.columns import parse_column_title
+from imulab.columns import parse_column_title, triad
 from imulab.errors import OptionError, ReadError, UnitError
 from imulab.live.stamps import Counts
 from imulab.readers.layout import Layout
@@ -20,15 +20,14 @@ from imulab.recording import Array
 
 Rows = list[list[float]]
 _LONGEST = 1 << 14
-_AXES = "xyz"
 
 
-def triad(stem: str, unit: str) -> dict[str, str]:
-    """Return the columns of a triad with their unit."""
-    return {f"{stem}_{axis}": unit for axis in _AXES}
+def units_of(sensor: str, unit: str) -> dict[str, str]:
+    """Return the columns of a sensor of three axes, with their unit."""
+    return dict.fromkeys(triad(sensor), unit)
 
 
-_EXTRA = {b"M": triad("mag", "1"), b"T": {"temperature": "degC"}}
+_EXTRA = {b"M": units_of("mag", "1"), b"T": {"temperature": "degC"}}
 """Messages of the x-IMU3 beside the inertial ones, and their columns."""
 
 
@@ -112,7 +111,7 @@ class MotionCal(LineDecoder):
     """``Raw:`` and nine whole numbers, as MotionCal and Adafruit's sketches write them."""
 
     name = "MotionCal Raw:"
-    units = triad("accel", "g") | triad("gyro", "deg/s") | triad("mag", "uT")
+    units = units_of("accel", "g") | units_of("gyro", "deg/s") | units_of("mag", "uT")
     _SCALES = (8192.0,) * 3 + (16.0,) * 3 + (10.0,) * 3
 
     def _row(self, line: bytes) -> list[float] | None:
@@ -133,7 +132,7 @@ class XImu3(LineDecoder):
 
     def __init__(self, kinds: set[bytes], counts: Counts) -> None:
         super().__init__(counts)
-        self.units = {"time": "us"} | triad("gyro", "deg/s") | triad("accel", "g")
+        self.units = {"time": "us"} | units_of("gyro", "deg/s") | units_of("accel", "g")
         self._latest: dict[bytes, list[float]] = {}
         self._extra = [kind for kind in _EXTRA if kind in kinds]
         for kind in self._extra:

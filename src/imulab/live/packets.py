@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import OptionError
-from imulab.live.lines import triad
+from imulab.live.lines import units_of
 from imulab.live.stamps import Counts
 from imulab.recording import Array
 
 _V1, _V2 = 0xFE, 0xFD
 _SIGNED, _SIGNATURE = 1, 13
 _RAW = [f"{axis}{sensor}" for sensor in ("acc", "gyro", "mag") for axis in "xyz"]
-_SCALED = triad("accel", "mg") | triad("gyro", "mrad/s") | triad("mag", "mgauss")
+_SCALED = units_of("accel", "mg") | units_of("gyro", "mrad/s") | units_of("mag", "mgauss")
 MESSAGES: dict[str, tuple[str, dict[str, str], list[str]]] = {
     "HIGHRES_IMU": (
         "us",
-        triad("accel", "m/s^2") | triad("gyro", "rad/s") | triad("mag", "gauss") | {"temperature": "degC"},
+        units_of("accel", "m/s^2") | units_of("gyro", "rad/s") | units_of("mag", "gauss") | {"temperature": "degC"},
         ["time_usec", *_RAW, "temperature"],
     ),
     "SCALED_IMU": ("ms", _SCALED, ["time_boot_ms", *_RAW]),
@@ -33,7 +33,7 @@ MESSAGES: dict[str, tuple[str, dict[str, str], list[str]]] = {
     "SCALED_IMU3": ("ms", _SCALED, ["time_boot_ms", *_RAW]),
     "RAW_IMU": (
         "us",
-        triad("accel", "count") | triad("gyro", "count") | triad("mag", "count"),
+        units_of("accel", "count") | units_of("gyro", "count") | units_of("mag", "count"),
         ["time_usec", *_RAW],
     ),
 }
@@ -146,7 +146,7 @@ class Msp(PacketDecoder):
     """MSP_RAW_IMU of Betaflight, INAV and their like, which is sent when it is asked for, in v1 or v2."""
 
     name = "MSP RAW_IMU"
-    units = triad("accel", "count") | triad("gyro", "count") | triad("mag", "count")
+    units = units_of("accel", "count") | units_of("gyro", "count") | units_of("mag", "count")
     poll = _POLL
 
     def _length(self, buffer: bytes, place: int) -> int | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import DataError
 from imulab.gravity import Gravity
 from imulab.live.guide import Attitude, Guide
@@ -87,7 +88,7 @@ class Session:
         if not len(block):
             return []
         times = block.time
-        if times is None or not all(f"accel_{axis}" in block for axis in "xyz"):
+        if times is None or not all(name in block for name in triad("accel")):
             raise DataError(
                 f"{self.source or block.name}: expected time and accel_x accel_y accel_z, found "
                 f"{' '.join(block.columns)}"

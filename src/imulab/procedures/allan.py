@@ -17,7 +17,7 @@ from imulab.procedures.inputs import Data, Part, Window, as_recording
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording, check_finite
 from imulab.report.elements import Exhibits, ReportTable, format_uncertain
-from imulab.units import parse_unit
+from imulab.units import si_unit
 
 
 @dataclass(frozen=True, repr=False)
@@ -135,8 +135,7 @@ def allan_deviation(
         )
     check_finite(recording, [chosen])
     curve = allan.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
-    quantity = parse_unit(unit := recording.units[chosen]).quantity
-    return _curve(curve, chosen, {"rate": "rad/s", "acceleration": "m/s^2"}.get(quantity, unit))
+    return _curve(curve, chosen, si_unit(recording.units[chosen]))
 
 
 def _is_line(data: object) -> bool:

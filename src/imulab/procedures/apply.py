@@ -10,6 +10,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, Unpack
 
+from imulab.columns import KINDS, triad
 from imulab.device.blob import Blob
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, OptionError, RecordError
@@ -205,11 +206,8 @@ def sections_for(
     return kept or sections  # with nothing to correct, the section itself says which columns it expects
 
 
-def _has_any(recording: Recording, triad: str) -> bool:
-    return any(f"{triad}_{axis}" in recording for axis in "xyz")
-
-
-_SENSORS = {"accel": "accelerometers", "gyro": "gyroscopes"}
+def _has_any(recording: Recording, sensor: str) -> bool:
+    return any(name in recording for name in triad(sensor))
 
 
 def _parts(record: Calibration | Blob) -> list[tuple[Section | None, Mapping[str, Any]]]:
@@ -235,8 +233,8 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     triads = [part.triad for part, _ in parts if part.triad]
     absent = [triad for triad in triads if not _has_any(recording, triad)]
     if absent and len(absent) < len(triads):
-        there = " and ".join(_SENSORS[triad] for triad in triads if triad not in absent)
-        missing = " and ".join(_SENSORS[triad] for triad in absent)
+        there = " and ".join(KINDS[triad].sensors for triad in triads if triad not in absent)
+        missing = " and ".join(KINDS[triad].sensors for triad in absent)
         found.append(Note(f"{recording.name}: no {missing} in it: its {there} alone are corrected"))
     for part, columns in parts:
         found += [] if part.remarks is None else part.remarks(columns, recording)

@@ -16,6 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
+from imulab.columns import kind_of
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import IfNeeded, Layout, load_layout
@@ -29,7 +30,6 @@ __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 _LOG = logging.getLogger(__name__)
 """Says of each file what it is, and how many rows of which times were read in how long."""
 _HEAD = 1 << 16
-_OURS = ("accel", "gyro", "dtg", "fog", "mag", "temperature", "truth")
 
 
 def read(
@@ -221,10 +221,15 @@ def _text_blocks(file: str | Path, name: str, layout: Layout | None, hashed: _Ha
         notes: list[str] | None = None
         for block in text.blocks():
             if notes is None:
-                notes = [] if layout or any(column.startswith(_OURS) for column in block.columns) else _found(file)
+                notes = [] if layout or any(map(_is_known, block.columns)) else _found(file)
             yield replace(block, notes=(*block.notes, *notes)) if notes else block
         if hashed is not None:
             text.drain()
+
+
+def _is_known(column: str) -> bool:
+    """Whether imulab knows what a column measures; times have this name in other programs' files too."""
+    return column.startswith("truth_") or kind_of(column) not in (None, "time")
 
 
 def _found(file: str | Path) -> list[str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
@@ -44,8 +45,8 @@ _KINDS = {
     "q": ("<i8", 1, 1.0),
     "Q": ("<u8", 1, 1.0),
 }
-_ACCEL = {f"accel_{axis}": "m/s^2" for axis in "xyz"}
-_GYRO = {f"gyro_{axis}": "rad/s" for axis in "xyz"}
+_ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
+_GYRO = dict.fromkeys(triad("gyro"), "rad/s")
 _FIELDS = {
     "IMU": ("AccX", "AccY", "AccZ", "GyrX", "GyrY", "GyrZ"),
     "ACC": ("AccX", "AccY", "AccZ"),

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import OptionError, ReadError, listed
 from imulab.readers import logs
 from imulab.readers.rosfiles import Container, Topic, open_container
@@ -26,8 +27,8 @@ from imulab.recording import Array, Recording
 _IMU, _TEMPERATURE = "sensor_msgs/Imu", "sensor_msgs/Temperature"
 _DOUBLES = {_IMU: 37, _TEMPERATURE: 2}
 _GYRO_AT, _ACCEL_AT = 13, 25  # behind quaternion and its covariance, behind the rate and its covariance
-_ACCEL = {f"accel_{axis}": "m/s^2" for axis in "xyz"}
-_GYRO = {f"gyro_{axis}": "rad/s" for axis in "xyz"}
+_ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
+_GYRO = dict.fromkeys(triad("gyro"), "rad/s")
 _ENOUGH = 4096  # samples to find out what a topic reports; a chunk may hold only one
 _ZSTD = b"\x28\xb5\x2f\xfd"
 

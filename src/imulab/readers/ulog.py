@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import OptionError, ReadError
 from imulab.readers import logs
 from imulab.readers.selection import Selection
@@ -36,8 +37,8 @@ _SIZES = {
     "double": "<f8",
 }
 _TOPICS = ("sensor_accel", "sensor_gyro", "sensor_combined")
-_ACCEL = {f"accel_{axis}": "m/s^2" for axis in "xyz"}
-_GYRO = {f"gyro_{axis}": "rad/s" for axis in "xyz"}
+_ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
+_GYRO = dict.fromkeys(triad("gyro"), "rad/s")
 _NO_ACCEL = 2**31 - 1
 _KEPT = {"sys_name": "autopilot", "ver_hw": "hardware", "sys_uuid": "autopilot_uuid"}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.columns import kind_of, triad
 from imulab.errors import DataError, UnitError
 from imulab.estimation.sampling import WIDEST_GAP, usual_step
 from imulab.procedures.gyro_array.model import MOST_ELEMENTS
@@ -31,7 +32,7 @@ class Merged(Shown):
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return what was joined, and what there is to say of it."""
-        gyros = sum(name.startswith("gyro_") for name in self.recording.columns)
+        gyros = sum(kind_of(name) == "gyro" for name in self.recording.columns)
         return f"{len(self.recording)} samples, {gyros} gyros", ["note"], [[note] for note in self.notes]
 
 
@@ -147,14 +148,14 @@ def _gyro_columns(recording: Recording, axis: str | None, column: str | None) ->
         if quantity not in ("rate", "output"):
             raise UnitError(f"{recording.name}: column {name} is in {recording.units[name]}; expected a rate")
         return [name]
-    triad = [name for name in ("gyro_x", "gyro_y", "gyro_z") if name in recording]
-    found = triad or [name for name in recording.columns if name == "gyro" or name.startswith("gyro_")]
+    axes = [name for name in triad("gyro") if name in recording]
+    found = axes or [name for name in recording.columns if kind_of(name) == "gyro"]
     if not found:
         raise DataError(
             f"{recording.name}: no gyroscope; expected gyro_x gyro_y gyro_z or one column gyro, found "
             f"{' '.join(recording.columns)}; --column NAME says which column it is"
         )
-    if len(found) not in (1, 3) or (len(found) == 3 and not triad):
+    if len(found) not in (1, 3) or (len(found) == 3 and not axes):
         raise DataError(
             f"{recording.name}: found {' '.join(found)}; expected one gyroscope in each file; "
             "--column NAME says which column it is"

@@ -25,7 +25,7 @@ from imulab.procedures.noise.record import make_record
 from imulab.procedures.result import Result
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
-from imulab.units import parse_unit
+from imulab.units import parse_unit, si_unit
 
 _SAME_RATE = 0.01
 _COVARIATE_UNITS = {"time": "s", "temperature": "K"}
@@ -252,18 +252,12 @@ def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> Non
     if chosen_columns(other.recording, columns) != names:
         raise DataError(f"{name}: other columns than {one.name}; expected {several(names)}")
     for column in names:
-        if (unit := si_unit(other.recording, column)) != si_unit(one, column):
-            raise UnitError(f"{name}: column {column} in {unit}, but {one.name} has it in {si_unit(one, column)}")
+        unit, expected = (si_unit(each.units[column]) for each in (other.recording, one))
+        if unit != expected:
+            raise UnitError(f"{name}: column {column} in {unit}, but {one.name} has it in {expected}")
     serials = [rest.recording.metadata.get("serial") for rest in (first, other)]
     if all(serials) and serials[0] != serials[1]:
         raise DataError(f"{name}: of unit {serials[1]}, but {one.name} is of {serials[0]}: expected logs of one unit")
-
-
-def si_unit(recording: Recording, name: str) -> str:
-    """Return the SI unit of a column, or its own where it has none."""
-    unit = recording.units[name]
-    known = {"rate": "rad/s", "acceleration": "m/s^2", "temperature": "degC"}
-    return known.get(parse_unit(unit).quantity, unit)
 
 
 def _column(
@@ -290,7 +284,7 @@ def _column(
     # Steps have the time of their log; those of several logs are told one after the other.
     return ColumnModel(
         name,
-        si_unit(rests[0].recording, name),
+        si_unit(rests[0].recording.units[name]),
         analysis,
         spikes,
         lines,

@@ -15,7 +15,6 @@ from imulab.errors import OptionError, RecordError, listed
 from imulab.procedures.noise.sections import Fit, fit_of
 from imulab.records.calibration import Calibration
 
-_SENSORS = {"rad/s": "gyro", "m/s^2": "accel"}
 STEPS = {"px4": 0.010, "ardupilot": 0.012}
 """Time between predictions of the filters that take their noise by it, s: EKF2_PREDICT_US and EKF_TARGET_DT."""
 
@@ -124,10 +123,10 @@ def noise_for(
             raise OptionError(f"{name} {value:g} {unit}: expected more than 0")
     f, d = rate or fit.sample_rate.value, step or STEPS.get(program, 0.01)
     keys: dict[str, float] = {}
-    for unit, sensor in _SENSORS.items():
+    for unit, gyro in (("rad/s", True), ("m/s^2", False)):
         names = [name for name, column in fit.columns.items() if column.unit == unit]
         if names:
-            keys |= found(_largest(record, fit, names), sensor == "gyro", f, d)
+            keys |= found(_largest(record, fit, names), gyro, f, d)
     if not keys:
         units = " ".join(dict.fromkeys(column.unit for column in fit.columns.values()))
         raise RecordError(

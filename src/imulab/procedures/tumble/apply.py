@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, UnitError
 from imulab.procedures.tumble.device import tables_of
@@ -17,8 +18,8 @@ from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit, to_si
 
 _FAR = 2.0
-_ACCEL = tuple(f"accel_{axis}" for axis in AXES)
-_GYRO = tuple(f"gyro_{axis}" for axis in AXES)
+_ACCEL = triad("accel")
+_GYRO = triad("gyro")
 
 
 def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:

@@ -10,6 +10,7 @@ from itertools import permutations, product
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import DataError
 from imulab.estimation.least_squares import median
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -39,7 +40,7 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
         The axes do not agree as they are named, but would after exchanging or reversing some.
     """
     recording = attitudes.recording
-    names = [f"gyro_{axis}" for axis in "xyz"]
+    names = triad("gyro")
     time, pieces = recording.time, attitudes.pieces
     if time is None or pieces is None or not all(name in recording for name in names):
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import DataError, RecordError
 from imulab.estimation.least_squares import median
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
@@ -41,7 +42,7 @@ def check_attitudes(attitudes: Attitudes, gravity: float) -> None:
 def _check_turned(attitudes: Attitudes) -> None:
     name, unit = attitudes.recording.name, attitudes.unit
     span = np.ptp(attitudes.mean, axis=0)
-    columns = [f"accel_{axis}" for axis in "xyz"]
+    columns = triad("accel")
     for axis, column in enumerate(columns):
         for other in range(axis):
             if np.array_equal(attitudes.mean[:, axis], attitudes.mean[:, other]):

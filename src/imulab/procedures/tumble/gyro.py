@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.least_squares import Observability, covariance, observability
 from imulab.estimation.rows import leave_out
@@ -118,13 +119,13 @@ def fit_gyro(
     """
     _check_request(record, attitudes, sensitivity, clock, clock_of)
     unit = recording.triad_unit("gyro")
-    check_finite(recording, [f"gyro_{axis}" for axis in "xyz"])
-    left_out = leave_out(recording, [f"gyro_{axis}" for axis in "xyz"])
+    check_finite(recording, triad("gyro"))
+    left_out = leave_out(recording, triad("gyro"))
     time, output = check_time(recording), left_out.recording.triad("gyro")
     factor = output_factor(attitudes.recording.name, "accel", attitudes.unit, model_of(record).output_unit)
     means = attitudes.mean * factor
     own = attitudes.recording.si("time")
-    moving = leave_out(attitudes.recording, [f"accel_{a}" for a in "xyz"]).recording
+    moving = leave_out(attitudes.recording, triad("accel")).recording
     own_force = specific_force(record, moving.triad("accel") * factor)
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
     case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)

@@ -16,6 +16,7 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.columns import triad
 from imulab.errors import SegmentError
 from imulab.estimation.rows import leave_out
 from imulab.procedures.inputs import Data, Sampling, as_recording
@@ -113,7 +114,7 @@ def find_attitudes(
     """
     recording = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples})
     unit = recording.triad_unit(sensor)
-    names = [f"{sensor}_{axis}" for axis in "xyz"]
+    names = triad(sensor)
     if not len(recording):
         raise SegmentError(f"{recording.name}: no samples")
     check_finite(recording, names)

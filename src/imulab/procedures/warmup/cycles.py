@@ -24,13 +24,12 @@ from imulab.procedures.warmup.poweron import (
     power_on_temperature,
 )
 from imulab.recording import Array, Recording, Source, check_finite, check_time
-from imulab.units import conversion_factor, parse_unit
+from imulab.units import conversion_factor, parse_unit, si_unit
 
 BIN = 1.0
 """Width of a bin, s."""
 _DAY = 86400.0
 _AXIS = re.compile(r"(gyro|accel)_.+")
-_SI = {"rate": "rad/s", "acceleration": "m/s^2"}
 
 
 @dataclass(frozen=True)
@@ -179,9 +178,9 @@ def find_power_cycle(
     if not pieces:
         raise DataError(f"{head.name}: every row is zero in {' '.join(axes)}")
     return Cycle(
-        bins=_bins(pieces, [conversion_factor(head.units[axis], _si_unit(head, axis)) for axis in axes]),
+        bins=_bins(pieces, [conversion_factor(head.units[axis], si_unit(head.units[axis])) for axis in axes]),
         axes=axes,
-        units=tuple(_si_unit(head, axis) for axis in axes),
+        units=tuple(si_unit(head.units[axis]) for axis in axes),
         temperature=temperature,
         first=first,
         last=last,
@@ -206,11 +205,6 @@ def _axes(recording: Recording) -> tuple[str, ...]:
             found = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
             raise UnitError(f"{recording.name}: the axes of one kind must share one unit, found {found}")
     return axes
-
-
-def _si_unit(recording: Recording, axis: str) -> str:
-    unit = parse_unit(recording.units[axis])
-    return _SI.get(unit.quantity, unit.symbol)
 
 
 def _power_on(recording: Recording, from_column: bool, reading: float | None) -> float:

@@ -22,10 +22,9 @@ from imulab.procedures.warmup.solve import amplitude_slopes
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.recognition import is_json
 from imulab.shown import Shown
-from imulab.units import conversion_factor, parse_unit
+from imulab.units import conversion_factor, si_unit
 
 _CUBIC = ("interval-cubic", "knot-cubic")
-_SI = {"rate": "rad/s", "acceleration": "m/s^2"}
 
 
 @dataclass(frozen=True, repr=False)
@@ -261,8 +260,7 @@ def _read_rows(
         at = tuple(_value(place, cell) for cell in cells[:lead])
         axis, unit = cells[lead : lead + 2]
         try:
-            known = parse_unit(unit)
-            si = _SI.get(known.quantity, known.symbol)
+            si = si_unit(unit)
             factor = conversion_factor(unit, si)
         except UnitError as error:
             raise ReadError(f"{place}: {error}") from None
