@@ -5,6 +5,7 @@ import json
 import keyword
 import re
 
+import numpy as np
 import pytest
 
 import imulab as il
@@ -37,6 +38,7 @@ FUNCTIONS = {
     "warmup fit": il.fit_warmup,
     "warmup table": il.warmup_table,
     "noise fit": il.fit_noise,
+    "noise simulate": il.simulate_noise,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,
@@ -61,6 +63,7 @@ OTHERWISE = {
 """Options that functions have by another name, or say in another way."""
 COMMANDS = dict(common._commands(command()))
 G = 9.80665
+DEGREE = np.pi / 180
 
 
 def options_of(path):
@@ -194,6 +197,23 @@ MADE = {
     "warmup simulate": (
         ["--temperatures", "-40,60", "--cycles", "1", "--units", "2", "--rate", "1", "-o", "one"],
         lambda out: il.simulate_warmup([-40, 60], cycles=1, units=2, rate=1.0).save(out),
+    ),
+    "noise simulate": (
+        [
+            "--white",
+            "0.3 deg/sqrt(h)",
+            "--gm",
+            "20 deg/h:60 s",
+            "--duration",
+            "100 s",
+            "--columns",
+            "gyro_z",
+            "-o",
+            "one.csv",
+        ],
+        lambda out: il.write(
+            il.simulate_noise(white=DEGREE * 0.3 / 60, gm=("20 deg/h", 60), duration=100, columns=["gyro_z"]), out
+        ),
     ),
     "warmup table": (
         ["warm.json", "--per-second", "-o", "one.csv"],

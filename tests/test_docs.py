@@ -42,6 +42,7 @@ OF_COMMANDS = (
     "simulate_array",
     "simulate_centrifuge",
     "simulate_fleet",
+    "simulate_noise",
     "simulate_power_cycle",
     "simulate_tumble",
     "simulate_warmup",

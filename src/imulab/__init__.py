@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from imulab.procedures.loading import load as load
     from imulab.procedures.noise.fit import NoiseFit as NoiseFit
     from imulab.procedures.noise.fit import fit_noise as fit_noise
+    from imulab.procedures.noise.simulate import simulate_noise as simulate_noise
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
     from imulab.procedures.tumble.compare import check_tumble as check_tumble
@@ -118,6 +119,7 @@ _HOME = {
     "read_blocks": "readers",
     "simulate_centrifuge": "procedures.centrifuge.rig",
     "simulate_fleet": "fleet.simulate",
+    "simulate_noise": "procedures.noise.simulate",
     "simulate_power_cycle": "procedures.warmup.simulate",
     "simulate_tumble": "procedures.tumble.simulate",
     "simulate_warmup": "procedures.warmup.simulate",

@@ -44,6 +44,20 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     return to_si(float(match[1]), unit.symbol)
 
 
+def split_quantity(text: str, option: str, example: str) -> tuple[float, str]:
+    """Return the number of a text such as ``0.3 deg/sqrt(h)`` and what stands behind it.
+
+    Raises
+    ------
+    OptionError
+        It does not begin with a number; the message gives an example.
+    """
+    match = _QUANTITY.fullmatch(text)
+    if match is None or re.search(r"\d,\d", text):
+        raise OptionError(f"{option} {text!r}: expected a number with a unit such as {example}")
+    return float(match[1]), (match[2] or "").strip()
+
+
 def in_si(value: float | str, option: str, kind: str, default_unit: str) -> float:
     """Return a quantity in SI: a number is in SI already, a text is read as on the command line.
 

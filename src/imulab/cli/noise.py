@@ -7,15 +7,29 @@ from typing import Annotated, Any
 import typer
 
 from imulab.cli.fit_options import with_options
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, check_outputs, quantity
+from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, quantity
 from imulab.errors import OptionError
 from imulab.procedures.noise.task import OPTIONS
+
+White = Annotated[
+    str | None, typer.Option(metavar="N", help="White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit.")
+]
+Flicker = Annotated[str | None, typer.Option(metavar="B", help="1/f noise, such as 5 deg/h.")]
+Walk = Annotated[str | None, typer.Option(metavar="K", help="Random walk, such as 3 deg/h/sqrt(h).")]
+Quantisation = Annotated[str | None, typer.Option(metavar="Q", help="Quantisation of the angle, such as 1 arcsec.")]
+Markov = Annotated[
+    list[str] | None,
+    typer.Option(metavar="SIGMA:TIME", help="Gauss-Markov noise, such as '20 deg/h:300 s'; once or twice."),
+]
+FromRecord = Annotated[
+    str | None, typer.Option("--from", metavar="RECORD", help="In place of terms: those of a record of noise fit.")
+]
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    for function in (fit,):
+    for function in (fit, simulate):
         group.command(function.__name__)(function)
     return group
 
@@ -67,3 +81,35 @@ def fit(
     with labelled("--{}", ["rate", "step"]):
         wanted = noise_for(record, program, rate=hertz, step=seconds)
     finish(record, output, report, json=json, describe=lambda _: "\n".join(f"{k}: {v:.4g}" for k, v in wanted.items()))
+
+
+def simulate(
+    output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Log to write, .csv or .parquet.")],
+    white: White = None,
+    flicker: Flicker = None,
+    walk: Walk = None,
+    quantisation: Quantisation = None,
+    gm: Markov = None,
+    source: FromRecord = None,
+    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the record, or 100 Hz.")] = None,
+    duration: Annotated[str, typer.Option(help="Of the log, s.")] = "1 h",
+    columns: Annotated[
+        str | None, typer.Option(metavar="A,A,...", help="Those of the record, or three axes of the sensor.")
+    ] = None,
+    seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
+) -> None:
+    """Simulate a log at rest from given noise or from a record's, with its truth in the head of the file.
+
+    Logs of any length are written in blocks.
+    """
+    from imulab.procedures.noise.simulate import noise_log
+    from imulab.writers import check_writable, write
+
+    check_outputs([output], [source] if source else [])
+    check_writable(output)
+    log = call(
+        noise_log, from_=source, white=white, flicker=flicker, walk=walk, quantisation=quantisation, gm=gm, rate=rate,
+        duration=duration, columns=columns, seed=seed,
+    )  # fmt: skip
+    write(log.blocks(), output)
+    print(f"{output}: {log.count} samples of {' '.join(log.values)}, {log.count / log.rate:g} s at {log.rate:g} Hz")
