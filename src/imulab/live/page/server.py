@@ -1,0 +1,190 @@
+"""The server of the page: `imulab live SOURCE --page` and `imulab open` put different parts into the same one.
+
+Addresses: ``/`` the page, ``/static/..`` its files, ``/ws`` the socket, ``/api/..`` those of the parts. What a part is,
+and what is said on the socket, is in `parts`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import sys
+import webbrowser
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
+from importlib.resources import files
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from imulab._version import VERSION
+from imulab.errors import ImulabError, OptionError
+from imulab.live.page.parts import Hub, Line, Message, Part, to_json
+from imulab.live.page.security import LOCAL, Guard, new_token
+
+UPLOAD_LIMIT = 4 << 30
+"""Bytes of one request, 4 GiB."""
+_SOCKET_LIMIT = 1 << 16
+_GRACE = 2
+
+
+def application(token: str, parts: Sequence[Part], *, limit: int = UPLOAD_LIMIT) -> Starlette:
+    """Return the application of a page with these parts; its `state` has `hub` and `token`."""
+    hub = Hub()
+    known = {kind: take for part in parts for kind, take in part.hears.items()}
+    hello = {"type": "hello", "areas": [part.name for part in parts], "version": VERSION}
+
+    @asynccontextmanager
+    async def alive(app: Starlette) -> AsyncIterator[None]:
+        hub.begin(asyncio.get_running_loop())
+        for part in parts:
+            part.begin(hub)
+        yield
+        for part in parts:
+            part.end()
+
+    async def speak(page: WebSocket) -> None:
+        await page.accept()
+        line = Line()
+        for message in (hello, *(each for part in parts for each in part.greet())):
+            line.put("greeting", to_json(message))
+        hub.join(line)
+        writer = asyncio.create_task(_write(page, line))
+        try:
+            while True:
+                _take(await page.receive_text(), known, line)
+        except WebSocketDisconnect:
+            pass
+        finally:
+            hub.leave(line)
+            writer.cancel()
+
+    static = files("imulab.live.page") / "static"
+    report = files("imulab.report")
+    shared = {"report.css": report / "style.css", "plotly.js": report / "vendor" / "plotly-cartesian.min.js"}
+    routes = [
+        Route("/", lambda request: FileResponse(str(static / "index.html"))),
+        WebSocketRoute("/ws", speak),
+        *(Route(f"/static/{name}", _file(str(path))) for name, path in shared.items()),
+        Mount("/static", StaticFiles(directory=str(static))),
+        *(route for part in parts for route in part.routes),
+    ]
+    app = Starlette(
+        routes=routes,
+        lifespan=alive,
+        middleware=[Middleware(Guard, token=token, limit=limit)],
+        exception_handlers={ImulabError: _refused},
+    )
+    app.state.hub, app.state.token = hub, token
+    return app
+
+
+def serve(
+    parts: Sequence[Part],
+    port: int = 0,
+    *,
+    browser: bool = True,
+    limit: int = UPLOAD_LIMIT,
+    tell: Callable[[str], object] = print,
+) -> None:
+    """Serve a page until Ctrl-C or `Hub.stop`, and say where: one line with the address, token included.
+
+    Parameters
+    ----------
+    parts
+        Of the page.
+    port
+        To listen at on this machine; 0 for a free one.
+    browser
+        Whether to open a browser there.
+    limit
+        Bytes that one request may bring.
+    tell
+        Takes the line.
+
+    Raises
+    ------
+    OptionError
+        The port is taken, or not permitted.
+    """
+    listening = _listen(port)
+    app = application(new_token(), parts, limit=limit)
+    config = uvicorn.Config(
+        app,
+        log_level="critical",
+        access_log=False,
+        ws="websockets-sansio",
+        ws_max_size=_SOCKET_LIMIT,
+        timeout_graceful_shutdown=_GRACE,
+        server_header=False,
+    )
+    server = uvicorn.Server(config)
+
+    def stop() -> None:
+        server.should_exit = True
+
+    app.state.hub.stop = stop
+    address = f"http://{LOCAL}:{listening.getsockname()[1]}/?token={app.state.token}"
+    tell(address)
+    sys.stdout.flush()
+    if browser:
+        _open(address)
+    try:
+        server.run(sockets=[listening])
+    finally:
+        listening.close()
+
+
+def _open(address: str) -> None:
+    """Open a browser where there is one; the address has been printed."""
+    with suppress(webbrowser.Error, OSError):
+        webbrowser.open(address)
+
+
+def _listen(port: int) -> socket.socket:
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    if sys.platform != "win32":  # there it would let two programs listen at once
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((LOCAL, port))
+        listening.listen()
+    except OSError as error:
+        listening.close()
+        raise OptionError(f"--port {port}: cannot be listened at: {error.strerror}; 0 takes a free one") from None
+    return listening
+
+
+def _file(path: str) -> Any:
+    return lambda request: FileResponse(path)
+
+
+async def _write(page: WebSocket, line: Line) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):  # it has gone: the reader finds out, too
+        while True:
+            for text in await line.get():
+                await page.send_text(text)
+
+
+def _take(text: str, known: Mapping[str, Callable[[Message], object]], line: Line) -> None:
+    """Hand a page's message to the part that knows it."""
+    try:
+        message = json.loads(text)
+        take = known.get(str(message.get("type"))) if isinstance(message, dict) else None
+        if take is None:
+            raise OptionError("unknown message: reload the page")
+        take(message)
+    except (ImulabError, ValueError, RecursionError) as error:
+        reason = str(error) if isinstance(error, ImulabError) else "no JSON: reload the page"
+        line.put("refused", to_json({"type": "refused", "text": reason}))
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, 400)

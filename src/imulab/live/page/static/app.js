@@ -1,0 +1,98 @@
+// The page: its socket, its areas and what is said above them.
+//
+// An area is a module with `title`, `mount(place, page)`, which is called once, and `hear(message)`, which gets every
+// message of the socket. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
+// (kind: "note" or "bad"; no text takes it away).
+
+import { h, put, show } from "./dom.js";
+import * as session from "./session.js";
+import * as workbench from "./workbench.js";
+
+const AREAS = { session, workbench };
+const AGAIN = 1000;
+const GONE = "The program has ended, or cannot be reached any more. What it recorded is kept: what it said last stands in its terminal.";
+const tabs = document.getElementById("tabs");
+const mounted = {};
+let socket = null;
+let ended = false;
+
+function say(text, kind = "note") {
+  const place = document.getElementById("said");
+  if (place.textContent === text) return;
+  place.replaceChildren(...(text ? [h("p", { class: `said ${kind}` }, text)] : []));
+}
+
+const page = {
+  say,
+  send(message) {
+    if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+    else say(GONE, "bad");
+  },
+  // Says that the program ends by itself now, and why: that it is gone is then no news.
+  end(text, kind) {
+    ended = true;
+    say(text, kind);
+  },
+};
+
+function choose(name) {
+  for (const [each, tab] of Object.entries(mounted)) {
+    const chosen = each === name;
+    show(document.getElementById(each), chosen);
+    tab.setAttribute("aria-selected", chosen);
+    tab.tabIndex = chosen ? 0 : -1;
+  }
+}
+
+function turn(event) {
+  const names = Object.keys(mounted);
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+  if (!step) return;
+  const name = names[(names.findIndex(each => mounted[each] === event.target) + step + names.length) % names.length];
+  location.hash = name;
+  mounted[name].focus();
+}
+
+function begin(names) {
+  for (const name of names) {
+    if (mounted[name] || !AREAS[name]) continue;
+    mounted[name] = h("button", {
+      role: "tab", id: `tab-${name}`, "aria-controls": name, onclick: () => { location.hash = name; }, onkeydown: turn,
+    }, AREAS[name].title);
+    tabs.append(mounted[name]);
+    AREAS[name].mount(document.getElementById(name), page);
+  }
+  show(tabs, Object.keys(mounted).length > 1);
+  follow();
+}
+
+function follow() {
+  const names = Object.keys(mounted);
+  if (names.length) choose(names.includes(location.hash.slice(1)) ? location.hash.slice(1) : names[0]);
+}
+
+function hear(message) {
+  if (message.type === "hello") {
+    say("");
+    begin(message.areas);
+    put(document.getElementById("where"), `version ${message.version}`);
+  } else if (message.type === "refused") {
+    say(message.text, "bad");
+  }
+  for (const name of Object.keys(mounted)) AREAS[name].hear(message);
+}
+
+function connect() {
+  socket = new WebSocket(`ws://${location.host}/ws`);
+  socket.onmessage = event => hear(JSON.parse(event.data));
+  socket.onclose = () => {
+    document.documentElement.dataset.connected = "no";
+    if (ended) return;
+    say(GONE, "bad");
+    setTimeout(connect, AGAIN);
+  };
+  socket.onopen = () => { document.documentElement.dataset.connected = "yes"; };
+}
+
+addEventListener("hashchange", follow);
+connect();

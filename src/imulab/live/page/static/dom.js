@@ -1,0 +1,36 @@
+// Elements without HTML: texts that files bring along stay texts.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+function fill(element, attributes, children) {
+  for (const [name, value] of Object.entries(attributes || {})) {
+    if (value === undefined || value === null || value === false) continue;
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.flat().filter(child => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+// h("button", { class: "quiet", onclick: drop }, "drop")
+export const h = (tag, attributes, ...children) => fill(document.createElement(tag), attributes, children);
+export const s = (tag, attributes, ...children) => fill(document.createElementNS(SVG, tag), attributes, children);
+
+// Puts a text in place where it is another: a screen reader does not hear the same again, and a selection stays.
+export function put(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function show(element, shown) {
+  if (element.hidden === shown) element.hidden = !shown;
+}
+
+let plotly = null;
+// Plotly, loaded when it is first asked for.
+export function loadPlotly() {
+  plotly ||= new Promise((done, failed) => {
+    const script = h("script", { src: "/static/plotly.js", onload: () => done(window.Plotly), onerror: failed });
+    document.head.append(script);
+  });
+  return plotly;
+}
