@@ -14,6 +14,7 @@ from imulab.cli import main
 from imulab.errors import OptionError
 from imulab.live.recorder import Recorder
 from imulab.live.session import Session
+from imulab.live.targets import read_targets
 from imulab.live.view import in_words
 
 FIT = ["--gravity", "9.81+-0", "--order", "1"]
@@ -66,6 +67,26 @@ def test_a_knocked_attitude_is_named_and_can_be_dropped():
     number = next(held.number for held in session.view().attitudes if held.aside)
     assert session.drop() is not None
     assert number not in [held.number for held in session.view().attitudes]
+
+
+def test_an_attitude_is_dropped_by_its_number():
+    session, _ = session_of(il.simulate_tumble(attitudes=9, order=1, gravity=9.81, gyro=False), planned=9)
+    third = session.guide.kept[2]
+    assert session.drop(3) == (third.start, third.stop)
+    assert [held.number for held in session.view().attitudes] == [1, 2, 4, 5, 6, 7, 8, 9]
+    with pytest.raises(OptionError, match="attitude 3: there is none of this number; expected one of 1 2 4 5 6 7 8 9"):
+        session.drop(3)
+
+
+def test_each_parameter_is_held_against_its_target():
+    recording = il.simulate_tumble(attitudes=16, order=1, gravity=9.81, gyro=False)
+    session, _ = session_of(recording, targets=read_targets("bias 100 ug, scale_factor 200 ppm"))
+    fit, known = session.guide.fit, {each.name: each for each in session.view().parameters}
+    for axis in "xyz":
+        bias, scale = (fit.calibration.parameters[f"{stem}_{axis}"] for stem in ("bias", "scale_factor"))
+        assert known[f"bias_{axis}"].share == pytest.approx(bias.standard_uncertainty / (1e-4 * 9.80665))
+        assert known[f"scale_factor_{axis}"].share == pytest.approx(scale.standard_uncertainty / scale.value / 2e-4)
+    assert {each.share for name, each in known.items() if name.startswith("misalignment")} == {None}
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from imulab.columns import triad
 from imulab.errors import ImulabError, ObservabilityError
 from imulab.gravity import Gravity
-from imulab.live.targets import Target, predicted_share, share_of
+from imulab.live.targets import Target, predicted_share, share_of, shares_of
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.fit import TumbleFit, fit_tumble
 from imulab.procedures.tumble.model import parameter_count, parameter_names
@@ -214,6 +214,13 @@ class Guide:
         if self.fit is None:
             return [float("inf")] * len(self.targets)
         return [share_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
+
+    def parameter_shares(self) -> dict[str, float]:
+        """Return the standard uncertainty over its target for each parameter that has one."""
+        if self.fit is None:
+            return {}
+        found = [shares_of(target, self.fit.calibration, self.local_gravity) for target in self.targets]
+        return {name: share for shares in found for name, share in shares.items()}
 
     def wanted(self) -> int:
         """Return how many attitudes the session will need in all, as far as can be told."""

@@ -87,12 +87,20 @@ class Runner:
             self.source.turn_to(self.session.next)
         return events
 
-    def drop(self) -> list[Event]:
-        """Drop the attitude that was named, or the last, from the session and from the recording."""
-        times = self.session.drop()
+    def drop(self, number: int | None = None) -> list[Event]:
+        """Drop an attitude, as `Session.drop` does, from the session and from the recording."""
+        times = self.session.drop(number)
         if times is not None:
             self.recorder.cut(times[0] - _BEFORE, times[1] + _BEHIND)
         return self.session.events
+
+    def listen(self, wait: float) -> list[Recording]:
+        """Return the samples that have come, after `wait` seconds at most, without session and recording."""
+        blocks: list[Recording] = []
+        for one in self.source.get(wait):
+            blocks += [one.data] if isinstance(one.data, Recording) else self._stream.feed(one.data, one.time)
+            self._answer()
+        return [block for block in blocks if len(block)]
 
     def close(self) -> None:
         """End the source, and write out the recording."""

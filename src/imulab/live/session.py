@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from imulab.columns import triad
-from imulab.errors import DataError
+from imulab.errors import DataError, OptionError
 from imulab.gravity import Gravity
 from imulab.live.guide import Attitude, Guide
 from imulab.live.holds import SHORTEST, SURE, Hold, Moment, Stillness
@@ -127,13 +127,24 @@ class Session:
         """Whether the unit still lies in an attitude that was dropped."""
         return self._dropping
 
-    def drop(self) -> tuple[float, float] | None:
-        """Drop the attitude that was named as knocked, or else the last; return its times, s, None without any."""
+    def drop(self, number: int | None = None) -> tuple[float, float] | None:
+        """Drop an attitude by its number, or else the one named as knocked, or the last; return its times, s.
+
+        None where there is no attitude at all.
+
+        Raises
+        ------
+        OptionError
+            There is none of this number.
+        """
         kept = self.guide.kept
         if not kept:
             return None
         knocked = [each for each in kept if each.number in self._aside]
-        gone = (knocked or kept)[-1]
+        gone = (knocked or kept)[-1] if number is None else next((e for e in kept if e.number == number), None)
+        if gone is None:
+            numbers = " ".join(str(each.number) for each in kept)
+            raise OptionError(f"attitude {number}: there is none of this number; expected one of {numbers}")
         self.events = []
         self.guide.drop(gone.number)
         if self._accepted is gone and self.state in ("still", "accepted"):
@@ -155,7 +166,10 @@ class Session:
         known: tuple[Known, ...] = ()
         if guide.fit is not None:
             rows = parameter_rows(guide.fit.calibration)
-            known = tuple(Known(row.name, row.value, row.standard_uncertainty, row.unit) for row in rows)
+            shares = guide.parameter_shares()
+            known = tuple(
+                Known(row.name, row.value, row.standard_uncertainty, row.unit, shares.get(row.name)) for row in rows
+            )
         seconds = self._time - (self._first or 0.0)
         reading = self._reading
         return View(

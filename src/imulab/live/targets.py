@@ -53,7 +53,12 @@ def read_targets(text: str | None) -> tuple[Target, ...]:
 
 def share_of(target: Target, record: Calibration, gravity: float) -> float:
     """Return the largest standard uncertainty of the target's parameters over the target; infinite without them."""
-    shares = []
+    return max(shares_of(target, record, gravity).values(), default=float("inf"))
+
+
+def shares_of(target: Target, record: Calibration, gravity: float) -> dict[str, float]:
+    """Return the standard uncertainty over the target for each of its parameters."""
+    shares = {}
     for name, parameter in record.parameters.items():
         if name.rpartition("_")[0] != target.stem or parameter.standard_uncertainty is None:
             continue
@@ -62,8 +67,8 @@ def share_of(target: Target, record: Calibration, gravity: float) -> float:
             size /= abs(parameter.value)
         elif target.stem[0] == "k":
             size *= gravity ** int(target.stem[1:])
-        shares.append(size / target.value)
-    return max(shares, default=float("inf"))
+        shares[name] = size / target.value
+    return shares
 
 
 def predicted_share(target: Target, uncertainties: dict[str, float], gravity: float) -> float:

@@ -23,12 +23,13 @@ class Held:
 
 @dataclass(frozen=True)
 class Known:
-    """A parameter as people read it."""
+    """A parameter as people read it, and its standard uncertainty over its target where it has one."""
 
     name: str
     value: float
     standard_uncertainty: float | None
     unit: str
+    share: float | None = None
 
 
 @dataclass(frozen=True)
