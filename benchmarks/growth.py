@@ -24,6 +24,7 @@ def rows() -> list[Row]:
         ("`tumble fit`, samples", _tumble),
         ("`array fuse` robust, rows x 6 gyros", _fuse),
         ("`allan`, samples", _allan),
+        ("`noise fit`, samples of six axes", _noise),
         ("`warmup fit`, 16 cycles, samples x 6 axes", _warmup),
         ("`centrifuge reduce`, samples of 3 channels", _centrifuge),
     ]
@@ -83,6 +84,14 @@ def _allan(folder: Path, size: int) -> list[str]:
     columns = {"time": np.arange(size) / 100, "gyro_x": rng.standard_normal(size)}
     il.write_csv(il.Recording(columns, {"time": "s", "gyro_x": "deg/s"}), folder / "in.csv")
     return ["allan", "in.csv"]
+
+
+def _noise(folder: Path, size: int) -> list[str]:
+    rng = np.random.default_rng(4)
+    columns = {f"{sensor}_{a}": rng.standard_normal(size) for sensor in ("gyro", "accel") for a in "xyz"}
+    units = {name: "deg/s" if name.startswith("gyro") else "m/s^2" for name in columns} | {"time": "s"}
+    il.write_csv(il.Recording({"time": np.arange(size) / 100, **columns}, units), folder / "in.csv")
+    return ["noise", "fit", "in.csv"]
 
 
 def _warmup(folder: Path, size: int) -> list[str]:

@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import imulab as il
+from imulab import readers
 from imulab.errors import ReadError, UnitError
 from imulab.readers import Layout, _text, load_layout, read, read_blocks
 from imulab.readers.layout import LayoutColumn
@@ -474,3 +476,16 @@ def test_a_line_without_an_end_is_refused_in_few_words(file):
     with pytest.raises(ReadError, match="line 1: expected a line of text, found more than 1048576 bytes") as met:
         read(file(b"a" * 3_000_000))
     assert len(str(met.value)) < 300
+
+
+def test_blocks_that_are_joined_as_they_are_read_make_the_same_recording(tmp_path, monkeypatch):
+    count = 150_000
+    columns = {"time": np.arange(count) / 100, "gyro_x": np.random.default_rng(1).standard_normal(count)}
+    il.write(il.Recording(columns, {"time": "s", "gyro_x": "deg/s"}, {"serial": "7"}), tmp_path / "long.parquet")
+    monkeypatch.setattr(readers, "_PART", 40_000)
+    found = il.read(tmp_path / "long.parquet")
+    assert {name: np.array_equal(values, columns[name]) for name, values in found.columns.items()} == {
+        "time": True,
+        "gyro_x": True,
+    }
+    assert (found.units["gyro_x"], found.metadata["serial"], found.first_row) == ("deg/s", "7", 1)

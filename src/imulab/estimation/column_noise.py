@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from imulab.estimation.noise_coefficients import (
 )
 from imulab.estimation.rows import leave_out
 from imulab.estimation.sampling import bridged, sampling_rate, steady_part
-from imulab.estimation.steps import Step, find_step
+from imulab.estimation.steps import Step, deviation_of_steps, find_step
 from imulab.recording import Array, Recording
 from imulab.units import from_si, parse_unit, si_unit
 from imulab.verdict import Note
@@ -122,11 +123,8 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     notes += [*more, *trimmed, *timing]
     moved = moved_columns(recording, names, rate)
     columns: dict[str, Any] = {}
-    noises = dict(
-        zip(
-            names, columns_noise([recording.si(n) for n in names], rate, [moved.get(n, "") for n in names]), strict=True
-        )
-    )
+    values = (recording.si(name) for name in names)  # one at a time: a long log is large
+    noises = dict(zip(names, columns_noise(values, rate, [moved.get(name, "") for name in names]), strict=True))
     for name in names:
         samples = recording.si(name)
         if name not in moved and (step := find_step(samples)) is not None:
@@ -158,9 +156,9 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
 def _check_squares(recording: Recording, names: list[str]) -> None:
     """Refuse samples whose squares, summed over a recording, are no numbers of this machine."""
     for name in names:
-        size = np.abs(recording.si(name))
-        index = int(np.argmax(size))
-        if size[index] > _LARGEST:
+        values = recording.si(name)
+        index = int(max(np.argmax(values), np.argmin(values), key=lambda k: abs(values[k])))
+        if abs(values[index]) > _LARGEST:
             raise DataError(
                 f"{recording.name}: {recording.place(index)}, column {name}: expected a reading, found "
                 f"{recording.column(name)[index]:.6g}, which is too large to be squared"
@@ -172,7 +170,7 @@ def _listed(values: Array | None) -> list[float | None] | None:
 
 
 def columns_noise(
-    columns: Sequence[Array], rate: float, moved: Sequence[str] = (), candidates: tuple[str, ...] = CANDIDATES
+    columns: Iterable[Array], rate: float, moved: Sequence[str] = (), candidates: tuple[str, ...] = CANDIDATES
 ) -> list[ColumnNoise]:
     """Return the Allan curves of columns, shape (n,) each, at a rate, Hz, and the coefficients of the model that fits.
 
@@ -184,17 +182,18 @@ def columns_noise(
     DataError, OptionError
         As for `allan_deviation`; fewer than 50 samples.
     """
-    curves = [allan_deviation(samples, rate) for samples in columns]
-    if len(columns[0]) < _FEWEST:
-        raise DataError(
-            f"noise coefficients: {len(columns[0])} samples are too few; expected some {_FEWEST} samples or more"
-        )
-    why = [
-        reason or _unfit(samples, float(curve.deviation[0]))
-        for samples, curve, reason in zip(columns, curves, moved or [""] * len(columns), strict=True)
-    ]
+    curves, why, stretches = [], [], []
+    for samples, reason in zip(columns, moved or repeat("")):  # noqa: B905
+        curves.append(allan_deviation(samples, rate))
+        if len(samples) < _FEWEST:
+            raise DataError(
+                f"noise coefficients: {len(samples)} samples are too few; expected some {_FEWEST} samples or more"
+            )
+        why.append(reason or _unfit(samples, float(curves[-1].deviation[0])))
+        stretches += [] if why[-1] else [[transformed(samples, 1 / rate)]]
+        del samples  # before the next is made
     fit = [k for k, reason in enumerate(why) if not reason]
-    found = analyses([[transformed(columns[k], 1 / rate)] for k in fit], candidates) if fit else []
+    found = analyses(stretches, candidates) if fit else []
     models = dict(zip(fit, zip(read_coefficients(found), found, strict=True), strict=True))
     return [
         ColumnNoise(curve, *(models[k] if k in models else (undetermined(why[k]),))) for k, curve in enumerate(curves)
@@ -277,7 +276,7 @@ def moved_columns(recording: Recording, names: list[str], rate: float) -> dict[s
         samples = recording.si(name)
         means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
         reach = float(np.ptp(means)) if means.size else 0.0
-        noise = float(np.diff(samples).std()) / math.sqrt(2 * size)
+        noise = deviation_of_steps(samples) / math.sqrt(2 * size)
         if reach > max(_STILL[quantity][0], _NOISE_REACH * noise):
             moved[name] = reach
     reasons: dict[str, str] = {}

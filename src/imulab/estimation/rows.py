@@ -153,7 +153,7 @@ def zero_rows(values: Sequence[Array], never_zero: bool = False) -> NDArray[np.b
 
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
     """Return the rows that repeat the row before in all columns, where the sensor does not do that by itself."""
-    same = [np.diff(column, prepend=np.nan) == 0 for column in values]
+    same = [np.concatenate([[False], column[1:] == column[:-1]]) for column in values]
     every = np.logical_and.reduce(same)
     count, n = int(np.count_nonzero(every)), len(every)
     by_chance = n * float(np.prod([np.count_nonzero(each) / n for each in same]))
@@ -179,33 +179,40 @@ def _far(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
 
     At rest only, since in motion there are knocks; but single zeros between values of one sign everywhere.
     """
-    steps = np.abs(np.diff(x))
+    steps = np.diff(x)
+    np.abs(steps, out=steps)
     far, alone = np.zeros((2, len(x)), dtype=np.bool_)
     count = len(steps) // _AROUND
-    local = np.sort(steps[: count * _AROUND].reshape(count, _AROUND)[:, : _AROUND // 2], axis=1)[:, _UPPER]
+    parts = steps[: count * _AROUND].reshape(count, _AROUND)
+    local = np.partition(parts[:, : _AROUND // 2], _UPPER, axis=1)[:, _UPPER]
     # Rest next to motion is no rest: the largest of a part's steps and its neighbours' counts.
     wide = np.maximum(local, np.maximum(np.append(local[1:], 0.0), np.concatenate([[0.0], local[:-1]])))
-    around = np.repeat(np.append(wide, wide[-1]), _AROUND)[: len(x)]
-    around = np.append(around, np.full(len(x) - len(around), wide[-1]))
-    if not (steps > 0).any():
+    resolution = float(np.min(steps, where=steps > 0, initial=np.inf))
+    if resolution == np.inf:
         return far, alone
-    resolution = float(steps[steps > 0].min())
     moving = wide > _QUIET * max(float(np.quantile(local, 0.2)), resolution)
     least = _FAR * resolution
-    limit = np.maximum(_FAR * _TO_SIGMA * around, least)
+    limits = np.maximum(_FAR * _TO_SIGMA * wide, least)
+
+    def part(samples: NDArray[np.intp]) -> NDArray[np.intp]:
+        return np.minimum(samples // _AROUND, count - 1)
+
     # A sample that is far from what is around it is a large step away from it, or from the one before.
-    suspect = np.flatnonzero(np.append(steps, 0.0) > limit)
-    suspect = suspect[~moving[np.minimum(suspect // _AROUND, len(wide) - 1)]]
+    suspect = np.flatnonzero(parts > limits[:, None])
+    rest = np.flatnonzero(steps[count * _AROUND :] > limits[-1]) + count * _AROUND
+    suspect = np.concatenate([suspect, rest])
+    suspect = suspect[~moving[part(suspect)]]
     index = np.unique(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
     middle = np.clip(index, _BESIDE, len(x) - 1 - _BESIDE)
     window = x[middle[:, None] + np.arange(-_BESIDE, _BESIDE + 1)]
     level = np.sort(window, axis=1)[:, _BESIDE]
     # A knock, or a turn that begins, moves more than two samples.
-    still = np.sort(np.abs(window - level[:, None]), axis=1)[:, -3] < limit[index] / 2
-    far[index] = still & (np.abs(x[index] - level) > limit[index])
+    limit = limits[part(index)]
+    still = np.sort(np.abs(window - level[:, None]), axis=1)[:, -3] < limit / 2
+    far[index] = still & (np.abs(x[index] - level) > limit)
     zero = np.flatnonzero(x[1:-1] == 0) + 1
     before, after = x[zero - 1], x[zero + 1]
-    away = np.minimum(np.abs(before), np.abs(after)) > np.maximum(_FAR_ZERO * around[zero], least)
+    away = np.minimum(np.abs(before), np.abs(after)) > np.maximum(_FAR_ZERO * wide[part(zero)], least)
     alone[zero[away & (before * after > 0)]] = True
     return far, alone
 

@@ -46,7 +46,7 @@ def find_step(samples: Array) -> Step | None:
         return None
     means = samples[: _BLOCKS * length].reshape(_BLOCKS, length).mean(axis=1)
     total = np.concatenate([[0.0], np.cumsum(means - means.mean())])
-    white = float(np.diff(samples).std()) / np.sqrt(length)
+    white = deviation_of_steps(samples) / np.sqrt(length)
     best, found = 1.0, None
     for width, limit in _LIMITS.items():
         place = np.arange(width, _BLOCKS - width + 1)
@@ -58,6 +58,13 @@ def find_step(samples: Array) -> Step | None:
             best = abs(change[index]) / least
             found = Step(float(change[index]), int(place[index]) * length, 4 * length)
     return found if found is not None and _jumps(means, found.sample // length) else None
+
+
+def deviation_of_steps(samples: Array) -> float:
+    """Return the standard deviation of the differences between neighbouring samples, shape (n,), n >= 2."""
+    step = np.diff(samples)
+    square = float(np.einsum("i,i", step, step)) / len(step)  # std would copy a long log twice
+    return float(np.sqrt(max(square - float(step.mean()) ** 2, 0.0)))
 
 
 def _jumps(means: Array, place: int) -> bool:

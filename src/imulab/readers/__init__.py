@@ -30,6 +30,8 @@ __all__ = ["Layout", "Selection", "load_layout", "read", "read_blocks"]
 _LOG = logging.getLogger(__name__)
 """Says of each file what it is, and how many rows of which times were read in how long."""
 _HEAD = 1 << 16
+_PART = 1 << 22
+"""Rows whose blocks are joined as they are read."""
 
 
 def read(
@@ -84,23 +86,31 @@ def read(
     selection = Selection(topic, instance, window, element)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
-    blocks = list(
-        _told(windowed(of_element(_blocks(file, name, known, selection, hashed), element, name), window, name))
-    )
-    source = Source(name, hashed.of(file))
-    first = blocks[0]
-    joined = {key: _joined([block.columns[key] for block in blocks]) for key in first.columns}
-    return Recording(
-        columns=joined,
-        units=first.units,
-        metadata=first.metadata,
-        name=first.name,
-        source=source,
-        first_row=first.first_row,
-        lines_before=first.lines_before,
-        notes=tuple(dict.fromkeys(note for block in blocks for note in block.notes)),
-        corrected_by=first.corrected_by,
-    )
+    blocks = _told(windowed(of_element(_blocks(file, name, known, selection, hashed), element, name), window, name))
+    first, parts, notes = _gathered(blocks)
+    source, units = Source(name, hashed.of(file)), first.units
+    first = replace(first, columns={})
+    # The parts of a column go as soon as they are joined, so that a large file is not in memory twice.
+    joined = {key: _joined([part.pop(key) for part in parts]) for key in list(parts[0])}
+    return replace(first, columns=joined, units=units, source=source, notes=notes)
+
+
+def _gathered(blocks: Iterator[Recording]) -> tuple[Recording, list[dict[str, Array]], tuple[str, ...]]:
+    """Return the first block, the columns of all in parts, and all notes.
+
+    Small arrays that go one by one leave holes, which the system does not get back: a part is of 32 MiB.
+    """
+    first = next(blocks)
+    parts, notes, begun = [dict(first.columns)], dict.fromkeys(first.notes), 0
+    rows = len(first)
+    for block in blocks:
+        parts.append(dict(block.columns))
+        notes |= dict.fromkeys(block.notes)
+        rows += len(block)
+        if rows >= _PART and next(iter(block.columns.values())).base is None:
+            parts[begun:] = [{key: np.concatenate([part.pop(key) for part in parts[begun:]]) for key in first.columns}]
+            begun, rows = len(parts), 0
+    return first, parts, tuple(notes)
 
 
 def read_blocks(

@@ -122,14 +122,15 @@ class Accumulator:
 
     def add(self, samples: Array) -> None:
         """Take the next samples, finite, shape (k,)."""
+        held = self._held + len(samples)
+        if held > WHOLE or (self._stretches and held >= STRETCH):
+            samples = np.concatenate([*self._waiting, samples]) if self._held else samples
+            stop = held // STRETCH * STRETCH
+            for start in range(0, stop, STRETCH):
+                self._transform(samples[start : start + STRETCH])
+            samples, self._waiting, self._held = samples[stop:], [], 0
         self._waiting.append(np.array(samples, dtype=np.float64))
         self._held += len(samples)
-        if self._held > WHOLE or (self._stretches and self._held >= STRETCH):
-            held = self._all()
-            stop = len(held) // STRETCH * STRETCH
-            for start in range(0, stop, STRETCH):
-                self._transform(held[start : start + STRETCH])
-            self._waiting, self._held = [held[stop:].copy()], len(held) - stop
 
     def stretch(self) -> Stretch:
         """Return the spectra of all samples; the accumulator takes no more."""
@@ -230,11 +231,7 @@ def binned(
 def transformed(samples: Array, interval: float, despike: bool = True) -> Stretch:
     """Return the spectra of samples in memory, finite, shape (n,): see `Accumulator`."""
     gathered = Accumulator(interval, despike)
-    if len(samples) <= WHOLE:
-        gathered.add(samples)
-    else:
-        for start in range(0, len(samples), WHOLE):
-            gathered.add(samples[start : start + WHOLE])
+    gathered.add(samples)
     return gathered.stretch()
 
 

@@ -180,12 +180,10 @@ def _clipped(values: Array) -> float | None:
     """Return the limit at which samples pile up: more than twice as many as at the next level; noise has fewer."""
     if len(np.unique(values[:_SEEN])) < _LEVELS:
         return None
-    for sign in (1.0, -1.0):
-        x = sign * values
-        top = float(x.max())
-        piled = int(np.count_nonzero(x == top))
+    for limit, outside, nearest in ((values.max(), np.less, np.max), (values.min(), np.greater, np.min)):
+        piled = int(np.count_nonzero(values == limit))
         if piled > _A_FEW:
-            below = float(x[x < top].max())
-            if piled > _PILED * int(np.count_nonzero(x == below)) + _A_FEW:
-                return sign * top
+            below = nearest(values[outside(values, limit)])
+            if piled > _PILED * int(np.count_nonzero(values == below)) + _A_FEW:
+                return float(limit)
     return None
