@@ -38,6 +38,7 @@ FUNCTIONS = {
     "warmup fit": il.fit_warmup,
     "warmup table": il.warmup_table,
     "noise fit": il.fit_noise,
+    "noise plan": il.plan_noise,
     "noise simulate": il.simulate_noise,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
@@ -198,6 +199,10 @@ MADE = {
         ["--temperatures", "-40,60", "--cycles", "1", "--units", "2", "--rate", "1", "-o", "one"],
         lambda out: il.simulate_warmup([-40, 60], cycles=1, units=2, rate=1.0).save(out),
     ),
+    "noise plan": (
+        ["--white", "0.3 deg/sqrt(h)", "--walk", "1e-6", "--for", "walk=20%", "--rate", "50", "-o", "one.csv"],
+        lambda out: il.plan_noise(white=DEGREE * 0.3 / 60, walk=1e-6, for_={"walk": 0.2}, rate=50.0).save(out),
+    ),
     "noise simulate": (
         [
             "--white",
@@ -290,10 +295,11 @@ def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
         lambda: il.plan_tumble(24, noise="20ug"),
         lambda: il.plan_warmup(),
         lambda: il.plan_centrifuge(),
+        lambda: il.plan_noise(white="0.3 deg/sqrt(h)", walk="10 deg/h/sqrt(h)", gm="5 deg/h:100 s"),
         lambda: il.simulate_centrifuge(),
         lambda: il.simulate_warmup(),
     ],
-    ids=["tumble", "warmup", "centrifuge", "rig", "cycles"],
+    ids=["tumble", "warmup", "centrifuge", "noise", "rig", "cycles"],
 )
 def test_results_show_themselves_in_twelve_lines_at_most(made):
     result = made()

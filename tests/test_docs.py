@@ -36,6 +36,7 @@ OF_COMMANDS = (
     "fleet_status",
     "merge_array",
     "plan_centrifuge",
+    "plan_noise",
     "plan_tumble",
     "plan_warmup",
     "run_fleet",

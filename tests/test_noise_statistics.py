@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from imulab.errors import OptionError
 from imulab.estimation.noise.choice import CANDIDATES, Averaged, average, choose
-from imulab.estimation.noise.duration import accuracy, length_for, visible
+from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
 from imulab.estimation.noise.intervals import profile
 from imulab.estimation.noise.likelihood import deviance, fit, information, time_limits
 from imulab.estimation.noise.terms import NAMES, Bins, allan_variance, letters, prepare, terms
@@ -21,11 +20,25 @@ def test_how_long_to_record_follows_the_rules_of_thumb():
     assert accuracy(walk, 0.1, 1e4)[[0, 2]] == pytest.approx([1 / np.sqrt(2e5), np.sqrt(2 / (walk[2] * 1e4))], rel=0.02)
     assert accuracy(flicker, 0.1, 1e4)[1] == pytest.approx(1.25 / (flicker[1] * 100), rel=0.05)
     assert accuracy(markov, 0.1, 1e4)[4:6] == pytest.approx([0.08, 0.22], rel=0.03)
-    assert length_for(walk, 0.1, 2, 0.1) == pytest.approx(115 * 100, rel=0.03)
-    assert length_for(markov, 0.1, 4, 0.1) == pytest.approx(65 * 100, rel=0.03)
-    assert length_for(markov, 0.1, 5, 0.1) == pytest.approx(500 * 100, rel=0.03)
-    with pytest.raises(OptionError, match="expected a term that the model has"):
-        length_for(walk, 0.1, 1, 0.1)
+    for model, parameter, wanted, close in (
+        (walk, 2, 115 * 100, 0.03),
+        (flicker, 1, 69 * 30, 0.1),
+        (markov, 4, 65 * 100, 0.03),
+        (markov, 5, 500 * 100, 0.03),
+    ):
+        lengths, reached = accuracy_curve(model, 0.1)
+        length = length_for(lengths, reached[:, parameter], 0.1)
+        assert length == pytest.approx(wanted, rel=close)
+        assert accuracy(model, 0.1, length)[parameter] == pytest.approx(0.1, rel=5e-3)
+    assert length_for(lengths, reached[:, 1], 0.1) == np.inf
+
+
+def test_a_narrow_band_and_a_ripple_tell_less():
+    """A quarter of the coefficients, half the accuracy; a ripple of 1 % ends it."""
+    white = values(white=1)
+    whole, quarter = (accuracy(white, 0.1, 1e6, highest)[0] for highest in (None, 1.25))
+    assert quarter / whole == pytest.approx(2, rel=0.02)
+    assert accuracy(white, 0.1, 1e9, ripple=0.01)[0] > 0.005 / np.sqrt(500)
 
 
 def test_limits_of_slow_noise_from_a_record_of_white_noise():

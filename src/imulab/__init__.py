@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from imulab.procedures.loading import load as load
     from imulab.procedures.noise.fit import NoiseFit as NoiseFit
     from imulab.procedures.noise.fit import fit_noise as fit_noise
+    from imulab.procedures.noise.plan import plan_noise as plan_noise
     from imulab.procedures.noise.simulate import simulate_noise as simulate_noise
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
@@ -113,6 +114,7 @@ _HOME = {
     "merge_array": "procedures.gyro_array.public",
     "normal_gravity": "gravity",
     "plan_centrifuge": "procedures.centrifuge.plan",
+    "plan_noise": "procedures.noise.plan",
     "plan_tumble": "procedures.tumble.planning",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",

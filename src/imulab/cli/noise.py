@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import math
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,6 +11,9 @@ from imulab.cli.fit_options import with_options
 from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, quantity
 from imulab.errors import OptionError
 from imulab.procedures.noise.task import OPTIONS
+
+if TYPE_CHECKING:
+    from imulab.procedures.noise.plan import NoisePlan
 
 White = Annotated[
     str | None, typer.Option(metavar="N", help="White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit.")
@@ -29,7 +33,7 @@ FromRecord = Annotated[
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    for function in (fit, simulate):
+    for function in (fit, plan, simulate):
         group.command(function.__name__)(function)
     return group
 
@@ -81,6 +85,72 @@ def fit(
     with labelled("--{}", ["rate", "step"]):
         wanted = noise_for(record, program, rate=hertz, step=seconds)
     finish(record, output, report, json=json, describe=lambda _: "\n".join(f"{k}: {v:.4g}" for k, v in wanted.items()))
+
+
+def plan(
+    source: FromRecord = None,
+    wanted: Annotated[
+        str,
+        typer.Option("--for", metavar="10%|walk=10%,..", help="Wanted standard uncertainty, of all terms or by name."),
+    ] = "10 %",
+    white: White = None,
+    flicker: Flicker = None,
+    walk: Walk = None,
+    quantisation: Quantisation = None,
+    gm: Markov = None,
+    rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the record, or 100 Hz.")] = None,
+    duration: Annotated[str | None, typer.Option(help="What a record of this length tells, s.")] = None,
+    columns: Annotated[str | None, typer.Option(metavar="A,A,...", help="Of the record.")] = None,
+    output: Annotated[
+        str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Uncertainties over the length, to write.")
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Say how long to record at rest for a wanted accuracy of each noise term."""
+    from imulab.procedures.noise.plan import plan_noise
+    from imulab.shown import aligned
+
+    check_outputs([output], [source] if source else [])
+    if output is not None and not output.lower().endswith(".csv"):
+        raise OptionError(f"{output}: expected a name that ends in .csv")
+    result = call(
+        plan_noise, from_=source, for_=wanted, white=white, flicker=flicker, walk=walk, quantisation=quantisation,
+        gm=gm, rate=rate, duration=duration, columns=columns,
+    )  # fmt: skip
+    if output:
+        result.save(output)
+    if json:
+        _print_plan(result)
+        return
+    lead, titles, rows = result.shown()
+    print("\n".join([lead, *aligned(titles, rows)]))
+    if output:
+        print(f"plan: {output}")
+
+
+def _print_plan(result: NoisePlan) -> None:
+    from imulab.procedures.noise.record import unit_of
+    from imulab.records.json_text import json_text
+
+    terms = [
+        {
+            "column": each.column,
+            "term": each.term,
+            "value": each.value,
+            "unit": unit_of(each.term, each.unit),
+            "relative_standard_uncertainty": finite(each.uncertainty),
+            "limit": finite(each.limit),
+            "wanted": finite(each.wanted),
+            "length": None if (length := finite(each.length)) is None else {"value": length, "unit": "s"},
+        }
+        for each in result.terms
+    ]
+    print(json_text({"length": {"value": result.length, "unit": "s"}, "terms": terms}), end="")
+
+
+def finite(value: float) -> float | None:
+    """Return a number, None where it is none."""
+    return value if math.isfinite(value) else None
 
 
 def simulate(

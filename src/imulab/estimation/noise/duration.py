@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.estimation.noise.band import within
 from imulab.estimation.noise.intervals import profile
 from imulab.estimation.noise.likelihood import Flags, fit, information, time_limits
 from imulab.estimation.noise.spectrum import Spectrum, bins
 from imulab.estimation.noise.terms import prepare
 from imulab.recording import Array
 
-_LONGEST = 1e10
-"""s; no record is as long."""
+LONGEST = 1e9
+"""s, 30 years: no record is as long."""
 _FEWEST, _DRAWN = 500, 100
+_PER_DECADE = 6
 
 
-def accuracy(values: Array, interval: float, length: float) -> Array:
+def accuracy(values: Array, interval: float, length: float, highest: float | None = None, ripple: float = 0.0) -> Array:
     """Return the relative standard uncertainty of each parameter from a record of a length, shape (8,).
 
     The Cramer-Rao bound of the logarithms, the root of the inverse of ``1/2 sum d (d ln lambda)(d ln lambda)'``; NaN
@@ -30,6 +31,10 @@ def accuracy(values: Array, interval: float, length: float) -> Array:
         Time between samples, s.
     length
         Length of the record, s.
+    highest
+        Up to which frequency the spectrum is used, Hz; half the sampling rate if not given.
+    ripple
+        eps, by how much the level of each bin is off the model, which more samples do not mend.
 
     Examples
     --------
@@ -38,40 +43,43 @@ def accuracy(values: Array, interval: float, length: float) -> Array:
     >>> round(float(accuracy(np.array([1.0, 0, 0, 0, 0, 0, 0, 0]), 0.01, 1e4)[0]), 6)
     0.000707
     """
-    covariance = information(prepare([_empty(interval, length)]), values)
+    covariance = information(prepare([_empty(interval, length, highest, ripple)]), values)
     return np.where(values > 0, np.sqrt(np.diag(covariance)), np.nan)
 
 
-def length_for(values: Array, interval: float, parameter: int, wanted: float) -> float:
-    """Return the length of a record, s, that determines a parameter to a relative standard uncertainty.
+def accuracy_curve(
+    values: Array, interval: float, highest: float | None = None, ripple: float = 0.0
+) -> tuple[Array, Array]:
+    """Return lengths of records, s, shape (t,), and what they tell, shape (t, 8), never less than a shorter one.
+
+    Arguments as for `accuracy`.
+    """
+    shortest = _FEWEST * interval
+    steps = max(int(np.ceil(_PER_DECADE * np.log10(LONGEST / shortest))), 1)
+    lengths = np.geomspace(shortest, max(LONGEST, 2 * shortest), steps + 1)
+    each = np.array([accuracy(values, interval, length, highest, ripple) for length in lengths.tolist()])
+    return lengths, np.minimum.accumulate(each, axis=0)
+
+
+def length_for(lengths: Array, reached: Array, wanted: float) -> float:
+    """Return the length of a record, s, that reaches a relative standard uncertainty; infinite where none does.
 
     Parameters
     ----------
-    values, interval
-        As for `accuracy`.
-    parameter
-        Its place in `NAMES`.
+    lengths, reached
+        Of `accuracy_curve`: s, and the uncertainty of one parameter, shapes (t,).
     wanted
         Relative standard uncertainty, for example 0.1.
-
-    Raises
-    ------
-    OptionError
-        The model has not got the parameter, or no record is long enough.
     """
-    if not values[parameter] > 0:
-        raise OptionError("length of a record: expected a term that the model has, found one that is 0")
-    low, high = np.log(_FEWEST * interval), np.log(_LONGEST)
-    if not accuracy(values, interval, _LONGEST)[parameter] <= wanted:
-        raise OptionError(f"accuracy {wanted:g}: expected one that a record of {_LONGEST:.0e} s can reach")
-    for _ in range(40):
-        middle = (low + high) / 2
-        reached = accuracy(values, interval, float(np.exp(middle)))[parameter] <= wanted
-        low, high = (low, middle) if reached else (middle, high)
-    return float(np.exp(high))
+    if not reached[-1] <= wanted:
+        return float("inf")
+    # Between the lengths of the curve the uncertainty is a power of the length; backwards, for it falls.
+    return float(np.exp(np.interp(np.log(wanted), np.log(reached[::-1]), np.log(lengths[::-1]))))
 
 
-def visible(values: Array, model: Flags, interval: float, length: float) -> Array:
+def visible(
+    values: Array, model: Flags, interval: float, length: float, highest: float | None = None, draws: int = _DRAWN
+) -> Array:
     """Return the 95 % limits that a record of a length sets to the terms of a model, shape (8,).
 
     The median upper end of the profile intervals over drawn spectra, the same at every call; NaN for terms that the
@@ -79,21 +87,26 @@ def visible(values: Array, model: Flags, interval: float, length: float) -> Arra
 
     Parameters
     ----------
-    values, interval, length
+    values, interval, length, highest
         As for `accuracy`: the noise that there is.
     model
         Its terms and those to be limited, shape (8,).
+    draws
+        How many spectra.
     """
-    spectrum = _empty(interval, length)
+    spectrum = _empty(interval, length, highest)
     frame, limits = prepare([spectrum]), time_limits([spectrum])
-    freedom = np.broadcast_to(spectrum.freedom, (_DRAWN, len(spectrum.freedom)))
-    power = frame.variances(values[None]) * np.random.default_rng(1).chisquare(freedom) / freedom
+    freedom = np.broadcast_to(spectrum.freedom, (draws, len(spectrum.freedom)))
+    used = np.maximum(freedom, 1)
+    power = frame.variances(values[None]) * np.random.default_rng(1).chisquare(used) / used
     best = fit(frame, model[None], limits, power, freedom)
     every = np.broadcast_to(model, best.values.shape)
     return np.asarray(np.median(profile(frame, best.values, every, limits, power, freedom)[1], axis=0))
 
 
-def _empty(interval: float, length: float) -> Spectrum:
+def _empty(interval: float, length: float, highest: float | None, ripple: float = 0.0) -> Spectrum:
     count = max(round(length / interval), _FEWEST)
     first, last = bins(count)
-    return Spectrum(interval, count, first, last, np.ones(len(first)), (last - first + 1).astype(np.float64))
+    many = (last - first + 1).astype(np.float64)
+    spectrum = Spectrum(interval, count, first, last, np.ones(len(first)), many / (1 + many * ripple**2 / 2))
+    return spectrum if highest is None else within(spectrum, highest)

@@ -77,7 +77,7 @@ def noise_log(
 ) -> NoiseLog:
     """Return a log to simulate; arguments and errors as for `simulate_noise`."""
     terms = {"white": white, "flicker": flicker, "walk": walk, "quantisation": quantisation, "gm": gm}
-    names = _names(columns)
+    names = names_given(columns)
     if from_ is None:
         by_columns = {_SENSORS[u] for u in _SENSORS if names and names[0].startswith(_SENSORS[u])}
         unit = next((u for u, sensor in _SENSORS.items() if sensor in by_columns), None)
@@ -122,7 +122,8 @@ def terms_of(record: Calibration, names: Sequence[str] | None) -> tuple[dict[str
     return values, {name: fit.columns[name].unit for name in kept}, fit.sample_rate.value
 
 
-def _names(columns: str | Sequence[str] | None) -> list[str] | None:
+def names_given(columns: str | Sequence[str] | None) -> list[str] | None:
+    """Return names of columns, given as such or as ``gyro_x,gyro_y``; errors as for `simulate_noise`."""
     if columns is None:
         return None
     names = [name.strip() for name in columns.split(",")] if isinstance(columns, str) else list(columns)

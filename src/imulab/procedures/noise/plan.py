@@ -1,0 +1,377 @@
+"""How long to record at rest for a wanted accuracy of each noise term."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imulab.errors import OptionError, listed
+from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
+from imulab.estimation.noise.terms import NAMES, SIGMA
+from imulab.estimation.noise.use import at_band_edge
+from imulab.procedures.inputs import as_record
+from imulab.procedures.noise.coefficients import Markov, given_terms
+from imulab.procedures.noise.engineering import label, shown
+from imulab.procedures.noise.sections import fit_of
+from imulab.procedures.noise.simulate import RATE, names_given, terms_of
+from imulab.quantities import fraction, in_si
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+from imulab.report.elements import QUIET, Figure, plain_number
+from imulab.report.plots import Plot
+from imulab.report.traces import DASHES, log_axis, rounded, scatter
+from imulab.shown import Shown
+from imulab.writers import write_csv
+
+WANTED = "10 %"
+_DRAWS = 30
+_ANY = ""
+_HOUR = 3600.0
+_UNITS = ((1.0, "s", 120.0), (60.0, "min", 120.0), (_HOUR, "h", 100.0), (24 * _HOUR, "d", math.inf))
+_COLOURS = ("#1f6f8b", "#c8553d", "#8e6bbd", "#c99a2e", "#4f9d69", "#22303a")
+
+
+@dataclass(frozen=True)
+class PlannedTerm:
+    """A term of a column, and what a record tells of it.
+
+    Attributes
+    ----------
+    column, term, unit
+        Names, as in a record, and the SI unit of the column.
+    value
+        SI; 0 of a term that is not seen.
+    uncertainty
+        Relative standard uncertainty from a record of the plan's length; NaN of a term that is not seen.
+    limit
+        SI, what such a record limits it to with 95 %; NaN of a term that is seen.
+    wanted
+        Relative standard uncertainty; NaN where none is wanted.
+    length
+        Of the record that reaches it, s; infinite where none does.
+    """
+
+    column: str
+    term: str
+    unit: str
+    value: float
+    uncertainty: float
+    limit: float
+    wanted: float
+    length: float
+
+
+@dataclass(frozen=True, repr=False)
+class NoisePlan(Shown):
+    """How long to record at rest.
+
+    Attributes
+    ----------
+    terms
+        Column by column.
+    length
+        Of the record that the uncertainties are of, s.
+    lengths
+        Of records, s, shape (t,).
+    reached
+        Relative standard uncertainty of each parameter from them, by column, shape (t, 8), in the order of the terms
+        white flicker walk quantisation gm1_sigma gm1_time gm2_sigma gm2_time; NaN where there is none.
+    """
+
+    terms: tuple[PlannedTerm, ...]
+    length: float
+    lengths: Array
+    reached: Mapping[str, Array]
+
+    @property
+    def needed(self) -> float:
+        """Length of the record that reaches all that is wanted, s."""
+        return max((each.length for each in self._wanted), default=0.0)
+
+    @property
+    def _wanted(self) -> list[PlannedTerm]:
+        return [each for each in self.terms if each.wanted > 0 and each.value > 0]
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return which record is needed, and what it tells of each term."""
+        titles = ["column", "term", "value", "unit", f"u, {duration_text(self.length)}", "wanted", "needs"]
+        return self._lead(), titles, [_row(each) for each in self.terms]
+
+    def _lead(self) -> str:
+        if not self._wanted:
+            return "No term that is wanted is seen; a longer record shows it, or lowers its limit."
+        longest = max(self._wanted, key=lambda each: each.length)
+        what = f"{longest.column}, {label(longest.term, longest.unit)}"
+        if math.isinf(longest.length):
+            return f"No record reaches {_percent(longest.wanted)} of {what}."
+        return f"A record of {duration_text(longest.length)} reaches what is wanted; longest for {what}."
+
+    def save(self, path: str | Path) -> None:
+        """Write the relative standard uncertainties over the length of a record as CSV.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        write_csv(self.curves(), path)
+
+    def curves(self) -> Recording:
+        """Return the relative standard uncertainty of each term over the length of a record, s."""
+        columns = {"length": self.lengths}
+        columns |= {
+            f"u_{each.column}_{each.term}": self.reached[each.column][:, NAMES.index(each.term)]
+            for each in self.terms
+            if each.value > 0
+        }
+        return Recording(columns, {"length": "s", **dict.fromkeys(list(columns)[1:], "1")}, {}, name="noise plan")
+
+    def plot(self) -> Plot:
+        """Return the accuracy of each term over the length of the record."""
+        return Plot(plan_figure(self), "Noise plan")
+
+
+def plan_figure(plan: NoisePlan) -> Figure:
+    """Return the relative standard uncertainty of each term over the length of the record, in h."""
+    known = [each for each in plan.terms if each.value > 0]
+    columns = list(dict.fromkeys(each.column for each in known))
+    kinds = list(dict.fromkeys(each.term for each in known))
+    top = min(max((each.length for each in plan._wanted if math.isfinite(each.length)), default=_HOUR) * 30, 1e9)
+    shown_ = plan.lengths <= max(top, 10 * plan.length)
+    traces: list[dict[str, Any]] = []
+    for each in known:
+        reached = 100 * plan.reached[each.column][shown_, NAMES.index(each.term)]
+        line = {
+            "color": _COLOURS[kinds.index(each.term) % len(_COLOURS)],
+            "dash": DASHES[columns.index(each.column) % len(DASHES)],
+        }
+        name = f"{each.column}, {label(each.term, each.unit)}"
+        traces.append(
+            scatter(rounded(plan.lengths[shown_] / _HOUR, 5), rounded(np.where(reached < 300, reached, np.nan), 5),
+                    "lines", name=name, line=line, hovertemplate="%{x:.3g} h: %{y:.2g} %<extra>" + name + "</extra>")
+        )  # fmt: skip
+    for wanted in sorted({each.wanted for each in plan._wanted}):
+        ends = plan.lengths[shown_][[0, -1]] / _HOUR
+        traces.append(
+            scatter(ends.tolist(), [100 * wanted] * 2, "lines", name=f"wanted, {_percent(wanted)}", hoverinfo="skip",
+                    line={"color": QUIET, "width": 1, "dash": "dot"})
+        )  # fmt: skip
+    return Figure(
+        title="Accuracy of each noise term over the length of the record",
+        caption="Relative standard uncertainty that a record at rest can reach (the Cramer-Rao bound). Four times the "
+        "record halves it, once the term is seen at all.",
+        traces=traces,
+        layout={"xaxis": log_axis("length of the record, h"), "yaxis": log_axis("standard uncertainty, %"),
+                "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}},
+        height=430,
+        message=plan._lead(),
+    )  # fmt: skip
+
+
+def duration_text(seconds: float) -> str:
+    """Return a length of time as people say it: ``35 min``, ``6.4 h``, ``12 d``."""
+    factor, unit = next((factor, unit) for factor, unit, most in _UNITS if seconds / factor < most)
+    return f"{plain_number(seconds / factor, 2)} {unit}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _row(each: PlannedTerm) -> list[str]:
+    factor, unit = shown(each.term, each.unit)
+    name = label(each.term, each.unit)
+    if not each.value > 0:
+        return [each.column, name, "not seen", unit, f"below {plain_number(each.limit * factor, 2)}", "–", "–"]
+    wanted = _percent(each.wanted) if each.wanted > 0 else "–"
+    needs = "–" if not each.wanted > 0 else "no record" if math.isinf(each.length) else duration_text(each.length)
+    value = plain_number(each.value * factor, 3)
+    return [each.column, name, value, unit, f"{plain_number(100 * each.uncertainty, 2)} %", wanted, needs]
+
+
+def plan_noise(
+    *,
+    from_: Calibration | str | PathLike[str] | None = None,
+    for_: float | str | Mapping[str, float | str] = WANTED,
+    white: float | str | None = None,
+    flicker: float | str | None = None,
+    walk: float | str | None = None,
+    quantisation: float | str | None = None,
+    gm: Markov | Sequence[Markov] | None = None,
+    rate: float | str | None = None,
+    duration: float | str | None = None,
+    columns: str | Sequence[str] | None = None,
+) -> NoisePlan:
+    """Say how long to record at rest for a wanted accuracy of each noise term.
+
+    The relative standard uncertainty of a parameter is the root of the diagonal of the inverse of
+    ``1/2 sum_b d_b (d ln lambda_b)(d ln lambda_b)'``, lambda_b the variance of the d_b cosine coefficients of
+    bin b: the Cramer-Rao bound of their logarithms, which the fit reaches.
+
+    Parameters
+    ----------
+    from_
+        A record of `fit_noise` or its file: its terms, band and rate.
+    for_
+        Wanted relative standard uncertainty, of the sizes of all terms or by name: ``"10 %"``,
+        ``"walk=10%,gm1_time=30%"``.
+    white, flicker, walk, quantisation, gm, rate
+        In place of a record: the terms, for example of a data sheet, and the sampling rate, as for `simulate_noise`.
+        A noise density of a data sheet is often one-sided: N is that over the root of 2.
+    duration
+        Also of what a record of this length tells, s; if not given, that of the record, or the one that is needed.
+    columns
+        Of the record.
+
+    Raises
+    ------
+    OptionError
+        There are neither terms nor a record, or a term that is wanted is none of them.
+    RecordError
+        The record is of another procedure.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.plan_noise(white="0.3 deg/sqrt(h)", walk="10 deg/h/sqrt(h)", for_="walk=10%")
+    A record of 6.1 h reaches what is wanted; longest for gyro, rate random walk.
+    column  term               value  unit           u, 6.1 h  wanted  needs
+    gyro    angle random walk  0.300  deg/sqrt(h)     0.048 %       –      –
+    gyro    rate random walk    10.0  deg/h/sqrt(h)    10.0 %    10 %  6.1 h
+    """
+    terms = {"white": white, "flicker": flicker, "walk": walk, "quantisation": quantisation, "gm": gm}
+    wanted = _read_wanted(for_)
+    seconds = None if duration is None else in_si(duration, "duration", "time", "s")
+    if seconds is not None and not 0 < seconds < 1e9:
+        raise OptionError(f"duration {seconds:g} s: expected more than 0")
+    if from_ is None:
+        given = given_terms(None, **terms)  # type: ignore[arg-type]
+        name = {"rad/s": "gyro", "m/s^2": "accel"}.get(given.unit, "output")
+        hertz = in_si(RATE if rate is None else rate, "rate", "frequency", "Hz")
+        if not 1e-3 <= hertz <= 1e6:
+            raise OptionError(f"rate {hertz:g} Hz: expected 0.001 to 1e6")
+        noise = {name: _Column(given.values, given.unit, 1 / hertz, None, 0.0, {}, 0.0)}
+        own = None
+    else:
+        for name, value in {**terms, "rate": rate}.items():
+            if value:
+                raise OptionError(f"{name}: the record says that already; expected either terms or a record")
+        noise, own = _of_record(as_record(from_, "plan_noise"), columns)
+    return _planned(noise, wanted, seconds or own)
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Noise of a column: parameters, SI unit, time between samples, f_max, ripple, limits of terms not seen, length."""
+
+    values: Array
+    unit: str
+    interval: float
+    highest: float | None
+    ripple: float
+    limits: Mapping[str, float]
+    length: float
+
+
+def _of_record(record: Calibration, columns: str | Sequence[str] | None) -> tuple[dict[str, _Column], float]:
+    values, units, _ = terms_of(record, names_given(columns))
+    fit = fit_of(record)
+    found = {}
+    for name in values:
+        column = fit.columns[name]
+        unseen = {
+            term: p.interval_95[1]
+            for term in NAMES
+            if (p := record.parameters.get(f"{name}_{term}")) is not None and p.value == 0 and p.interval_95
+        }
+        found[name] = _Column(
+            _without_edge(values[name], column.shortest_time.value), units[name], column.interval.value,
+            fit.band[name].value, column.ripple, unseen, column.length.value,
+        )  # fmt: skip
+    return found, max(fit.columns[name].length.value for name in values)
+
+
+def _without_edge(values: Array, shortest: float) -> Array:
+    """Without Gauss-Markov terms at the shortest time constant, which are the sensor's filter and no noise to plan."""
+    left = values.copy()
+    for k in np.flatnonzero(at_band_edge(values, shortest)).tolist():
+        left[[SIGMA[k], SIGMA[k] + 1]] = 0
+    return left
+
+
+def _planned(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: float | None) -> NoisePlan:
+    known = {
+        name
+        for column in noise.values()
+        for k, name in enumerate(NAMES)
+        if column.values[k] > 0 or name in column.limits
+    }
+    for name in wanted:
+        if name != _ANY and name not in known:
+            raise OptionError(f"for_ {name}: not among the terms; expected {listed(sorted(known), name)}")
+    reached: dict[str, Array] = {}
+    lengths: dict[tuple[str, str], float] = {}
+    grid = np.empty(0)
+    for name, column in noise.items():
+        grid, reached[name] = accuracy_curve(column.values, column.interval, column.highest, column.ripple)
+        for k, term in enumerate(NAMES):
+            want = _wanted(wanted, term)
+            if column.values[k] > 0:
+                lengths[name, term] = length_for(grid, reached[name][:, k], want) if want > 0 else math.nan
+    at = length or max((each for each in lengths.values() if math.isfinite(each)), default=_HOUR)
+    terms = [each for name, column in noise.items() for each in _terms(name, column, wanted, lengths, at, length)]
+    return NoisePlan(tuple(terms), at, grid, reached)
+
+
+def _terms(
+    name: str,
+    column: _Column,
+    wanted: Mapping[str, float],
+    lengths: Mapping[tuple[str, str], float],
+    at: float,
+    given: float | None,
+) -> list[PlannedTerm]:
+    """The terms of a column and what a record of length `at` tells of each; limits anew where it is another length."""
+    u = accuracy(column.values, column.interval, at, column.highest, column.ripple)
+    limits = dict(column.limits)
+    if limits and given is not None and not math.isclose(given, column.length, rel_tol=1e-3):
+        more = np.array([name in limits or value > 0 for name, value in zip(NAMES, column.values, strict=True)])
+        found = visible(column.values, more, column.interval, at, column.highest, _DRAWS)
+        limits = {term: float(found[NAMES.index(term)]) for term in limits}
+    terms = []
+    for k, term in enumerate(NAMES):
+        value, want = float(column.values[k]), _wanted(wanted, term)
+        if value > 0:
+            terms.append(PlannedTerm(name, term, column.unit, value, float(u[k]), math.nan, want, lengths[name, term]))
+        elif term in limits:
+            terms.append(PlannedTerm(name, term, column.unit, 0.0, math.nan, limits[term], want, math.nan))
+    return terms
+
+
+def _wanted(wanted: Mapping[str, float], term: str) -> float:
+    """What is wanted of a term; what is wanted of all is not of correlation times, which take longest."""
+    return wanted.get(term, math.nan if term.endswith("_time") else wanted.get(_ANY, math.nan))
+
+
+def _read_wanted(given: float | str | Mapping[str, float | str]) -> dict[str, float]:
+    """Wanted relative uncertainties by the name of a term; by '' that of all terms."""
+    pairs: Mapping[str, float | str]
+    if isinstance(given, Mapping):
+        pairs = given
+    elif isinstance(given, str) and "=" in given:
+        parts = [part.partition("=") for part in given.split(",")]
+        pairs = {name.strip(): value for name, _, value in parts}
+    else:
+        pairs = {_ANY: given}
+    wanted = {}
+    for name, value in pairs.items():
+        wanted[name] = fraction(value, f"for_ {name}".strip())
+        if not 1e-6 <= wanted[name] <= 1:
+            raise OptionError(f"for_ {value}: expected a share above 0 and up to 1, such as 10 % or walk=10%")
+    return wanted
