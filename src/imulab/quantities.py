@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
-from typing import Any
 
 from imulab.errors import OptionError, UnitError, quoted
 from imulab.units import parse_unit, to_si
@@ -164,26 +163,19 @@ def whole_number(text: str, option: str) -> int:
         raise OptionError(f"{option} {text!r}: expected a whole number") from None
 
 
-def chosen(
-    topic: str | None, instance: str | None, window: str | None, element: str | None = None, *, label: str = "--{}"
-) -> dict[str, Any]:
-    """Return the options of `read` that choose a part of a file; `label` is how messages call an option.
+def span(text: str, option: str) -> tuple[float | None, float | None]:
+    """Return a part of a recording's time such as ``10:60``, ``10:`` or ``:60``, s; None for an end that is not given.
 
     Raises
     ------
     OptionError
-        The instance or the element is no number, or the window is not FROM:TO.
+        It is none.
     """
-    part: tuple[float | None, ...] | None = None
-    if window is not None:
-        name = label.format("window")
-        ends = _BETWEEN.split(window.strip())
-        if len(ends) != 2 or not any(end.strip() for end in ends):
-            raise OptionError(f"{name} {window!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
-        part = tuple(quantity(end, name, "time", "s") if end.strip() else None for end in ends)
-    number = None if instance is None else whole_number(instance, label.format("instance"))
-    one = None if element is None else whole_number(element, label.format("element"))
-    return {"topic": topic, "instance": number, "window": part, "element": one}
+    ends = _BETWEEN.split(text.strip())
+    if len(ends) != 2 or not any(end.strip() for end in ends):
+        raise OptionError(f"{option} {text!r}: expected FROM:TO in seconds, such as 10:60, 10: or :60")
+    first, last = (quantity(end, option, "time", "s") if end.strip() else None for end in ends)
+    return first, last
 
 
 def interval(text: str, option: str) -> tuple[float, float]:

@@ -6,30 +6,23 @@ from typing import Annotated, Any
 
 import typer
 
+from imulab.cli.fit_options import READ, reading, with_options
 from imulab.cli.options import (
     AsJson,
-    Element,
-    Instance,
-    LayoutFile,
     RecordingFile,
     ReportFile,
-    Topic,
-    Window,
     check_outputs,
-    chosen,
     warn,
 )
 from imulab.printable import printable
 
 
+@with_options(READ)
 def allan(
     file: RecordingFile,
+    *,
     taus: Annotated[str, typer.Option(help="octave, or dense (24 a decade).")] = "octave",
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
+    options: dict[str, str | None],
     report: ReportFile = None,
     json: AsJson = False,
 ) -> None:
@@ -38,8 +31,8 @@ def allan(
     from imulab.quantities import labelled
     from imulab.readers import read
 
-    check_outputs([report], [name for name in (file, layout) if name])
-    recording = read(file, layout, **chosen(topic, instance, window, element))
+    check_outputs([report], [name for name in (file, options["layout"]) if name])
+    recording = read(file, **reading(options))
     with labelled("--{}", ["taus"]):
         found = analyse(recording, taus)
     if report:

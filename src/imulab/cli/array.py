@@ -4,32 +4,30 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import with_options
+from imulab.cli.fit_options import reading, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
-    Instance,
-    LayoutFile,
     OutputFile,
     RecordingFile,
     ReportFile,
-    Topic,
-    Window,
     call,
     check_outputs,
-    chosen,
     progress_bar,
     quantity,
     warn,
     whole_number,
     with_notes,
 )
+from imulab.device.methods import METHODS
 from imulab.errors import OptionError
-from imulab.procedures.gyro_array.task import OPTIONS
+from imulab.procedures.gyro_array.task import MEMORY, METHOD, OPTIONS
+from imulab.procedures.options import READING
 
 if TYPE_CHECKING:
     from imulab.device.blob import Blob
@@ -37,6 +35,8 @@ if TYPE_CHECKING:
     from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
+_METHOD = replace(METHOD, help=f"{' '.join(METHODS)}; the calibration's, or robust.")
+_MEMORY = replace(MEMORY, help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing.")
 CalibrationFile = Annotated[
     str | None, typer.Option("--calibration", metavar="RECORD", help="Record of array calibrate, taken off first.")
 ]
@@ -91,26 +91,25 @@ def simulate(
     print(f"{output}: {len(recording)} samples, {elements} gyros on each axis, serial {recording.metadata['serial']}")
 
 
+@with_options(READING)
 def merge(
     files: Annotated[list[str], typer.Argument(metavar="FILE FILE...", help="Recordings, a gyroscope each.")],
+    *,
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT", help="Recording of the array to write.")],
     axis: Annotated[str | None, typer.Option(metavar="x|y|z", help="Take this axis of each.")] = None,
     column: Annotated[str | None, typer.Option(metavar="NAME", help="Take this column of each.")] = None,
     align: Annotated[bool, typer.Option("--align", help="Move the clocks to where the motion fits the first.")] = False,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
+    options: dict[str, str | None],
 ) -> None:
     """Join files of one gyroscope each to the recording of an array, by time, at the times of the first file."""
     from imulab.cli.options import note, read_recording
     from imulab.procedures.gyro_array.public import merge_array
     from imulab.writers import check_writable, write
 
-    check_outputs([output], [*files, *([layout] if layout else [])])
-    reading = chosen(topic, instance, window)
+    check_outputs([output], [*files, *([options["layout"]] if options["layout"] else [])])
+    how = reading(options)
     check_writable(output)
-    recordings = [read_recording(file, layout, reading) for file in files]
+    recordings = [read_recording(file, **how) for file in files]
     merged = call(merge_array, recordings, axis=axis, column=column, align=align)
     write(merged.recording, output)
     for message in merged.notes:
@@ -138,18 +137,10 @@ def calibrate(
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 
 
+@with_options((_METHOD, _MEMORY, *READING))
 def fuse(
     file: RecordingFile,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            help="mean support least-squares feedback robust covariance kalman; the calibration's, or robust."
-        ),
-    ] = None,
-    memory: Annotated[
-        str | None,
-        typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing."),
-    ] = None,
+    options: dict[str, str | None],
     initial_bias: Annotated[
         str, typer.Option("--initial-bias", metavar="first|zero|RECORD", help="Biases to start from.")
     ] = "first",
@@ -158,10 +149,6 @@ def fuse(
     still: Annotated[
         str | None, typer.Option("--still", metavar="FROM:TO", help="The unit is known to be at rest then, s.")
     ] = None,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
     output: OutputFile = None,
 ) -> None:
     """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
@@ -172,14 +159,15 @@ def fuse(
     from imulab.writers import check_writable, write, write_csv_to
 
     records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
-    check_outputs([output], [name for name in (file, layout, *records) if name])
-    reading = chosen(topic, instance, window)
+    check_outputs([output], [name for name in (file, options["layout"], *records) if name])
+    how = reading(options)
     if output:
         check_writable(output)
+    method, memory = options["method"], options["memory"]
     fusion_text(method, memory)  # refuses before a record is read
     known = None if calibration is None else _load_any(calibration)
     by = fusion_text(method, memory, held=carried(known))
-    options = FuseOptions(
+    settings = FuseOptions(
         method=by.method,
         memory="growing" if by.memory is None else by.memory,
         start=by.start,
@@ -188,8 +176,8 @@ def fuse(
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
         still=None if still is None else interval(still, "--still"),
     )
-    fuser = Fuser(options, tell=warn) if file == "-" else Fuser(options)  # a stream may never end
-    blocks = (fused_recording(part) for part in fuser.fuse(with_notes(read_blocks(file, layout, **reading))))
+    fuser = Fuser(settings, tell=warn) if file == "-" else Fuser(settings)  # a stream may never end
+    blocks = (fused_recording(part) for part in fuser.fuse(with_notes(read_blocks(file, **how))))
     if output:
         write(blocks, output)
     else:
@@ -244,21 +232,16 @@ def _say(fuser: Fuser, *, verdict: bool) -> None:
         warn(line)
 
 
+@with_options((_MEMORY, *READING))
 def compare(
     file: Annotated[str | None, typer.Argument(metavar="FILE", help="Recording, with or without truth_rate.")] = None,
+    *,
     calibration: CalibrationFile = None,
     experiment: Annotated[
         str | None, typer.Option(metavar="static|dynamic", help="Run the source's set-up instead of a FILE.")
     ] = None,
     seeds: Annotated[str, typer.Option(help="Runs of the experiment.")] = "20",
-    memory: Annotated[
-        str | None,
-        typer.Option(help="growing, growing:COUNT, or a gain between 0 and 1; the calibration's, or growing."),
-    ] = None,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
+    options: dict[str, str | None],
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -269,11 +252,11 @@ def compare(
 
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
-    check_outputs([output, report], [name for name in (file, calibration, layout) if name])
-    reading = chosen(topic, instance, window)
+    check_outputs([output, report], [name for name in (file, calibration, options["layout"]) if name])
+    how = reading(options)
     count = whole_number(seeds, "--seeds")
     if experiment is not None:
-        if output or report or memory:
+        if output or report or options["memory"]:
             raise OptionError("array compare: -o, --report and --memory need a FILE")
         from imulab.procedures.gyro_array.experiments import run_experiment
 
@@ -291,11 +274,9 @@ def compare(
     from imulab.readers import read
 
     record = None if calibration is None else _load(calibration, "--calibration")
-    by = fusion_text(None, memory, held=carried(record))
+    by = fusion_text(None, options["memory"], held=carried(record))
     kept = "growing" if by.memory is None else by.memory
-    comparison = compare_methods(
-        read(str(file), layout, **reading), calibration=record, memory=kept, count_from=by.start
-    )
+    comparison = compare_methods(read(str(file), **how), calibration=record, memory=kept, count_from=by.start)
     write_both(comparison.record, output, report)
     if not json:
         print(verdict_line(comparison.record.verdict))

@@ -7,16 +7,11 @@ from collections.abc import Iterable
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from imulab.cli.fit_options import READ, reading, with_options
 from imulab.cli.options import (
-    Element,
-    Instance,
-    LayoutFile,
     OutputFile,
     RecordingFile,
-    Topic,
-    Window,
     check_outputs,
-    chosen,
     with_notes,
 )
 
@@ -24,20 +19,17 @@ if TYPE_CHECKING:
     from imulab.recording import Recording
 
 
+@with_options(READ)
 def convert(
     file: RecordingFile,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
+    options: dict[str, str | None],
     output: OutputFile = None,
 ) -> None:
     """Write a recording of any kind as native CSV or Parquet to OUT, or as CSV to standard output."""
     from imulab.readers import read_blocks
 
-    check_outputs([output], [name for name in (file, layout) if name])
-    write_out(with_notes(read_blocks(file, layout, **chosen(topic, instance, window, element))), output)
+    check_outputs([output], [name for name in (file, options["layout"]) if name])
+    write_out(with_notes(read_blocks(file, **reading(options))), output)
 
 
 def write_out(blocks: Iterable[Recording], output: str | None) -> None:

@@ -1,14 +1,22 @@
-"""A fit's options on the command line, made from the procedure's own definition of them."""
+"""Options on the command line, made from the one definition that manifests and functions share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
 import typer
 
-from imulab.procedures.options import Option
+from imulab.procedures.options import ELEMENT, FLAG, READING, Option, read_options
+
+READ = (*READING, ELEMENT)
+"""How a recording is read."""
+
+
+def reading(texts: Mapping[str, str | None]) -> dict[str, Any]:
+    """Return the options of `imulab.read`, from the texts of those that a command has."""
+    return read_options([option for option in READ if option.name in texts], texts, FLAG)
 
 
 def with_options(options: Sequence[Option]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

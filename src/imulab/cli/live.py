@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from imulab.cli.options import GivenFiles, LayoutFile, OutputFile, ReportFile, check_outputs, note, whole_number
+from imulab.cli.fit_options import with_options
+from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, whole_number
 from imulab.errors import OptionError
+from imulab.procedures.options import FLAG, LAYOUT
+from imulab.procedures.tumble.task import GRAVITY, ORDER, TASK
 
 if TYPE_CHECKING:
     from imulab.live.formats import UnknownFormatError
@@ -19,6 +22,7 @@ _WAIT = 0.05
 _EVERY = 0.1
 
 
+@with_options((ORDER, *GRAVITY, LAYOUT))
 def live(
     source: Annotated[
         str,
@@ -28,15 +32,11 @@ def live(
             "simulate[:key=value,..].",
         ),
     ],
+    *,
     save: Annotated[str | None, typer.Option("--save", metavar="REC.csv", help="Recording to write.")] = None,
     output: OutputFile = None,
     report: ReportFile = None,
-    gravity: Annotated[
-        str | None, typer.Option(metavar="G", help="Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002.")
-    ] = None,
-    latitude: Annotated[str | None, typer.Option(metavar="DEG", help="Latitude, deg, for normal gravity.")] = None,
-    height: Annotated[str | None, typer.Option(metavar="M", help="Height above the ellipsoid, m.")] = None,
-    order: Annotated[str, typer.Option(metavar="auto|0..5|blend", help="Order of the fit.")] = "auto",
+    options: dict[str, str | None],
     target: Annotated[
         str | None,
         typer.Option(metavar='"bias 100 ug, .."', help="Standard uncertainties at which it is enough."),
@@ -44,7 +44,6 @@ def live(
     attitudes: Annotated[
         str | None, typer.Option(metavar="N", help="Number of attitudes, instead of a target.")
     ] = None,
-    layout: LayoutFile = None,
     plain: Annotated[bool, typer.Option("--plain", help="A line for each event; ends when it is enough.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file of --save.")] = False,
     follow: Annotated[bool, typer.Option("--follow", help="The simulated unit does what the guide says.")] = False,
@@ -54,28 +53,26 @@ def live(
     The recording is written out every second; at its end the record is that of `imulab tumble fit` on it.
     """
     from imulab.cli.result import finish
-    from imulab.gravity import gravity_option
     from imulab.live.formats import UnknownFormatError
     from imulab.live.runner import Runner
     from imulab.live.session import Session
     from imulab.live.sources import open_source
     from imulab.live.targets import read_targets
-    from imulab.procedures.registry import PROCEDURES
-    from imulab.procedures.run import FLAG, run_task
+    from imulab.procedures.run import run_task
 
     if source == "serial:":
         _list_ports()
         return
     if save is None:
         raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
-    texts = {"order": order, "gravity": gravity, "latitude": latitude, "height": height}
-    values = PROCEDURES["tumble"].task.values({key: text for key, text in texts.items() if text is not None}, FLAG)
+    layout = options["layout"]
+    values = TASK.values({name: text for name, text in options.items() if text is not None}, FLAG)
     planned = None if attitudes is None else whole_number(attitudes, "--attitudes")
     if planned is not None and not 4 <= planned <= 200:
         raise OptionError(f"--attitudes {planned}: expected 4 to 200")
     if planned is not None and target is not None:
         raise OptionError("--attitudes together with --target: expected one or the other")
-    session = Session(values["order"], gravity_option(gravity, latitude, height, FLAG), read_targets(target), planned)
+    session = Session(values["order"], values["gravity"], read_targets(target), planned)
     replayed = [source.partition(":")[2].rpartition("@")[0] or source.partition(":")[2]]
     check_outputs([save, output, report], [name for name in (*replayed, layout) if name])
     known = _layout(layout)
@@ -87,7 +84,7 @@ def live(
         raise
     finally:
         runner.close()
-    record = run_task("tumble", [save], texts, GivenFiles())
+    record = run_task("tumble", [save], {**options, "layout": None}, GivenFiles())
     finish(record, output, report, json=False)
     note(f"the recording is {save}; imulab tumble fit {save} makes the same record")
 

@@ -15,7 +15,6 @@ from imulab.cli.speech import hold, speech
 from imulab.cli.speech import note as note
 from imulab.cli.speech import warn as warn
 from imulab.errors import ImulabError, OptionError
-from imulab.quantities import chosen as chosen
 from imulab.quantities import labelled
 from imulab.quantities import quantity as quantity
 from imulab.quantities import whole_number as whole_number
@@ -28,22 +27,8 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; - reads standard input.")]
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
-LayoutFile = Annotated[
-    str | None,
-    typer.Option("--layout", metavar="NAME|L.toml", help="Columns of a foreign file; see imulab show --formats."),
-]
 OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
 ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]
-Topic = Annotated[
-    str | None, typer.Option("--topic", metavar="TOPIC", help="Topic of a bag or log, where there are several.")
-]
-Instance = Annotated[
-    str | None, typer.Option("--instance", metavar="N", help="Sensor of a flight log, from 0; the first if not given.")
-]
-Window = Annotated[
-    str | None, typer.Option("--window", metavar="FROM:TO", help="Part to read, s; either side may be left out.")
-]
-Element = Annotated[str | None, typer.Option("--element", metavar="N", help="One IMU of a file of several, from 1.")]
 _PAPER = (".pdf", ".png", ".svg", ".docx")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
@@ -67,11 +52,11 @@ def with_notes(
             said |= {kind, said_of}
 
 
-def read_recording(file: str, layout: str | None, part: dict[str, Any]) -> Recording:
+def read_recording(file: str, **how: Any) -> Recording:
     """Read a recording as a whole, and warn where it was cut, in the line of a refusal if there is one."""
     from imulab.readers import read
 
-    recording = read(file, layout, **part)
+    recording = read(file, **how)
     list(with_notes([recording], notes=False, tell=hold))
     return recording
 
@@ -87,7 +72,7 @@ class GivenFiles:
 
     def recording(self, name: str, layout: str | None, **part: Any) -> Recording:
         """Read a recording as a whole, and warn where it was cut."""
-        return read_recording(name, layout, part)
+        return read_recording(name, layout=layout, **part)
 
     def record(self, name: str) -> Calibration:
         """Read a calibration record."""

@@ -11,17 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from imulab.cli.convert import write_out
+from imulab.cli.fit_options import READ, reading, with_options
 from imulab.cli.options import (
     AsJson,
-    Element,
-    Instance,
-    LayoutFile,
     OutputFile,
     RecordFile,
-    Topic,
-    Window,
     check_outputs,
-    chosen,
     is_json,
     naming,
     note,
@@ -43,13 +38,10 @@ def add_commands(app: typer.Typer) -> None:
         app.command(name)(function)
 
 
+@with_options(READ)
 def apply(
     files: Annotated[list[str], typer.Argument(metavar="RECORD... FILE", help="Records, then the recording.")],
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
+    options: dict[str, str | None],
     again: Annotated[bool, typer.Option("--again", help="Correct a recording that a record corrected before.")] = False,
     latest_start: Annotated[
         str,
@@ -74,7 +66,7 @@ def apply(
         raise OptionError("apply: expected at least one RECORD and the FILE to correct")
     *names, file = files
     check_outputs([output], files)
-    part = chosen(topic, instance, window, element)
+    how = reading(options)
     try:
         records = [load_any(name) for name in names]
     except RecordError:
@@ -94,7 +86,7 @@ def apply(
                     latest_start=start,
                 )
             )
-    blocks = with_notes(read_blocks(file, layout, **part), notes=False)
+    blocks = with_notes(read_blocks(file, **how), notes=False)
     if temperature_column and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
@@ -144,15 +136,13 @@ def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> I
             warn(f"{name}: {beyond_message(record, count, most)}")
 
 
+@with_options(READ)
 def show(
     files: Annotated[
         list[str] | None, typer.Argument(metavar="FILE [FILE]", help="Record or recording, or two records.")
     ] = None,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
+    *,
+    options: dict[str, str | None],
     formats: Annotated[bool, typer.Option("--formats", help="List the kinds of recording that can be read.")] = False,
     json: AsJson = False,
 ) -> None:
@@ -173,15 +163,15 @@ def show(
     from imulab.procedures.loading import load
     from imulab.readers import read_blocks
 
-    if layout is None and is_blob(file):
+    if options["layout"] is None and is_blob(file):
         blob = load_blob(file)
         print(dumps(blob.text, indent=1, ensure_ascii=False) if json else describe_blob(blob))
         return
-    if layout is None and is_json(file):
+    if options["layout"] is None and is_json(file):
         record = load(file)
         print(record.to_json().rstrip("\n") if json else describe_record(record))
         return
-    blocks = read_blocks(file, layout, **chosen(topic, instance, window, element))
+    blocks = read_blocks(file, **reading(options))
     print(recording_json(blocks) if json else describe_recording(blocks))
 
 

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import replace
+from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import with_options
+from imulab.cli.fit_options import READ, reading, with_options
 from imulab.cli.options import (
     AsJson,
-    Element,
     GivenFiles,
-    Instance,
-    LayoutFile,
     OutputFile,
+    RecordFile,
     RecordingFile,
     ReportFile,
-    Topic,
-    Window,
     call,
     check_outputs,
-    chosen,
     progress_bar,
     quantity,
     read_recording,
@@ -28,10 +24,10 @@ from imulab.cli.options import (
     whole_number,
 )
 from imulab.cli.result import finish
-from imulab.procedures.tumble.task import OPTIONS
+from imulab.procedures.options import FLAG
+from imulab.procedures.tumble.task import GRAVITY, OPTIONS
 
-if TYPE_CHECKING:
-    pass
+_OF_THE_RECORD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the file's head, else of the record.")
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -135,21 +131,19 @@ def fit(
     finish(record, output, report, json=json)
 
 
+@with_options(READ)
 def gyro(
     file: RecordingFile,
+    *,
     accel: Annotated[str, typer.Option("--accel", metavar="RECORD", help="Tumble record of the accelerometers.")],
     accel_file: Annotated[
         str | None,
         typer.Option("--accel-file", metavar="FILE", help="Accelerometers' recording, if not the same file."),
     ] = None,
-    layout: LayoutFile = None,
     accel_layout: Annotated[
         str | None, typer.Option("--accel-layout", metavar="L.toml", help="Columns of the accelerometers' file.")
     ] = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
+    options: dict[str, str | None],
     fit_bias: Annotated[bool, typer.Option("--fit-bias", help="Fit the biases to the turns too.")] = False,
     g_sensitivity: Annotated[str, typer.Option(help="auto, yes or no.")] = "auto",
     clock: Annotated[
@@ -169,14 +163,14 @@ def gyro(
     from imulab.procedures.tumble.gyrorecord import with_gyro
     from imulab.procedures.tumble.segment import find_attitudes
 
-    inputs = [name for name in (file, accel, accel_file, layout, accel_layout) if name]
+    inputs = [name for name in (file, accel, accel_file, options["layout"], accel_layout) if name]
     check_outputs([output, report], inputs)
     record = load(accel)
-    part = chosen(topic, instance, window, element)
-    recording = read_recording(file, layout, part)
+    how = reading(options)
+    recording = read_recording(file, **how)
     own = recording
     if accel_file is not None:
-        own = read_recording(accel_file, accel_layout or layout, {"element": part["element"]})
+        own = read_recording(accel_file, layout=accel_layout or how["layout"], element=how["element"])
     result = fit_gyro(
         record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
@@ -190,20 +184,13 @@ def gyro(
     )
 
 
+@with_options((_OF_THE_RECORD, *GRAVITY[1:], *READ))
 def check(
-    record: Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")],
+    record: RecordFile,
     file: RecordingFile,
-    layout: LayoutFile = None,
-    topic: Topic = None,
-    instance: Instance = None,
-    window: Window = None,
-    element: Element = None,
+    *,
+    options: dict[str, str | None],
     limit: Annotated[str | None, typer.Option(help="Largest | |f| - g | that passes, mg, beside the test.")] = None,
-    gravity: Annotated[
-        str | None, typer.Option(help="Local gravity, m/s^2; else of the file's head, else of the record.")
-    ] = None,
-    latitude: Annotated[str | None, typer.Option(help="Latitude, deg, for normal gravity.")] = None,
-    height: Annotated[str | None, typer.Option(help="Height above the ellipsoid, m.")] = None,
     report: ReportFile = None,
     json: AsJson = False,
 ) -> int:
@@ -219,11 +206,11 @@ def check(
     from imulab.procedures.tumble.compare import check_tumble
     from imulab.procedures.tumble.segment import find_attitudes
 
-    check_outputs([report], [name for name in (record, file, layout) if name])
+    check_outputs([report], [name for name in (record, file, options["layout"]) if name])
     held = load(record)
-    local = gravity_option(gravity, latitude, height, "--{}")
+    local = gravity_option(options["gravity"], options["latitude"], options["height"], FLAG)
     largest = None if limit is None else quantity(limit, "--limit", "acceleration", "mg")
-    attitudes = find_attitudes(read_recording(file, layout, chosen(topic, instance, window, element)))
+    attitudes = find_attitudes(read_recording(file, **reading(options)))
     try:
         result = check_tumble(held, attitudes, limit=largest, gravity=local)
     except RecordError as error:

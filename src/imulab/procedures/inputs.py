@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.frames import Frame, columns_of_arrays, is_frame
-from imulab.quantities import chosen
+from imulab.quantities import span
 from imulab.readers import Layout, read, read_blocks
 from imulab.readers.selection import Selection, of_element, windowed
 from imulab.recording import Recording, Source
@@ -201,7 +201,7 @@ def _part(given: Mapping[str, Any], called: str) -> dict[str, Any]:
     """Return window and element as `read` takes them."""
     window, element = given.get("window"), given.get("element")
     if isinstance(window, str):
-        window = chosen(None, None, window, label=f"{called}: {{}}")["window"]
+        window = span(window, f"{called}: window")
     if window is not None and not (isinstance(window, tuple | list) and len(window) == 2):
         raise OptionError(f"{called}: window {quoted(window)}: expected (FROM, TO) in s, such as (10, 60) or '10:60'")
     for key in ("element", "instance"):

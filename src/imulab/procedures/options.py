@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from imulab.errors import OptionError, listed
-from imulab.quantities import chosen, number, quantity, whole_number
+from imulab.quantities import number, quantity, span, whole_number
 
+FLAG = "--{}"
+"""How the command line calls an option in its messages."""
 _SWITCH = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
 
 
@@ -102,24 +104,24 @@ def file_option(name: str, help: str, shows: str) -> Option:  # noqa: A002
     return Option(name, help, lambda text, _: text, None, shows, names_file=True)
 
 
-LAYOUT = file_option("layout", "Columns of a foreign file: L.toml, or a name from show --formats.", "LAYOUT")
+LAYOUT = file_option("layout", "Columns of a foreign file; see imulab show --formats.", "NAME|L.toml")
 READING = (
     LAYOUT,
     text_option("topic", "Topic of a bag or log, where there are several.", shows="TOPIC"),
-    text_option("instance", "Sensor of a flight log, from 0; the first if not given.", shows="N"),
-    text_option("window", "Part to read, s; either side may be left out.", shows="FROM:TO"),
+    whole("instance", "Sensor of a flight log, from 0; the first if not given."),
+    Option("window", "Part to read, s; either side may be left out.", span, shows="FROM:TO"),
 )
 """How a recording is read, whatever the procedure."""
-ELEMENT = text_option("element", "One IMU of a file of several, from 1.", shows="N")
+ELEMENT = whole("element", "One IMU of a file of several, from 1.")
 
 
-def part_of(values: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """Return the options of `imulab.read` that choose a part of a file; errors as for `chosen`."""
-    return chosen(values["topic"], values["instance"], values["window"], values.get("element"), label=label)
+def part_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of `imulab.read` that choose a part of a file."""
+    return {name: values[name] for name in ("topic", "instance", "window", "element") if name in values}
 
 
-def read_options(options: Sequence[Option], texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    """Return the values of all options, from the texts of those given; `label` is how messages call one (``"--{}"``).
+def read_options(options: Sequence[Option], texts: Mapping[str, str | None], label: str) -> dict[str, Any]:
+    """Return the values of all options, from the texts of those given; `label` is how messages call one (`FLAG`).
 
     Raises
     ------
@@ -128,7 +130,8 @@ def read_options(options: Sequence[Option], texts: Mapping[str, str], label: str
     """
     values: dict[str, Any] = {}
     for option in options:
-        text = texts.get(option.name, option.default)
+        given = texts.get(option.name)
+        text = option.default if given is None else given
         called = label.format(option.name.replace("_", "-") if label.startswith("--") else option.name)
         values[option.name] = None if text is None else option.read(text, called)
     return values

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from imulab.procedures.options import FLAG
 from imulab.procedures.procedure import Files
 from imulab.procedures.registry import PROCEDURES
 from imulab.records.calibration import Calibration
-
-FLAG = "--{}"
-"""How the command line calls an option in its messages."""
 
 
 def _silent(_: int) -> None:

@@ -44,21 +44,20 @@ def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
     return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
 
 
+METHOD = text_option(
+    "method", "Method that fuse and export take from the record; robust if not given.", shows="METHOD", choices=METHODS
+)
+MEMORY = text_option(
+    "memory",
+    "Its memory: growing, growing:COUNT, or a gain between 0 and 1.",
+    shows="growing|growing:N|GAIN",
+    choices=("growing",),
+)
 OPTIONS = (
     Option("interval", "Use STILL from START to STOP, s.", interval, shows="FROM:TO"),
     measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
-    text_option(
-        "method",
-        "Method that fuse and export take from the record; robust if not given.",
-        shows="METHOD",
-        choices=METHODS,
-    ),
-    text_option(
-        "memory",
-        "Its memory: growing, growing:COUNT, or a gain between 0 and 1.",
-        shows="growing|growing:N|GAIN",
-        choices=("growing",),
-    ),
+    METHOD,
+    MEMORY,
     *READING,
 )
 
@@ -72,7 +71,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         raise OptionError(f"{names[0]} together with {names[1]}: expected one of them, they say the same")
     by = (values["method"], values["memory"])
     fusion = None if by == (None, None) else fusion_text(*by, label)
-    return {**values, "fusion": fusion, "part": part_of(values, label)}
+    return {**values, "fusion": fusion, "part": part_of(values)}
 
 
 TASK = Task(

@@ -58,7 +58,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     for name, nothing in (("regress", "no"), ("steps", "say")):
         values[name] = None if values[name] == nothing else values[name]
     check_options(values["terms"], values["horizon"], values["band"], values["regress"], values["steps"], label)
-    return {**values, "part": part_of(values, label)}
+    return {**values, "part": part_of(values)}
 
 
 TASK = Task(files="its logs at rest", count=(1, None), options=OPTIONS, values=_values, fit=_fit)

@@ -114,23 +114,27 @@ def _order(text: str, called: str) -> int | str:
     return int(text) if text.isdecimal() else text
 
 
+ORDER = Option(
+    "order",
+    "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
+    _order,
+    "auto",
+    "auto|0..5|blend",
+    ORDERS,
+)
+GRAVITY = (
+    text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
+    text_option("latitude", "Latitude, deg, for normal gravity.", shows="DEG"),
+    text_option("height", "Height above the ellipsoid, m.", shows="M"),
+)
 OPTIONS = (
-    Option(
-        "order",
-        "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
-        _order,
-        "auto",
-        "auto|0..5|blend",
-        ORDERS,
-    ),
+    ORDER,
     choice("method", "norm: by the length of f; linearised: the source's iteration.", METHODS, "norm"),
     choice(
         "loss", "auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.", LOSSES, "auto"
     ),
     Option("nonlinearity", "Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known.", _spread, shows="20ug,20ug"),
-    text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
-    text_option("latitude", "Latitude, deg, for normal gravity.", shows="DEG"),
-    text_option("height", "Height above the ellipsoid, m.", shows="M"),
+    *GRAVITY,
     file_option("prior", "Earlier record of this unit, as prior knowledge.", "RECORD"),
     Option(
         "ageing", "What the unit may have changed since the prior, if known.", _ageing, shows="100ug,100ppm[,50urad]"
@@ -162,7 +166,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
             nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
         )  # fmt: skip
     values["gravity"] = gravity_option(values["gravity"], values["latitude"], values["height"], label)
-    return {**values, "part": part_of(values, label)}
+    return {**values, "part": part_of(values)}
 
 
 TASK = Task(

@@ -93,7 +93,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     fit = {name: values[name] for name in _OF_THE_FIT}
     fit |= {"settling_limit": values["settling_limit"], "exit_rule": values["exit"]}
     check_options(**{name: value for name, value in fit.items() if name not in ("axes", "settling_limit")})
-    return {**values, "fit": fit, "part": part_of(values, label)}
+    return {**values, "fit": fit, "part": part_of(values)}
 
 
 TASK = Task(
