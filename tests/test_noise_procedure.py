@@ -10,6 +10,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.errors import DataError, OptionError, UnitError
 from imulab.estimation.noise.simulate import simulated
+from imulab.procedures.noise.figures import exhibits
 from imulab.procedures.reports import rendered
 from imulab.records.json_text import sealed_text
 
@@ -81,6 +82,31 @@ def test_the_uncertainty_of_a_mean_is_that_of_white_noise(record):
     t, u = (np.array(bias[key]["value"]) for key in ("time", "standard_uncertainty"))
     assert t[-1] == pytest.approx(60)
     np.testing.assert_allclose(u, 0.001 / np.sqrt(t), rtol=0.25)
+
+
+def test_what_is_as_fast_as_the_end_of_the_band_is_white_noise():
+    """Noise of 0.05 s is white to all that is slower: N^2 + 2 S^2 T; the walk beside it stays what it is."""
+    fast = 0.005 * np.sqrt(0.3 / 2 / 0.05)
+    x = samples(3, 360_000, white=0.005, gm1_sigma=fast, gm1_time=0.05, walk=5e-4)
+    found = il.fit_noise(
+        il.Recording({"time": 0.01 * np.arange(len(x)), "gyro_x": x}, {"time": "s", "gyro_x": "deg/s"})
+    )
+    record = found.calibration
+    assert record.fit["columns"]["gyro_x"]["chosen"] == "NGK"
+    assert record.model["terms"] == {"gyro_x": "NK"}
+    assert list(record.parameters) == ["gyro_x_white", "gyro_x_flicker", "gyro_x_walk"]
+    white, walk = (record.parameter(f"gyro_x_{term}") for term in ("white", "walk"))
+    truth = 0.005 * DEGREE * np.sqrt(1.3)
+    assert white.value == pytest.approx(truth, rel=0.04)  # the shortest time constant that is allowed is 0.08 s
+    assert white.interval_95[1] / white.value == pytest.approx(np.exp(1.96 * white.standard_uncertainty / white.value))
+    assert record.fit["filter_white"]["gyro_x"]["value"] == pytest.approx(white.value, rel=0.01)
+    assert record.fit["filter_walk"]["gyro_x"]["value"] == pytest.approx(5e-4 * DEGREE, rel=0.35)
+    assert walk.interval_95[0] < 5e-4 * DEGREE < walk.interval_95[1]
+    (note,) = (line for line in record.warnings if "end of the band" in line)
+    assert note.startswith("gyro_x: the white noise, 0.00586 deg/s/√Hz at low frequencies, falls to 0.00503")
+    drawn = {trace.get("name") for item in exhibits(record).items for trace in getattr(item, "traces", [])}
+    assert {"white", "walk"} < drawn
+    assert "Gauss-Markov" not in drawn
 
 
 def test_the_record_comes_back_from_its_file(fit, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.noise.terms import SIGMA, TIME, allan_terms, mean_terms
+from imulab.estimation.noise.terms import SIGMA, TIME, allan_terms, letters, mean_terms
 from imulab.recording import Array
 
 _AT_BOUND = 1.5
@@ -69,6 +69,44 @@ def at_band_edge(values: Array, shortest: float) -> NDArray[np.bool_]:
     Such a term is the roll-off of the sensor's filter at the end of the band, and no slow noise.
     """
     return np.asarray((values[..., SIGMA] > 0) & (values[..., TIME] <= _AT_BOUND * shortest))
+
+
+def letters_inside(model: NDArray[np.bool_], values: Array, shortest: float) -> str:
+    """Return the letters of a model without the Gauss-Markov terms that are the edge of the band; arguments (8,)."""
+    return letters(model).replace("G", "", int(np.count_nonzero(at_band_edge(values, shortest))))
+
+
+def edge_as_white(values: Array, covariance: Array, shortest: float) -> tuple[Array, Array]:
+    """Return a model whose Gauss-Markov terms at the end of the band are white noise, as slower noise sees them.
+
+    ``N^2 + sum 2 S^2 T`` in place of N^2; a term that is left is the first.
+
+    Parameters
+    ----------
+    values, covariance
+        Parameters, shape (8,), and the covariance of their logarithms, shape (8, 8).
+    shortest
+        The least time constant that the fit allowed, s.
+    """
+    edge = np.flatnonzero(at_band_edge(values, shortest))
+    if not edge.size:
+        return values, covariance
+    found, turn = values.copy(), np.eye(len(values))
+    parts = np.zeros(len(values))
+    parts[0] = values[0] ** 2
+    for k in edge.tolist():
+        parts[[SIGMA[k], TIME[k]]] = 2 * values[SIGMA[k]] ** 2 * values[TIME[k]]
+        found[[SIGMA[k], TIME[k]]] = 0.0
+    found[0] = np.sqrt(white_square(values, np.zeros(1), shortest)[0])
+    # d ln N: of a term's variance by S as by N, by T half as much.
+    parts[list(TIME)] /= 2
+    turn[0] = parts / found[0] ** 2
+    turn[found == 0] = 0.0
+    if found[SIGMA[0]] == 0:
+        order = np.arange(len(values))
+        order[[*SIGMA, *TIME]] = [*SIGMA[::-1], *TIME[::-1]]
+        found, turn = found[order], turn[order]
+    return found, np.asarray(turn @ covariance @ turn.T)
 
 
 def _fast(values: Array, k: int, horizon: Array, shortest: float) -> NDArray[np.bool_]:

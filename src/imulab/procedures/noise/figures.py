@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.noise.terms import allan_terms
+from imulab.estimation.noise.terms import LINEAR, allan_terms
+from imulab.estimation.noise.use import at_band_edge
 from imulab.procedures.noise.choices import rejected
 from imulab.procedures.noise.engineering import density, label, shown, split
-from imulab.procedures.noise.sections import Binned, Fit, drawn_of, fit_of
+from imulab.procedures.noise.sections import Binned, Column, Fit, drawn_of, fit_of
 from imulab.records.calibration import Calibration
 from imulab.report import panels
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
@@ -147,8 +148,9 @@ def _models(fit: Fit) -> ReportTable:
         )
     return ReportTable(
         "Models",
-        "Chosen terms, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation, with the weight among all candidates; "
-        "the next; the probability of the test of fit (of a good model below 0.01 in one record of a hundred); the "
+        "Chosen terms, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation, with the weight among all candidates "
+        "(a G of the shortest time that the band tells is the sensor's filter, and counts as white noise); the next; "
+        "the probability of the test of fit (of a good model below 0.01 in one record of a hundred); the "
         "highest frequency used; by how much bins are off the model; what was taken for no noise.",
         ["column", "chosen", "next", "p of fit", "up to, Hz", "ripple, %", "spikes", "lines", "steps"],
         rows,
@@ -161,7 +163,7 @@ def _curve(record: Calibration, fit: Fit, name: str) -> Figure:
     tau, measured, fitted, low, high = (
         np.array(each) for each in (allan.tau, allan.measured, allan.fitted, allan.low, allan.high)
     )
-    parts = np.sqrt(allan_terms(np.array(column.values), tau, column.interval.value))
+    parts = _parts(column, tau)
     floor = 0.5 * factor * min(float(fitted.min()), float(measured[measured > 0].min(initial=np.inf)))
     traces: list[dict[str, Any]] = [band(tau, factor * low, factor * high, GOOD, _DIGITS, name="95 % band")]
     for k, title in enumerate(_PARTS):
@@ -196,6 +198,16 @@ def _curve(record: Calibration, fit: Fit, name: str) -> Figure:
         },
         height=430,
     )
+
+
+def _parts(column: Column, tau: np.ndarray) -> np.ndarray:
+    """The Allan deviation of each part of the chosen model; what is the edge of the band belongs to the white noise."""
+    values = np.array(column.values)
+    squares = allan_terms(values, tau, column.interval.value)
+    for k in np.flatnonzero(at_band_edge(values, column.shortest_time.value)):
+        squares[0] += squares[LINEAR + k]
+        squares[LINEAR + k] = 0.0
+    return np.asarray(np.sqrt(squares))
 
 
 def _ratios(record: Calibration, fit: Fit, names: Any, page: int, pages: int) -> Figure:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imulab.estimation.noise.rest import Rest
-from imulab.estimation.noise.terms import letters
+from imulab.estimation.noise.use import at_band_edge, edge_as_white, letters_inside
 from imulab.procedures.noise.choices import rejected
-from imulab.procedures.noise.engineering import shown
+from imulab.procedures.noise.engineering import density, shown
+from imulab.report.elements import plain_number
 from imulab.verdict import Note
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
         found.append(
             (Note, f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level")
         )
+    if at_band_edge(analysis.values, analysis.limits[0]).any():
+        found.append((Note, _edge(column)))
     samples = sum(each.count for each in analysis.stretches)
     if column.spikes:
         kind: type[str] = str if column.spikes > _MANY_SPIKES * samples else Note
@@ -71,10 +74,25 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
         text = f"the level changes by {_sized(step.size, column.unit)} at {step.time:.4g} s"
         found.append((str, f"{text}, which slow noise does not make; --steps remove takes it out"))
     found += [each for drift in column.drifts if (each := _drift(drift, column)) is not None]
-    rivals = [letters(analysis.choice.models[0, k]) for k in np.flatnonzero(analysis.choice.rivals[0])]
+    choice, shortest = analysis.choice, analysis.limits[0]
+    near = [analysis.index, *np.flatnonzero(choice.rivals[0]).tolist()]
+    models = (letters_inside(choice.models[0, k], choice.values[0, k], shortest) for k in near)
+    chosen, *rivals = dict.fromkeys(models)
     if rivals:
-        found.append((Note, f"{analysis.letters} and {', '.join(rivals)} describe the record about equally well"))
+        found.append((Note, f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
     return found
+
+
+def _edge(column: ColumnModel) -> str:
+    """Say what a Gauss-Markov term of the shortest time constant is, and what the white noise is with it."""
+    analysis = column.analysis
+    factor, unit = density(column.unit)
+    level = float(edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])[0][0])
+    return (
+        f"the white noise, {plain_number(level * factor, 3)} {unit} at low frequencies, falls to "
+        f"{plain_number(float(analysis.values[0]) * factor, 3)} at the end of the band: the sensor's filter, no slow "
+        "noise; filters get the white noise of low frequencies"
+    )
 
 
 def _lines(column: ColumnModel) -> str:

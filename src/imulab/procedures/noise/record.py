@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from imulab.errors import RecordError
+from imulab.estimation.noise.analysis import Analysis
 from imulab.estimation.noise.likelihood import Flags
 from imulab.estimation.noise.moments import allan_of_bins
 from imulab.estimation.noise.rest import Rest
-from imulab.estimation.noise.terms import NAMES, allan_variance, letters, terms
-from imulab.estimation.noise.use import bias_square, walk_square, white_square
+from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, allan_variance, letters, terms
+from imulab.estimation.noise.use import bias_square, edge_as_white, letters_inside, walk_square, white_square
 from imulab.procedures.noise.findings import findings
 from imulab.recording import Array, Source
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from imulab.procedures.noise.fit import ColumnModel
 
 _DIGITS = 7
-_TAILS = (0.025, 0.975)
+_TAILS, _NORMAL = (0.025, 0.975), 1.96
 _SLOW = ("flicker", "walk")
 """Terms that have a limit where the chosen model has not got them."""
 _PART = 10.0
@@ -63,7 +64,10 @@ def make_record(
         parameters=parameters,
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
         model={
-            "terms": {name: column.analysis.letters for name, column in columns.items()},
+            "terms": {
+                name: letters_inside(found.model, found.values, found.limits[0])
+                for name, found in ((name, column.analysis) for name, column in columns.items())
+            },
             "horizon": {"value": horizon, "unit": "s"},
         },
         fit={
@@ -98,21 +102,22 @@ def _parameters(
     names, blocks = [], []
     for name, column in columns.items():
         analysis, unit = column.analysis, column.unit
-        low, high = analysis.intervals(more)
-        known = []
+        values, covariance = edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])
+        low, high = _intervals(analysis, more, values, covariance)
+        has, known = np.where(analysis.values > 0, values > 0, analysis.model), []
         for k, term in enumerate(NAMES):
             slow = term in _SLOW
-            value = float(analysis.values[k])
-            if not (analysis.model[k] or (more[k] and slow)) or (short and k and not slow):
+            value = float(values[k])
+            if not (has[k] or (more[k] and slow)) or (short and k and not slow):
                 continue
             limit = value == 0 or (short and slow)
-            u = None if limit else value * float(np.sqrt(analysis.covariance[k, k]))
+            u = None if limit else value * float(np.sqrt(covariance[k, k]))
             ends = (0.0 if limit else min(float(low[k]), value), max(float(high[k]), value))
             found[f"{name}_{term}"] = Parameter(0.0 if limit else value, u, unit_of(term, unit), interval_95=ends)
             known += [] if limit else [k]
         names += [f"{name}_{NAMES[k]}" for k in known]
-        size = analysis.values[known]
-        blocks.append(analysis.covariance[np.ix_(known, known)] * np.outer(size, size))
+        size = values[known]
+        blocks.append(covariance[np.ix_(known, known)] * np.outer(size, size))
         for drift in column.drifts:
             if drift.covariate == "time" and (drift.found.follows or drift.taken):
                 b, u = drift.slope, drift.standard_uncertainty
@@ -120,6 +125,19 @@ def _parameters(
                 names.append(f"{name}_ramp")
                 blocks.append(np.array([[u**2]]))
     return found, names, blocks
+
+
+def _intervals(analysis: Analysis, more: Flags, values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Ends of the 95 % intervals of the parameters in a record, in which the edge of the band is white noise."""
+    low, high = analysis.intervals(more)
+    if np.array_equal(values, analysis.values):
+        return low, high
+    if values[TIME[0]] == analysis.values[TIME[1]]:
+        for ends in (low, high):
+            ends[[SIGMA[0], TIME[0]]] = ends[[SIGMA[1], TIME[1]]]
+    reach = np.exp(_NORMAL * np.sqrt(covariance[0, 0]))
+    low[0], high[0] = values[0] / reach, values[0] * reach
+    return low, high
 
 
 def _use(column: ColumnModel, horizon: float) -> dict[str, Any]:
