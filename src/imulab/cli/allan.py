@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-import typer
-
-from imulab.cli.fit_options import READ, reading, with_options
+from imulab.cli.fit_options import READ, one_of, reading, with_options
 from imulab.cli.options import (
     AsJson,
     RecordingFile,
@@ -14,6 +12,7 @@ from imulab.cli.options import (
     check_outputs,
     warn,
 )
+from imulab.estimation import TAUS
 from imulab.printable import printable
 
 
@@ -21,7 +20,7 @@ from imulab.printable import printable
 def allan(
     file: RecordingFile,
     *,
-    taus: Annotated[str, typer.Option(help="octave, or dense (24 a decade).")] = "octave",
+    taus: Annotated[str, one_of(TAUS, "dense: 24 a decade.")] = "octave",
     options: dict[str, str | None],
     report: ReportFile = None,
     json: AsJson = False,

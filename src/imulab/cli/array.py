@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import reading, with_options
+from imulab.cli.fit_options import one_of, reading, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -24,8 +24,9 @@ from imulab.cli.options import (
     whole_number,
     with_notes,
 )
-from imulab.device.methods import METHODS
+from imulab.device.methods import METHODS, STARTS
 from imulab.errors import OptionError
+from imulab.procedures.gyro_array.choices import EXPERIMENTS, FAULTS, MOUNTINGS, OF_THE_SOURCE, UNITS
 from imulab.procedures.gyro_array.task import MEMORY, METHOD, OPTIONS
 from imulab.procedures.options import READING
 
@@ -52,7 +53,7 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
 
 def simulate(
     output: Annotated[str, typer.Option("-o", "--output", metavar="OUT.csv", help="Recording to write.")],
-    experiment: Annotated[str, typer.Option(help="static, dynamic (the source's set-ups) or moving.")] = "dynamic",
+    experiment: Annotated[str, one_of(EXPERIMENTS, "static and dynamic are the source's set-ups.")] = "dynamic",
     elements: Annotated[str, typer.Option(help="Gyros on each axis.")] = "6",
     axes: Annotated[str, typer.Option(help="1 or 3.")] = "1",
     rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; that of the experiment if not given.")] = None,
@@ -65,14 +66,12 @@ def simulate(
     turn_on: Annotated[str, typer.Option(help="Standard deviation of the turn-on biases.")] = "0.02 deg/s",
     scale_spread: Annotated[str, typer.Option(help="Standard deviation of the scale factors.")] = "0",
     misalignment: Annotated[str, typer.Option(help="Standard deviation of the misalignments.")] = "0 deg",
-    mounting: Annotated[str, typer.Option(help="same, or alternate: even elements upside down.")] = "same",
+    mounting: Annotated[str, one_of(MOUNTINGS, "alternate: even elements upside down.")] = "same",
     fault: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="KIND:GYRO[:START[:DURATION[:SIZE]]]", help="dead stuck spikes jump nan saturation; s, deg/s."
-        ),
+        one_of(FAULTS, f"{' '.join(FAULTS)}; s, deg/s.", metavar="KIND:GYRO[:START[:DURATION[:SIZE]]]"),
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the outputs: rad/s deg/s deg/h.")] = "deg/s",
+    unit: Annotated[str, one_of(UNITS, "Unit of the outputs.")] = "deg/s",
     session: Annotated[str, typer.Option(help="Another recording of the same array.")] = "0",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
@@ -142,7 +141,7 @@ def fuse(
     file: RecordingFile,
     options: dict[str, str | None],
     initial_bias: Annotated[
-        str, typer.Option("--initial-bias", metavar="first|zero|RECORD", help="Biases to start from.")
+        str, one_of(STARTS, "Biases to start from.", "--initial-bias", metavar=f"{'|'.join(STARTS)}|RECORD")
     ] = "first",
     calibration: CalibrationFile = None,
     rate: Annotated[str | None, typer.Option(help="Sampling rate, Hz; from the first samples if not given.")] = None,
@@ -158,7 +157,7 @@ def fuse(
     from imulab.readers import read_blocks
     from imulab.writers import check_writable, write, write_csv_to
 
-    records = [name for name in (calibration, None if initial_bias in ("first", "zero") else initial_bias) if name]
+    records = [name for name in (calibration, None if initial_bias in STARTS else initial_bias) if name]
     check_outputs([output], [name for name in (file, options["layout"], *records) if name])
     how = reading(options)
     if output:
@@ -171,7 +170,7 @@ def fuse(
         method=by.method,
         memory="growing" if by.memory is None else by.memory,
         start=by.start,
-        initial_bias=initial_bias if initial_bias in ("first", "zero") else _load(initial_bias, "--initial-bias"),
+        initial_bias=initial_bias if initial_bias in STARTS else _load(initial_bias, "--initial-bias"),
         calibration=known,
         rate=None if rate is None else quantity(rate, "--rate", "frequency", "Hz"),
         still=None if still is None else interval(still, "--still"),
@@ -237,9 +236,7 @@ def compare(
     file: Annotated[str | None, typer.Argument(metavar="FILE", help="Recording, with or without truth_rate.")] = None,
     *,
     calibration: CalibrationFile = None,
-    experiment: Annotated[
-        str | None, typer.Option(metavar="static|dynamic", help="Run the source's set-up instead of a FILE.")
-    ] = None,
+    experiment: Annotated[str | None, one_of(OF_THE_SOURCE, "Run the source's set-up instead of a FILE.")] = None,
     seeds: Annotated[str, typer.Option(help="Runs of the experiment.")] = "20",
     options: dict[str, str | None],
     output: OutputFile = None,

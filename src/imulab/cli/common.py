@@ -1,11 +1,10 @@
-"""What every command has: how much it says, the project file, the size of what it unpacks, and what a shell offers."""
+"""What every command has: how much it says, the project file, and the size of what it unpacks."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
@@ -17,30 +16,10 @@ from imulab.cli.speech import choose, note, speech, tell
 from imulab.errors import OptionError, listed, meant
 
 _ALIKE = 0.75  # --threshold is no misspelt --hold
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "tumble plan --criterion": ("imulab.procedures.tumble.optimal:CRITERIA",),
-    "tumble plan --from": ("sphere", "fixture:15", "head:15"),
-    "tumble plan --method": ("imulab.procedures.tumble.choices:METHODS",),
-    "tumble gyro --g-sensitivity": ("auto", "yes", "no"),
-    "tumble gyro --clock-of": ("gyro", "accel"),
-    "array simulate --experiment": ("imulab.procedures.gyro_array.simulate:EXPERIMENTS",),
-    "array simulate --mounting": ("same", "alternate"),
-    "array simulate --fault": ("imulab.procedures.gyro_array.simulate:FAULTS",),
-    "array simulate --unit": ("rad/s", "deg/s", "deg/h"),
-    "array fuse --method": ("imulab.device.methods:METHODS",),
-    "array fuse --memory": ("growing",),
-    "array fuse --initial-bias": ("first", "zero"),
-    "array compare --experiment": ("static", "dynamic"),
-    "allan --taus": ("octave", "dense"),
-    "warmup simulate --law": ("imulab.procedures.warmup.simulate:LAWS",),
-    "export --to": ("imulab.exporters:EXPORTERS",),
-    "fleet run --engine": ("imulab.fleet.engine:ENGINES",),
-}
-"""The values that a shell offers for an option: words, or where a module lists them."""
 
 
 def offer(root: Any) -> None:
-    """Give every command the options that all have, and every option of few values those to complete it by."""
+    """Give every command the options that all have, and every option what the help shows for its value."""
     app = typer.Typer()
     app.command()(_common)
     quiet, verbose, no_project, unpack_limit = typer.main.get_command(app).params[:4]
@@ -52,20 +31,14 @@ def offer(root: Any) -> None:
         files = [parameter.name for parameter in command.params if parameter.param_type_name == "argument"]
         command.callback = partial(_run, command.callback, path, files)
         for parameter in command.params:
-            values = next((v for option in parameter.opts if (v := _CHOICES.get(f"{path} {option}"))), ())
-            if values:
-                parameter._custom_shell_complete = partial(_complete, values)
             if parameter.param_type_name == "argument":
                 parameter.display_type_rich = lambda ctx: ""  # the name says what it is
             elif parameter.metavar is None and not parameter.is_flag:
-                parameter.metavar = _stand_in(values, parameter.default)
+                parameter.metavar = _stand_in(parameter.default)
 
 
-def _stand_in(values: tuple[str, ...], default: Any) -> str:
+def _stand_in(default: Any) -> str:
     """What the help shows in the place of an option's value."""
-    words = "|".join(values)
-    if values and ":" not in words and len(words) <= 30:
-        return words
     if not isinstance(default, str) or not default[:1].isdigit():
         return "VALUE"
     return "NUMBER" if default.replace(".", "", 1).isdigit() else "QUANTITY"
@@ -143,14 +116,6 @@ def _from_project(values: dict[str, Any], files: list[str]) -> dict[str, str]:
 
 def _names(value: Any) -> list[str]:
     return [value] if isinstance(value, str) else list(value or [])
-
-
-def _complete(values: tuple[str, ...], context: Any, parameter: Any, incomplete: str) -> list[str]:
-    words: list[str] = []
-    for value in values:
-        module, colon, name = value.partition(":")
-        words += getattr(import_module(module), name) if colon and "." in module else [value]
-    return [word for word in words if word.startswith(incomplete)]
 
 
 def usage(error: Any) -> str:

@@ -6,13 +6,22 @@ from typing import Annotated
 
 import typer
 
+from imulab.cli.fit_options import lists
 from imulab.cli.options import call, warn
 from imulab.errors import OptionError
 
 
 def export(
     records: Annotated[list[str], typer.Argument(metavar="RECORD...", help="Calibration records of one unit.")],
-    to: Annotated[str, typer.Option("--to", metavar="TARGET", help="c blob px4 ardupilot kalibr openvins ros.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="TARGET",
+            help="c blob px4 ardupilot kalibr openvins ros.",
+            autocompletion=lists("imulab.exporters:EXPORTERS"),
+        ),
+    ],
     output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder to write to.")],
     lossy: Annotated[
         bool, typer.Option("--lossy", help="Leave out what the target cannot hold, and fit the rest anew.")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from inspect import Parameter, signature
 from typing import Annotated, Any
 
@@ -54,7 +55,19 @@ def _parameter(option: Option) -> Parameter:
     )
 
 
-def _beginning(choices: Sequence[str]) -> Callable[[str], list[str]]:
+def one_of(choices: Iterable[str], help: str, *flags: str, metavar: str | None = None) -> Any:  # noqa: A002
+    """Return an option of few words, which its help lists and a shell completes."""
+    words = tuple(choices)
+    return typer.Option(*flags, metavar=metavar or "|".join(words), help=help, autocompletion=_beginning(words))
+
+
+def lists(where: str) -> Callable[[str], list[str]]:
+    """Return what completes a word of a list that costs an import: ``imulab.exporters:EXPORTERS``."""
+    module, _, name = where.partition(":")
+    return lambda incomplete: _beginning(getattr(import_module(module), name))(incomplete)
+
+
+def _beginning(choices: Iterable[str]) -> Callable[[str], list[str]]:
     def words(incomplete: str) -> list[str]:
         return [choice for choice in choices if choice.startswith(incomplete)]
 

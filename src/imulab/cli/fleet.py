@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from imulab.cli.fit_options import one_of
 from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
 from imulab.errors import OptionError
+from imulab.fleet import ENGINES
 
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
@@ -35,7 +37,7 @@ def run(
         str, typer.Argument(metavar="MANIFEST", help="CSV or Parquet: serial,procedure,file and options of the fits.")
     ],
     output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder of the records.")],
-    engine: Annotated[str, typer.Option(help="local or dask.")] = "local",
+    engine: Annotated[str, one_of(ENGINES, "Processes of this machine, or a Dask cluster.")] = "local",
     scheduler: Annotated[
         str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a Dask cluster, as tcp://host:8786.")
     ] = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import with_options
+from imulab.cli.fit_options import lists, with_options
 from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, quantity
 from imulab.errors import OptionError
 from imulab.procedures.noise.task import OPTIONS
@@ -38,12 +38,6 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
     return group
 
 
-def _programs(incomplete: str) -> list[str]:
-    from imulab.procedures.noise.wants import PROGRAMS
-
-    return [name for name in PROGRAMS if name.startswith(incomplete)]
-
-
 @with_options(OPTIONS)
 def fit(
     files: Annotated[list[str], typer.Argument(metavar="LOG...", help="Logs at rest of one unit.")],
@@ -53,7 +47,10 @@ def fit(
     program: Annotated[
         str | None,
         typer.Option(
-            "--for", metavar="PROGRAM", help="Print what its filter wants, key: value.", autocompletion=_programs
+            "--for",
+            metavar="PROGRAM",
+            help="Print what its filter wants, key: value.",
+            autocompletion=lists("imulab.procedures.noise.wants:PROGRAMS"),
         ),
     ] = None,
     rate: Annotated[str | None, typer.Option(metavar="HZ", help="--for: samples that it gets; as the logs.")] = None,

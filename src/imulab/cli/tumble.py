@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import READ, reading, with_options
+from imulab.cli.fit_options import READ, one_of, reading, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -25,6 +25,7 @@ from imulab.cli.options import (
 )
 from imulab.cli.result import finish
 from imulab.procedures.options import FLAG
+from imulab.procedures.tumble.choices import CLOCKS, CRITERIA, METHODS, SENSITIVITIES, STARTS
 from imulab.procedures.tumble.task import GRAVITY, OPTIONS
 
 _OF_THE_RECORD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the file's head, else of the record.")
@@ -49,22 +50,21 @@ def plan(
     ] = None,
     order: Annotated[str, typer.Option(help="Order of the model, 0 to 5; 3 shows what 2 would leave out.")] = "3",
     output: Annotated[str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Plan to write.")] = None,
-    criterion: Annotated[str, typer.Option(help="A: least sum of variances; D: smallest confidence region.")] = "A",
+    criterion: Annotated[str, one_of(CRITERIA, "A: least sum of variances; D: smallest confidence region.")] = "A",
     source: Annotated[
         str,
-        typer.Option(
+        one_of(
+            STARTS,
+            "Where attitudes may lie: sphere, fixture:15 or head:15 (steps in deg), or a file that lists them.",
             "--from",
             metavar="sphere|FILE",
-            help="Where attitudes may lie: sphere, fixture:15 or head:15 (steps in deg), or a file that lists them.",
         ),
     ] = "sphere",
     add: Annotated[
         str | None, typer.Option(metavar="FILE", help="Attitudes already there: a plan, a record or a recording.")
     ] = None,
     report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
-    method: Annotated[
-        str, typer.Option(help="Method of the fit that the attitudes are for: norm or linearised.")
-    ] = "norm",
+    method: Annotated[str, one_of(METHODS, "Method of the fit that the attitudes are for.")] = "norm",
     distinct_verticals: Annotated[
         bool | None,
         typer.Option(
@@ -145,12 +145,12 @@ def gyro(
     ] = None,
     options: dict[str, str | None],
     fit_bias: Annotated[bool, typer.Option("--fit-bias", help="Fit the biases to the turns too.")] = False,
-    g_sensitivity: Annotated[str, typer.Option(help="auto, yes or no.")] = "auto",
+    g_sensitivity: Annotated[str, one_of(SENSITIVITIES, "Whether to fit what forces add to the rate.")] = "auto",
     clock: Annotated[
         str, typer.Option(help="Standard uncertainty of the clock's rate, common to the three scale factors.")
     ] = "50 ppm",
     clock_of: Annotated[
-        str, typer.Option("--clock-of", help="Whose time stamps are right where two clocks differ: gyro or accel.")
+        str, one_of(CLOCKS, "Whose time stamps are right where two clocks differ.", "--clock-of")
     ] = "gyro",
     output: OutputFile = None,
     report: ReportFile = None,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import with_options
+from imulab.cli.fit_options import one_of, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -18,7 +18,7 @@ from imulab.cli.options import (
     warn,
 )
 from imulab.errors import OptionError
-from imulab.procedures.warmup.choices import TEMPERATURES
+from imulab.procedures.warmup.choices import LAWS, TEMPERATURES
 from imulab.procedures.warmup.task import OPTIONS
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def simulate(
     output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Folder for the recordings.")],
     temperatures: Temperatures = TEMPERATURES,
     cycles: Annotated[str, typer.Option(help="Power cycles at each temperature.")] = "3",
-    law: Annotated[str, typer.Option(help="How the zeros depend on temperature: smooth or bent.")] = "smooth",
+    law: Annotated[str, one_of(LAWS, "How the zeros depend on temperature.")] = "smooth",
     duration: Annotated[str, typer.Option(help="Of each recording.")] = "600 s",
     rate: Annotated[str, typer.Option(help="Sample rate.")] = "10 Hz",
     units: Annotated[str, typer.Option(help="Number of units of one type.")] = "1",

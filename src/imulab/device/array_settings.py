@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.methods import METHODS
+from imulab.device.methods import METHODS, STARTS
 from imulab.device.tables import DeviceTable, Field
 from imulab.errors import OptionError, RecordError, listed
 from imulab.recording import Array
@@ -131,7 +131,7 @@ def array_table(settings: ArraySettings) -> DeviceTable:
     if not (s.rate > 0 and np.isfinite(s.rate)):
         raise OptionError(f"rate {s.rate}: expected more than 0 Hz")
     given = s.initial_bias if not isinstance(s.initial_bias, str) else None
-    if given is None and s.initial_bias not in ("first", "zero"):
+    if given is None and s.initial_bias not in STARTS:
         raise OptionError(f"initial bias {s.initial_bias!r}: expected first, zero or biases")
 
     def samples(time: float, least: int) -> np.int64:
@@ -141,7 +141,7 @@ def array_table(settings: ArraySettings) -> DeviceTable:
         "method": METHODS.index(s.method),
         "elements": n,
         "axes": axes,
-        "initial": 2 if given is not None else ("first", "zero").index(s.initial_bias),
+        "initial": 2 if given is not None else STARTS.index(s.initial_bias),
         "kernel": ("gaussian", "exponential").index(s.kernel),
         "start": s.start,
         "cap": samples(s.memory_time, 100),

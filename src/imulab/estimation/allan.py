@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError, OptionError
+from imulab.estimation import TAUS
 from imulab.recording import Array
 
 _CHUNK = 1 << 14
@@ -99,7 +100,7 @@ def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
             steps = int(_DENSE_PER_DECADE * math.log10(most)) + 1
             counts = np.unique(np.round(10 ** (np.arange(steps) / _DENSE_PER_DECADE))).astype(np.int64)
         else:
-            raise OptionError(f"taus {taus!r}: expected octave or dense")
+            raise OptionError(f"taus {taus!r}: expected {' or '.join(TAUS)}")
     else:
         counts = np.unique(np.round(np.asarray(taus, dtype=np.float64) * rate).astype(np.int64))
     counts = counts[(counts >= 1) & (counts <= most)]

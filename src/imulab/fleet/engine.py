@@ -14,11 +14,10 @@ from typing import Any, Protocol
 
 from imulab._version import VERSION
 from imulab.errors import OptionError, listed
-from imulab.fleet import processes
+from imulab.fleet import ENGINES, processes
 from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.work import Job, Outcome, work
 
-ENGINES = ("local", "dask")
 _CONNECT = 10.0
 """Seconds to wait for a scheduler, and as many for its first worker: both must be over within 45 s."""
 _AHEAD = 3

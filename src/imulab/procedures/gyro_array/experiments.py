@@ -9,11 +9,12 @@ import numpy as np
 
 from imulab.device.methods import METHODS
 from imulab.errors import OptionError, listed
+from imulab.procedures.gyro_array.choices import EXPERIMENTS, OF_THE_SOURCE
 from imulab.procedures.gyro_array.compare import rate_figures
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
 from imulab.procedures.gyro_array.model import find_elements
-from imulab.procedures.gyro_array.simulate import EXPERIMENTS, NoiseModel, simulate_array
+from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
 
 CALIBRATION_TIME = 60.0
 """Duration of the recording at rest that a calibrated start comes from, s."""
@@ -48,8 +49,8 @@ def run_experiment(
     OptionError
         The experiment is unknown, or there is no seed.
     """
-    if experiment not in ("static", "dynamic"):
-        raise OptionError(f"experiment {experiment!r}: expected one of {listed(('static', 'dynamic'), experiment)}")
+    if experiment not in OF_THE_SOURCE:
+        raise OptionError(f"experiment {experiment!r}: expected one of {listed(OF_THE_SOURCE, experiment)}")
     if not 1 <= seeds <= 10_000:
         raise OptionError(f"seeds {seeds}: expected 1 to 10000")
     rate = EXPERIMENTS[experiment][0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.device.array_settings import MOST_COUNT
 from imulab.device.blob import Blob
-from imulab.device.methods import METHODS
+from imulab.device.methods import METHODS, STARTS
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation.rows import HISTORY, zero_rows
 from imulab.procedures.gyro_array.blobs import blob_stream, fusion_of_blob
@@ -83,7 +83,7 @@ class FuseOptions:
             raise OptionError(f"memory {self.memory:g}: expected growing, growing:COUNT, or a gain between 0 and 1")
         if not 1 <= self.start <= MOST_COUNT:
             raise OptionError(f"memory growing:{self.start}: expected a count from 1 to {MOST_COUNT}")
-        if isinstance(self.initial_bias, str) and self.initial_bias not in ("first", "zero"):
+        if isinstance(self.initial_bias, str) and self.initial_bias not in STARTS:
             raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record")
         if self.method == "covariance" and self.calibration is None:
             raise OptionError("method covariance needs --calibration RECORD: its weights come from a recording at rest")

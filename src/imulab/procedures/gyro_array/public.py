@@ -10,6 +10,7 @@ from typing import Any, TypeAlias, Unpack, cast
 from numpy.typing import NDArray
 
 from imulab.device.blob import Blob, is_blob, load_blob
+from imulab.device.methods import STARTS
 from imulab.errors import DataError, OptionError, quoted
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
@@ -314,7 +315,7 @@ def _options(
     elif calibration is not None:
         known = as_record(calibration, "fuse: calibration")
     start = cast(Any, initial_bias)
-    if not isinstance(initial_bias, str) or initial_bias not in ("first", "zero"):
+    if not isinstance(initial_bias, str) or initial_bias not in STARTS:
         start = as_record(initial_bias, "fuse: initial_bias")
     by = fusion_text(method, None if memory is None else str(memory), _LABEL, carried(known))
     gain: str | float = "growing" if by.memory is None else by.memory

@@ -6,24 +6,18 @@ Source of both set-ups: patent CN109443333B (6 gyros; 100 Hz, 2000 s at rest; 50
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from imulab.errors import OptionError, listed
+from imulab.procedures.gyro_array.choices import EXPERIMENTS, FAULTS, MOUNTINGS, UNITS
 from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array, Recording
 from imulab.units import conversion_factor, parse_unit
 
-EXPERIMENTS: Mapping[str, tuple[float, float]] = {
-    "static": (100.0, 2000.0),
-    "dynamic": (50.0, 100.0),
-    "moving": (100.0, 120.0),
-}
-"""Sampling rate, Hz, and duration, s, of each."""
 _MOST_READINGS = 200_000_000
-FAULTS = ("dead", "stuck", "spikes", "jump", "nan", "saturation")
 _DEG = math.pi / 180
 
 
@@ -197,10 +191,10 @@ def _check(elements: int, axes: int, rate: float, length: float, mounting: str, 
             raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
     if axes not in (1, 3):
         raise OptionError(f"axes {axes}: expected 1 or 3")
-    if mounting not in ("same", "alternate"):
-        raise OptionError(f"mounting {mounting!r}: expected one of {listed(('same', 'alternate'), mounting)}")
+    if mounting not in MOUNTINGS:
+        raise OptionError(f"mounting {mounting!r}: expected one of {listed(MOUNTINGS, mounting)}")
     if parse_unit(unit).quantity != "rate":
-        raise OptionError(f"unit {unit}: expected rad/s deg/s deg/h")
+        raise OptionError(f"unit {unit}: expected {' '.join(UNITS)}")
 
 
 def _check_numbers(noise: NoiseModel, scale_spread: float, misalignment: float, session: int, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""The words that the options of a tumble fit take."""
+"""The words that the options of a tumble test take."""
 
 from __future__ import annotations
 
@@ -7,3 +7,8 @@ FROM_DATA = ("auto", "blend")
 ORDERS = ("auto", *map(str, range(HIGHEST_ORDER + 1)), "blend")
 METHODS = ("norm", "linearised")
 LOSSES = ("square", "huber", "auto")
+CRITERIA = ("A", "D")
+STARTS = ("sphere", "fixture:15", "head:15")
+"""Where attitudes may lie, with steps of any number of degrees."""
+SENSITIVITIES = ("auto", "yes", "no")
+CLOCKS = ("gyro", "accel")

@@ -23,11 +23,12 @@ from imulab.estimation.least_squares import Observability, covariance, observabi
 from imulab.estimation.rows import leave_out
 from imulab.procedures.tumble.apply import output_factor, specific_force
 from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.choices import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.directions import direction_covariance
 from imulab.procedures.tumble.findings import aside_of
-from imulab.procedures.tumble.gyroclock import CLOCKS, CRYSTAL, Clock, clock_of_scale, compare_clocks, counted, evened
+from imulab.procedures.tumble.gyroclock import CRYSTAL, Clock, clock_of_scale, compare_clocks, counted, evened
 from imulab.procedures.tumble.gyrolinear import Nonlinearity, test_linearity
-from imulab.procedures.tumble.gyrorest import SENSITIVITIES, clock_notes, find_holds
+from imulab.procedures.tumble.gyrorest import clock_notes, find_holds
 from imulab.procedures.tumble.gyrosolve import Case, Solved, solve_turns
 from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
 from imulab.procedures.tumble.sections import fit_of, model_of

@@ -22,7 +22,6 @@ from imulab.verdict import Note
 
 CRYSTAL = 50e-6
 """Standard uncertainty of the rate of a clock that nothing is known of but that a crystal drives it."""
-CLOCKS = ("gyro", "accel")
 _KNOT = 0.05  # s
 _LAGS = np.linspace(-2.0, 2.0, 21)  # s
 _STEPS = 6

@@ -16,7 +16,6 @@ from imulab.estimation.least_squares import f_test
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.recording import Array
 
-SENSITIVITIES = ("auto", "yes", "no")
 _EDGE = 0.1  # s back into the 0.3 s of each hold that segmentation drops
 _STILL = 5.0
 _MARGIN = 0.1  # s

@@ -19,7 +19,6 @@ from imulab.procedures.tumble.model import norm_and_jacobian, parameter_count
 from imulab.procedures.tumble.solve import start_parameters
 from imulab.recording import Array
 
-CRITERIA = ("A", "D")
 CLOSEST = np.radians(3.0)
 """Two attitudes closer than this are the same attitude: the same axis vertical."""
 _KEPT_CLEAR = 2 * CLOSEST

@@ -14,9 +14,9 @@ import numpy as np
 from imulab.errors import ObservabilityError, OptionError, listed
 from imulab.estimation.least_squares import observability
 from imulab.procedures.tumble.advice import sphere_points
-from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.choices import CRITERIA, HIGHEST_ORDER
 from imulab.procedures.tumble.model import parameter_count, parameter_names
-from imulab.procedures.tumble.optimal import CLOSEST, CRITERIA, Search, information_rows, inverse, optimal_set
+from imulab.procedures.tumble.optimal import CLOSEST, Search, information_rows, inverse, optimal_set
 from imulab.recording import Array
 
 MOST_ATTITUDES = 300

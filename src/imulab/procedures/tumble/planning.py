@@ -13,6 +13,7 @@ from imulab.errors import ImulabError, OptionError, RecordError
 from imulab.procedures.inputs import Data, as_recording
 from imulab.procedures.loading import load
 from imulab.procedures.tumble import plan
+from imulab.procedures.tumble.choices import STARTS
 from imulab.procedures.tumble.fit import fit_tumble
 from imulab.procedures.tumble.options import check_method
 from imulab.procedures.tumble.plan import Plan, fixture_candidates, head_candidates
@@ -155,16 +156,14 @@ def _noise_of(record: Calibration) -> float:
 
 def _candidates(given: Any) -> Array | None:
     if isinstance(given, str):
-        if given == "sphere":
+        if given == STARTS[0]:
             return None
         kind, colon, step = given.partition(":")
         if colon and kind in ("fixture", "head"):
             angle = quantity(step, f"from_ {kind}", "angle", "deg")
             return fixture_candidates(angle) if kind == "fixture" else head_candidates(angle)
         if colon and not Path(given).exists():
-            raise OptionError(
-                f"from_ {given!r}: expected sphere, fixture:15, head:15 (steps in deg) or a file of directions"
-            )
+            raise OptionError(f"from_ {given!r}: expected {', '.join(STARTS)} (steps in deg) or a file of directions")
     if isinstance(given, np.ndarray | list | tuple):
         return _units(given, "from_")
     recording = as_recording(given, {}, plan_tumble, name="from_")

@@ -15,14 +15,13 @@ from typing import overload
 import numpy as np
 
 from imulab.errors import OptionError, listed
-from imulab.procedures.warmup.choices import TEMPERATURES
+from imulab.procedures.warmup.choices import LAWS, TEMPERATURES
 from imulab.quantities import in_si, temperature_list, whole
 from imulab.recording import Array, Recording
 from imulab.shown import Shown
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv
 
-LAWS = ("smooth", "bent")
 GYRO_AXES = ("gyro_x", "gyro_y", "gyro_z")
 ACCEL_AXES = ("accel_x", "accel_y", "accel_z")
 
