@@ -47,7 +47,10 @@ def test_help_imports_no_numerics():
 def test_a_fit_and_noise_load_no_package_that_takes_longer_than_they_do(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     il.write_csv(il.simulate_tumble(order=1, gravity=9.81, seed=1), "tumble.csv")
-    heavy = "{'scipy.special._basic', 'scipy.optimize', 'scipy.linalg', 'scipy.signal', 'numpy.f2py', 'numpy.testing'}"
+    heavy = (
+        "{'scipy.special._basic', 'scipy.optimize', 'scipy.linalg', 'scipy.signal', 'scipy.fft', 'numpy.f2py', "
+        "'numpy.testing', 'numpy.ma'}"
+    )
     for words in (["tumble", "fit", "tumble.csv", "--gravity", "9.81"], ["allan", "tumble.csv"]):
         code = f"import sys; from imulab.cli import main; print(main({words}), {heavy} & set(sys.modules))"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation import TAUS
+from imulab.estimation.ranked import distinct
 from imulab.recording import Array
 
 _CHUNK = 1 << 14
@@ -98,11 +99,11 @@ def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
             counts = 2 ** np.arange(0, int(math.log2(most)) + 1)
         elif taus == "dense":
             steps = int(_DENSE_PER_DECADE * math.log10(most)) + 1
-            counts = np.unique(np.round(10 ** (np.arange(steps) / _DENSE_PER_DECADE))).astype(np.int64)
+            counts = distinct(np.round(10 ** (np.arange(steps) / _DENSE_PER_DECADE))).astype(np.int64)
         else:
             raise OptionError(f"taus {taus!r}: expected {' or '.join(TAUS)}")
     else:
-        counts = np.unique(np.round(np.asarray(taus, dtype=np.float64) * rate).astype(np.int64))
+        counts = distinct(np.round(np.asarray(taus, dtype=np.float64) * rate).astype(np.int64))
     counts = counts[(counts >= 1) & (counts <= most)]
     if not counts.size:
         raise OptionError(f"taus: expected averaging times from {1 / rate:g} s to {most / rate:g} s")

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.ranked import median, medians
 from imulab.recording import Array
 
 Model = Callable[[Array], tuple[Array, Array]]
@@ -183,15 +184,6 @@ def leverage(jacobian: Array, weights: Array) -> Array:
     return result
 
 
-def median(values: Array) -> float:
-    """Return the median of a few numbers, NaN if there is one among them, in a tenth of the time of NumPy's."""
-    ordered = np.sort(values, axis=None)
-    if np.isnan(ordered[-1]):
-        return float("nan")
-    middle = len(ordered) // 2
-    return float((ordered[-1 - middle] + ordered[middle]) / 2)
-
-
 def huber_weights(standardised: Array) -> Array:
     """Return ``min(1, c / |z|)`` for residuals in units of their standard deviation."""
     weights: Array = np.minimum(1.0, _HUBER / np.maximum(np.abs(standardised), 1e-300))
@@ -260,7 +252,7 @@ def plausible_excess(residuals: Array, variance: Array, spare: Array) -> tuple[A
     told, freedom = freedom >= _TOLD, np.maximum(freedom, _TOLD)
     peak = np.minimum(_PEAK, np.minimum(freedom / _PER_DEGREE, (freedom / _PER_SQUARE) ** 2))[:, None]
     reach = _REACH * np.sqrt(2 * freedom)
-    typical = np.median(variance, axis=1)[:, None]
+    typical = medians(variance)[:, None]
     first = np.maximum(excess_variance(residuals, variance, freedom + reach)[:, None], _LEAST_EXCESS * typical)
     last = excess_variance(residuals, variance, np.maximum(freedom - reach, _LEAST_CHI_SQUARE * freedom))[:, None]
     width = np.log(np.maximum(last, typical) / first)
@@ -285,7 +277,7 @@ def robust_scale(standardised: Array, size: int) -> Array:
     As many residuals as there are parameters are near zero by construction: the median is that of the others.
     """
     largest = np.sort(np.abs(standardised), axis=1)[:, min(size, standardised.shape[1] - 1) :]
-    scale: Array = 1.4826 * np.median(largest, axis=1)
+    scale: Array = 1.4826 * medians(largest)
     return scale
 
 

@@ -17,6 +17,7 @@ from imulab.estimation.noise.choice import average
 from imulab.estimation.noise.cosine import frequencies
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, letters
 from imulab.estimation.noise.use import bias_square
+from imulab.estimation.ranked import distinct
 from imulab.recording import Array
 
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk", "quantisation")
@@ -214,7 +215,7 @@ def resolution(samples: Array) -> float:
 
     The first 20,000 samples tell it.
     """
-    values = np.unique(samples[:20_000])
+    values = distinct(samples[:20_000])
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
 
 

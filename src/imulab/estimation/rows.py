@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import kind_of
 from imulab.errors import DataError
+from imulab.estimation.ranked import distinct, quantile
 from imulab.recording import Array, Recording
 from imulab.verdict import Note
 
@@ -190,7 +191,7 @@ def _far(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     resolution = float(np.min(steps, where=steps > 0, initial=np.inf))
     if resolution == np.inf:
         return far, alone
-    moving = wide > _QUIET * max(float(np.quantile(local, 0.2)), resolution)
+    moving = wide > _QUIET * max(quantile(local, 0.2), resolution)
     least = _FAR * resolution
     limits = np.maximum(_FAR * _TO_SIGMA * wide, least)
 
@@ -202,7 +203,7 @@ def _far(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     rest = np.flatnonzero(steps[count * _AROUND :] > limits[-1]) + count * _AROUND
     suspect = np.concatenate([suspect, rest])
     suspect = suspect[~moving[part(suspect)]]
-    index = np.unique(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
+    index = distinct(np.minimum(suspect[:, None] + np.arange(3), len(x) - 1))
     middle = np.clip(index, _BESIDE, len(x) - 1 - _BESIDE)
     window = x[middle[:, None] + np.arange(-_BESIDE, _BESIDE + 1)]
     level = np.sort(window, axis=1)[:, _BESIDE]

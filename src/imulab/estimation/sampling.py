@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from imulab.errors import DataError
+from imulab.estimation.ranked import median, quantile
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import to_si
 
@@ -29,9 +30,9 @@ def usual_step(step: Array) -> tuple[float, float]:
     (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
     fifth exceed. The usual step is the mean of those that are no gaps.
     """
-    longest = _GAP * float(np.median(step))
+    longest = _GAP * median(step)
     if np.mean(step > longest) > _COARSE:
-        longest = _GAP * float(np.quantile(step, 1 - _COARSE))
+        longest = _GAP * quantile(step, 1 - _COARSE)
     return float(step[step <= longest].mean()), longest
 
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from imulab.estimation.ranked import median
 from imulab.recording import Array
 
 _BLOCKS, _SMALLEST = 256, 16
@@ -53,7 +54,7 @@ def find_step(samples: Array) -> Step | None:
         change = (total[place + width] - 2 * total[place] + total[place - width]) / width
         index = int(np.argmax(np.abs(change)))
         others = np.abs(np.delete(change, np.s_[max(0, index - 2 * width) : index + 2 * width + 1]))
-        least = max(limit * _TO_SIGMA * float(np.median(others)), _WHITE * white / np.sqrt(width))
+        least = max(limit * _TO_SIGMA * median(others), _WHITE * white / np.sqrt(width))
         if least > 0 and abs(change[index]) > best * least:
             best = abs(change[index]) / least
             found = Step(float(change[index]), int(place[index]) * length, 4 * length)

@@ -90,7 +90,7 @@ def choose(
     best = found.chosen
     with_q = models | terms("Q")
     joins = np.zeros(len(power), dtype=np.bool_)
-    for index in np.unique(best).tolist():
+    for index in sorted(set(best.tolist())):
         columns = np.flatnonzero(best == index)
         tried = fit(bins, with_q[index : index + 1], limits, power[columns], freedom[columns])
         joins[columns] = found.deviance[columns, index] - tried.deviance >= _QUANTISATION

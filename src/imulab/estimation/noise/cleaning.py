@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.ranked import median, medians, quantile
 from imulab.recording import Array
 
 _BLOCK, _SPIKE = 50, 6.0
@@ -55,7 +56,7 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
     blocks = len(samples) // _BLOCK
     if blocks < 4:
         return samples, 0
-    level = np.median(samples[: blocks * _BLOCK].reshape(blocks, _BLOCK), axis=1)
+    level = medians(samples[: blocks * _BLOCK].reshape(blocks, _BLOCK))
     # The line from the middle of a block to that of the next, and on beyond the first and the last.
     rise = np.diff(level)
     share = (np.arange(_BLOCK) + 0.5) / _BLOCK
@@ -66,7 +67,7 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
         stop = min(start + _CHUNK // _BLOCK, blocks - 1)
         line = level[start:stop, None] + rise[start:stop, None] * share
         off = np.abs(samples[body][start * _BLOCK : stop * _BLOCK].reshape(line.shape) - line).ravel()
-        limit = _SPIKE / _TO_SIGMA * float(np.quantile(off[:: max(1, len(off) // 8192)], 0.95))
+        limit = _SPIKE / _TO_SIGMA * quantile(off[:: max(1, len(off) // 8192)], 0.95)
         if limit > 0 and float(off.max()) > limit:
             far = np.flatnonzero(off > limit)
             cleaned = samples.copy() if not count else cleaned
@@ -104,7 +105,7 @@ def line_groups(
     for start, stop in zip((first - 1).tolist(), last.tolist(), strict=True):
         if stop - start >= _FEWEST:
             beside = max(0, (_LEAST - (stop - start) + 1) // 2)
-            level[start:stop] = np.median(squares[max(start - beside, 0) : stop + beside])
+            level[start:stop] = median(squares[max(start - beside, 0) : stop + beside])
     out = np.flatnonzero((squares > limit * level) & (level > 0))
     if not out.size:
         return fine, ()
@@ -132,7 +133,7 @@ def strong_lines_removed(c: Array, lines: Sequence[Line], interval: float) -> tu
         middle = round(2 * (len(c) + 1) * interval * line.frequency)
         near = slice(max(middle - _NEAR, 0), middle + _NEAR)
         power = c[near] ** 2
-        if power.max() < _STRONG * np.median(c[max(middle - 10 * _NEAR, 0) : middle + 10 * _NEAR] ** 2):
+        if power.max() < _STRONG * median(c[max(middle - 10 * _NEAR, 0) : middle + 10 * _NEAR] ** 2):
             continue
         j = np.arange(1, len(c) + 1, dtype=np.float64)
         place, size = _sine(c[near], j[near], float(j[near][np.argmax(power)]), len(c) + 1)

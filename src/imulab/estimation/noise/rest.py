@@ -11,6 +11,7 @@ import numpy as np
 from imulab.errors import DataError
 from imulab.estimation.column_noise import moved_columns
 from imulab.estimation.noise.cosine import Stretch, transformed
+from imulab.estimation.ranked import distinct
 from imulab.estimation.sampling import WIDEST_GAP, bridged, sampling_rate, steady_part, usual_step
 from imulab.recording import Array, Recording, check_time
 from imulab.verdict import Note
@@ -178,7 +179,7 @@ def _parts(time: Array) -> tuple[list[tuple[int, int, Array | None]], int, int]:
 
 def _clipped(values: Array) -> float | None:
     """Return the limit at which samples pile up: more than twice as many as at the next level; noise has fewer."""
-    if len(np.unique(values[:_SEEN])) < _LEVELS:
+    if len(distinct(values[:_SEEN])) < _LEVELS:
         return None
     for limit, outside, nearest in ((values.max(), np.less, np.max), (values.min(), np.greater, np.min)):
         piled = int(np.count_nonzero(values == limit))

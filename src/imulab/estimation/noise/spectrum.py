@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.ranked import distinct
 from imulab.recording import Array
 
 _ALONE, _PER_DECADE = 24, 60
@@ -59,6 +60,6 @@ def bins(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """
     steps = int(np.ceil(_PER_DECADE * np.log10(max(count / _ALONE, 1)))) + 1
     edges = np.ceil((_ALONE + 1) * 10 ** (np.arange(steps) / _PER_DECADE)).astype(np.int64)
-    starts = np.unique(np.concatenate([np.arange(1, _ALONE + 1), edges]))
+    starts = distinct(np.concatenate([np.arange(1, _ALONE + 1), edges]))
     first = starts[starts < count]
     return first, np.append(first[1:] - 1, count - 1)

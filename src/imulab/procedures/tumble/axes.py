@@ -12,7 +12,7 @@ import numpy as np
 
 from imulab.columns import triad
 from imulab.errors import DataError
-from imulab.estimation.least_squares import median
+from imulab.estimation.ranked import median
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.rotation import frame_rotations
 from imulab.recording import Array

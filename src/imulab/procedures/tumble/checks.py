@@ -6,7 +6,7 @@ import numpy as np
 
 from imulab.columns import triad
 from imulab.errors import DataError, RecordError
-from imulab.estimation.least_squares import median
+from imulab.estimation.ranked import median
 from imulab.procedures.tumble.attitudes import Attitudes, Motion
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.model import GAUGE, parameter_names

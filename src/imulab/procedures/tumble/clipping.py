@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
+from imulab.estimation.ranked import median
 from imulab.recording import Array, Recording
 
 _FEWEST_SAMPLES = 5
@@ -47,7 +48,7 @@ def check_clipping(recording: Recording, names: list[str], pieces: NDArray[np.in
                     held.append((count / (stop - start), start + int(np.argmax(ties[start:stop]))))
                 else:
                     shares.append(_largest_share(values[start:stop]))
-            usual = float(np.median(shares)) if shares else 0.0
+            usual = median(np.array(shares)) if shares else 0.0
             if held and max(held)[0] > _USUAL_TIES * usual:
                 share, first = max(held)
                 raise DataError(

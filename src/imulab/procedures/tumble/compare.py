@@ -9,7 +9,8 @@ from typing import ClassVar, Unpack
 import numpy as np
 
 from imulab.errors import OptionError, RecordError
-from imulab.estimation.least_squares import chi_square_probability, median
+from imulab.estimation.least_squares import chi_square_probability
+from imulab.estimation.ranked import median
 from imulab.gravity import Gravity, local_gravity
 from imulab.procedures.inputs import Reading, as_record
 from imulab.procedures.result import Drawn

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.estimation.ranked import median
 from imulab.procedures.tumble.engineering import micro_g, small_g
 from imulab.procedures.tumble.model import AXES
 from imulab.procedures.tumble.sections import (
@@ -100,7 +101,7 @@ def _residuals(record: Calibration) -> Figure:
     before = [micro_g(value) / 1e3 for value in data.residual_before]
     usual = np.array(data.down_weight) >= ALARM
     bad = len(number) - int(usual.sum())
-    beyond = bulk(np.array(after), usual if usual.any() else None, float(np.median(bars)) if bars else 0.0)
+    beyond = bulk(np.array(after), usual if usual.any() else None, median(np.array(bars)) if bars else 0.0)
     marks = [] if beyond is None else edge_marks(beyond, np.array(after), number, [small_g(v) for v in data.residual])
     worst = int(np.argmax(np.where(usual, np.abs(after), -1.0)))
     scale = {} if beyond is None else {"range": [beyond.low, beyond.high]}

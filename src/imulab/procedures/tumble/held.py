@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.ranked import distinct, median, medians
 from imulab.procedures.tumble import _segment
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Motion
 from imulab.recording import Array, Recording
@@ -62,7 +63,7 @@ def _statistics(held: Held) -> tuple[Array, Array, Array]:
     count = len(held.centre)
     size = held.stop - held.start
     total = np.bincount(held.attitude, size, count)
-    per_batch = max(1, min(int(np.median(total)) // _BATCHES, int(size.min()) // 2))
+    per_batch = max(1, min(int(median(total)) // _BATCHES, int(size.min()) // 2))
     first = np.empty(int((size // per_batch).sum()), dtype=np.int64)
     number = np.empty(count, dtype=np.int64)
     scatter: Array = np.empty((count, 9, 9))
@@ -79,7 +80,7 @@ def _pooled(covariance: Array, freedom: Array, share: Array) -> Array:
     """Covariance of each mean, shrunk towards the noise common to all: a few batches alone make poor weights."""
     scatter = covariance / share[:, None, None]
     level = np.trace(scatter, axis1=1, axis2=2)
-    usual = level <= 3 * np.median(level)
+    usual = level <= 3 * median(level)
     pooled = np.einsum("n,nij->ij", freedom[usual], scatter[usual]) / max(float(freedom[usual].sum()), 1.0)
     own = freedom[:, None, None]
     shrunk: Array = (own * scatter + POOL_DEGREES * pooled) / (own + POOL_DEGREES)
@@ -97,7 +98,7 @@ def _motion(held: Held, moments: Array, freedom: Array, share: Array) -> Motion:
     numbers = np.array([np.bincount(held.attitude, each, count) for each in terms])
     difference, spread, slope = sums / np.maximum(numbers, 1)[:, :, None, None]
     white = difference / (2 * held.length)
-    pooled = np.median(white, axis=0)
+    pooled = medians(white, 0)
     each = np.repeat(held.attitude, size)
     within: Array = np.column_stack([np.bincount(each, held.scatter[:, axis], count) for axis in range(3)])
     within = within * held.length / (held.length - 1) / np.bincount(each, minlength=count)[:, None]
@@ -115,7 +116,7 @@ def covariance_and_motion(
 ) -> tuple[Array, Motion | None]:
     """Return the covariance of each mean, with that of rounding, and the motion in the attitudes."""
     moments, freedom, share = _statistics(held)
-    noise = np.sqrt(np.median(held.scatter, axis=0))
+    noise = np.sqrt(medians(held.scatter, 0))
     if (noise < resolution / 2).any():
         resolution = resolutions(recording, names)
     # Noise below half a step of the output does not average its rounding away.
@@ -134,7 +135,7 @@ def resolutions(recording: Recording, names: list[str], part: int | None = None)
     found = np.full(len(names), 0.0 if part is None else np.inf)
     for axis, name in enumerate(names):
         samples = recording.column(name)
-        values = np.unique(samples[:: max(1, len(samples) // 100_000)][:part])
+        values = distinct(samples[:: max(1, len(samples) // 100_000)][:part])
         if len(values) > 1:
             found[axis] = np.diff(values).min()
     return found

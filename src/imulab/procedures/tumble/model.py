@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.estimation.least_squares import Fit, least_squares
+from imulab.estimation.ranked import medians
 from imulab.procedures.tumble import _model
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Motion
 from imulab.recording import Array
@@ -192,7 +193,7 @@ def length_noise(theta: Array, jacobian: Array, covariance: Array, motion: Motio
     _model.noise(np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), motion.moments, np.empty(0), own)
     # An attitude that was knocked, or moved in other ways, says nothing of the others' noise.
     ratio = own / expected
-    counts = motion.freedom * (ratio <= _UNUSUAL * np.median(ratio, axis=1, keepdims=True))
+    counts = motion.freedom * (ratio <= _UNUSUAL * medians(ratio)[:, None])
     level = (counts * own).sum(axis=1) / np.maximum((counts * expected).sum(axis=1), np.finfo(float).tiny)
     usual = level[:, None] * expected
     return lengthening, (motion.freedom * own + POOL_DEGREES * usual) / (motion.freedom + POOL_DEGREES)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.errors import SegmentError
+from imulab.estimation.ranked import median, quantile
 from imulab.estimation.rows import leave_out
 from imulab.procedures.inputs import Data, Sampling, as_recording
 from imulab.procedures.tumble import _segment
@@ -170,7 +171,7 @@ def find_attitudes(
 def _quietest(variance: Array, recording: Recording, names: list[str]) -> tuple[float, Array]:
     """Return the variance of the quietest windows, no smaller than that of rounding, and the step of each output."""
     finite = variance[np.isfinite(variance) & (variance > 0)]
-    quietest = float(np.quantile(finite, 0.05)) if finite.size else 0.0
+    quietest = quantile(finite, 0.05) if finite.size else 0.0
     # No step within a part is smaller than the smallest of all, which costs a sort: often too small to matter already.
     resolution = resolutions(recording, names, _A_PART)
     if float((resolution**2).sum()) / 12 > quietest:
@@ -209,7 +210,7 @@ def _notes(blocks: _Blocks, variance: Array) -> tuple[str, ...]:
 def _form_blocks(recording: Recording, names: list[str], time: Array, window: float) -> _Blocks:
     steps = np.diff(time)
     # The mean, not the median: stamps come in bursts, rates change, samples get lost; long pauses are left out.
-    usual = steps[steps <= np.quantile(steps, 0.99)] if steps.size else np.ones(1)
+    usual = steps[steps <= quantile(steps, 0.99)] if steps.size else np.ones(1)
     step = float(usual.mean())
     seconds = min(_BLOCK_SECONDS, window / 3, len(time) * step)  # no block is longer than the recording
     length = max(SMALLEST_BLOCK, round(seconds / step))
@@ -272,7 +273,7 @@ def _choose(candidates: list[_Pieces]) -> int:
     radius.
     """
     counts = np.array([len(pieces.mean) for pieces in candidates])
-    enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * np.median(counts[counts > 0])))) if counts.any() else 0)
+    enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * median(counts[counts > 0])))) if counts.any() else 0)
     known: dict[int, float] = {}
     errors = []
     for pieces, count in zip(candidates, counts, strict=True):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.estimation.ranked import quantile
 from imulab.procedures.tumble.sections import attitudes_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -20,7 +21,7 @@ def sphere_figure(record: Calibration) -> Figure:
     u = force / np.linalg.norm(force, axis=1, keepdims=True)
     residual = np.array([float(from_si(value, "ug")) for value in data.residual])
     weight = np.array(data.down_weight)
-    limit = float(np.quantile(np.abs(residual[weight >= ALARM]), 0.95)) if (weight >= ALARM).any() else 1.0
+    limit = quantile(np.abs(residual[weight >= ALARM]), 0.95) if (weight >= ALARM).any() else 1.0
     up = u[:, 2] >= 0
     traces: list[dict[str, Any]] = []
     for upper, axes in ((True, ("x", "y")), (False, ("x2", "y2"))):
