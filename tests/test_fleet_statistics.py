@@ -252,8 +252,8 @@ BAD_LIMITS = {
     ),
     "no unit": ("[tumble]\nbias_x = { upper = 1 }\n", "tumble: bias_x: expected a unit, and lower or upper or both"),
     "no end": ('[tumble]\nbias_x = { unit = "mg" }\n', "expected a unit, and lower or upper or both"),
-    "no number": ('[tumble]\nbias_x = { upper = "1", unit = "mg" }\n', "upper = '1': expected a number"),
-    "infinite": ('[tumble]\nbias_x = { upper = inf, unit = "mg" }\n', "upper = inf: expected a number"),
+    "no number": ('[tumble]\nbias_x = { upper = "1", unit = "mg" }\n', "bias_x: upper: expected a number, found '1'"),
+    "infinite": ('[tumble]\nbias_x = { upper = inf, unit = "mg" }\n', "bias_x: upper: expected a number, found inf"),
     "other unit": ('[tumble]\nbias_x = { upper = 1, unit = "deg" }\n', "unit 'deg': expected m/s^2 or mg"),
     "crossed": ('[tumble]\nbias_x = { lower = 2, upper = 1, unit = "mg" }\n', "lower 2 is not below upper 1"),
 }

@@ -340,7 +340,7 @@ def test_a_byte_order_mark_above_foreign_rows_is_skipped(file):
 @pytest.mark.parametrize("size", SIZES)
 def test_a_sample_rate_makes_the_time_through_all_blocks(file, monkeypatch, size):
     monkeypatch.setattr("imulab.readers.lines._BLOCK_BYTES", size)
-    head = 'sample_rate = { value = 62.5, unit = "Hz" }\n'
+    head = 'sample_rate = { value = 0.0625, unit = "kHz" }\n'
     layout = toml(file, head + '[columns]\naccel_x = { from = 0, unit = "V" }\n')
     recording = read(file(b"".join(b"%d\n" % k for k in range(100))), layout)
     assert list(recording.columns) == ["time", "accel_x"]
@@ -376,11 +376,15 @@ LAYOUTS = {
         "column fog: unknown key 'scal'; known keys: from unit scale zero scale_factor; did you mean 'scale'?",
     ),
     "from": ('[columns]\nfog = { from = -1, unit = "V" }\n', "column fog: from = -1; expected a column number from 0"),
-    "rate unit": ('sample_rate = { value = 1, unit = "kHz" }\n' + FOG, "sample_rate: expected { value = 100, unit ="),
+    "unit of rate": (
+        'sample_rate = { value = 1, unit = "s" }\n' + FOG,
+        "sample_rate: expected a unit of frequency",
+    ),
+    "rate alone": ("sample_rate = { value = 1 }\n" + FOG, "sample_rate: expected { value = 100, unit ="),
     "rate 0": ("sample_rate = 0\n" + FOG, "sample_rate: expected a number of Hz from 1e-06 to 1e+09, found 0"),
     "rate true": (
         'sample_rate = { value = true, unit = "Hz" }\n' + FOG,
-        "sample_rate: expected a number of Hz from 1e-06 to 1e+09",
+        "sample_rate: expected a number, found True",
     ),
     "not TOML": ("columns = [", "the layout file is not TOML"),
     "unit unknown": (

@@ -22,16 +22,21 @@ class ScaleFactor:
 
 def scale_factor_of(entry: Any, place: str, example: str) -> ScaleFactor:
     """Return a scale factor ``{ value = 0.02, unit = "V/(deg/s)" }``; `example` is how the whole line is written."""
-    if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
-        raise ReadError(f"{place}: expected {example}, found {quoted(entry)}")
-    value = number_of(entry["value"], place)
+    value, unit = value_and_unit(entry, place, example)
     if value == 0:
         raise ReadError(f"{place}: expected a value other than 0")
     try:
-        output, measured = parse_scale_factor(str(entry["unit"]))
+        output, measured = parse_scale_factor(unit)
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
     return ScaleFactor(value, output, measured)
+
+
+def value_and_unit(entry: Any, place: str, example: str) -> tuple[float, str]:
+    """Return both of ``{ value = 2.5, unit = "V" }``; `example` is how the whole line is written."""
+    if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
+        raise ReadError(f"{place}: expected {example}, found {quoted(entry)}")
+    return number_of(entry["value"], place), str(entry["unit"])
 
 
 def check_keys(table: Mapping[str, Any], keys: tuple[str, ...], place: str) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.fleet.display import to_parameter_unit
 from imulab.procedures.registry import PROCEDURES
+from imulab.quantity_entries import check_keys, number_of
 from imulab.toml import load_toml
 
 
@@ -66,20 +67,16 @@ def load_limits(path: str, units: Mapping[tuple[str, str], str]) -> dict[tuple[s
 
 
 def _limits(entry: Any, unit: str, place: str) -> Limits:
+    ends = {"lower": -math.inf, "upper": math.inf}
     if not isinstance(entry, dict):
         raise ReadError(f'{place}: expected {{ lower = -20, upper = 20, unit = "{unit}" }}, found {quoted(entry)}')
-    extra = sorted(set(entry) - {"lower", "upper", "unit"})
-    if extra:
-        raise ReadError(f"{place}: unknown key {extra[0]!r}; known keys: lower upper unit")
-    if "unit" not in entry or not {"lower", "upper"} & set(entry):
+    check_keys(entry, (*ends, "unit"), place)
+    if "unit" not in entry or not ends.keys() & entry.keys():
         raise ReadError(f"{place}: expected a unit, and lower or upper or both")
-    ends = {"lower": -math.inf, "upper": math.inf}
-    for name in set(entry) - {"unit"}:
-        value = entry[name]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ReadError(f"{place}: {name} = {quoted(value)}: expected a number")
+    for name in ends.keys() & entry.keys():
+        value = number_of(entry[name], f"{place}: {name}")
         try:
-            ends[name] = to_parameter_unit(float(value), str(entry["unit"]), unit)
+            ends[name] = to_parameter_unit(value, str(entry["unit"]), unit)
         except UnitError as error:
             raise UnitError(f"{place}: {error}") from None
     if not ends["lower"] < ends["upper"]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from imulab.columns import check_unit
 from imulab.errors import ReadError, UnitError, listed, quoted
-from imulab.quantity_entries import check_keys, number_of, scale_factor_of
+from imulab.quantity_entries import check_keys, number_of, scale_factor_of, unit_of, value_and_unit
 from imulab.recording import Array
 from imulab.toml import load_toml
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
@@ -277,13 +277,11 @@ def _zero(entry: Any, unit: Unit, place: str) -> float:
     """Return the zero of a column in its unit."""
     if entry is None:
         return 0.0
-    if not isinstance(entry, dict) or set(entry) != {"value", "unit"}:
-        raise ReadError(f"{place}: expected zero = {_BY_COLUMN['zero']}, found {quoted(entry)}")
+    value, symbol = value_and_unit(entry, place, f"zero = {_BY_COLUMN['zero']}")
     try:
-        factor = conversion_factor(str(entry["unit"]), unit.symbol)
+        zero = value * conversion_factor(symbol, unit.symbol)
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
-    zero = number_of(entry["value"], place) * factor
     if zero:
         _check_size(zero, place)
     return zero
@@ -324,12 +322,12 @@ def _encoding(name: Any, path: str) -> str:
 def _sample_rate(entry: Any, path: str) -> float | None:
     if entry is None:
         return None
-    if isinstance(entry, int | float) and not isinstance(entry, bool):
+    place = f"{path}: sample_rate"
+    if isinstance(entry, int | float):
         entry = {"value": entry, "unit": "Hz"}
-    if not isinstance(entry, dict) or set(entry) != {"value", "unit"} or entry["unit"] != "Hz":
-        raise ReadError(f'{path}: sample_rate: expected {{ value = 100, unit = "Hz" }}, found {quoted(entry)}')
-    value = entry["value"]
+    value, symbol = value_and_unit(entry, place, '{ value = 100, unit = "Hz" }')
+    rate = to_si(value, unit_of(symbol, "frequency", place))
     low, high = _RATES
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise ReadError(f"{path}: sample_rate: expected a number of Hz from {low:g} to {high:g}, found {quoted(value)}")
-    return to_si(float(value), "Hz")
+    if not low <= rate <= high:
+        raise ReadError(f"{place}: expected a number of Hz from {low:g} to {high:g}, found {rate:g}")
+    return rate
