@@ -30,6 +30,9 @@ def usual_step(step: Array) -> tuple[float, float]:
     (stamps in whole milliseconds at 700 Hz alternate between 1 and 2 ms), and the limit is 1.5 times the step that a
     fifth exceed. The usual step is the mean of those that are no gaps.
     """
+    if step.max() <= _GAP * step.min():  # no gap, whatever the median is
+        usual = float(step.mean())
+        return usual, _GAP * usual
     longest = _GAP * median(step)
     if np.mean(step > longest) > _COARSE:
         longest = _GAP * quantile(step, 1 - _COARSE)
@@ -75,6 +78,8 @@ def steady_rows(time: Array) -> tuple[int, int]:
     that differs is passed over.
     """
     step = np.diff(time)
+    if step.size and step.max() < (1 + _SAME_RATE / 2) * step.min():  # as most are
+        return 0, len(time)
     size = max(_SMALLEST_BLOCK, -(-len(step) // _BLOCKS))
     count = len(step) // size
     if count < 2:
