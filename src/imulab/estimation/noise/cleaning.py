@@ -87,9 +87,9 @@ def line_groups(
 ) -> tuple[NDArray[np.bool_], tuple[Line, ...]]:
     """Find lines: squares of coefficients that stand out of their bin, and what is beside them.
 
-    A square, the mean of `averages`, is that of a line beyond the 1e-9 point of chi-square about the median of its bin,
-    in bins of 16 and more, with their neighbours up to 100. Left out are three coefficients on both sides, and as many
-    as stand out themselves: a strong line leaks far.
+    A square, the mean of `averages`, is that of a line beyond the 1e-9 point of chi-square about the median of its bin
+    with neighbours, 100 in all; none is found below the 25th. Left out are three coefficients on both sides, and as
+    many as stand out themselves: a strong line leaks far.
 
     Returns
     -------
@@ -101,11 +101,7 @@ def line_groups(
     limit = float(chdtri(averages, _FALSE_ALARM) / chdtri(averages, 0.5))
     noise = averages / float(chdtri(averages, 0.5))  # the mean of chi-square over its median
     fine = np.ones(len(squares), dtype=np.bool_)
-    level = np.zeros(len(squares))
-    for start, stop in zip((first - 1).tolist(), last.tolist(), strict=True):
-        if stop - start >= _FEWEST:
-            beside = max(0, (_LEAST - (stop - start) + 1) // 2)
-            level[start:stop] = median(squares[max(start - beside, 0) : stop + beside])
+    level = _levels(squares, first, last)
     out = np.flatnonzero((squares > limit * level) & (level > 0))
     if not out.size:
         return fine, ()
@@ -119,6 +115,24 @@ def line_groups(
         power = max(float((squares[span] - level[span] * noise).sum()), float(above.max()))
         lines.append(Line(f, float(np.sqrt(2 * power / count))))
     return fine, tuple(sorted(lines, key=lambda line: -line.amplitude))
+
+
+def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
+    """The median around each coefficient, bin by bin, shape (J,); 0 where there are too few around it."""
+    width = last - first + 1
+    level = np.zeros(len(width))
+    for k in np.flatnonzero(width >= _FEWEST).tolist():
+        beside = max(0, (_LEAST - int(width[k]) + 1) // 2)
+        level[k] = median(squares[max(int(first[k]) - 1 - beside, 0) : int(last[k]) + beside])
+    # Of narrow bins as many on both sides: the median of noise that falls with frequency is that of the middle.
+    centre = (first + last) // 2 - 1
+    for half, most in ((_LEAST // 4, _LEAST // 2), (_LEAST // 2, len(squares) - _LEAST // 2)):
+        near = np.flatnonzero((width < _FEWEST) & (centre >= half) & (centre < min(most, len(squares) - half)))
+        if near.size:
+            level[near] = np.median(squares[centre[near, None] + np.arange(-half, half + 1)], axis=1)
+    found = np.zeros(len(squares))
+    found[first[0] - 1 : last[-1]] = np.repeat(level, width)
+    return found
 
 
 def strong_lines_removed(c: Array, lines: Sequence[Line], interval: float) -> tuple[Array, tuple[Line, ...]]:
