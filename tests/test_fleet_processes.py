@@ -30,7 +30,7 @@ def test_an_error_in_a_process_is_raised_here():
 
 
 def test_a_process_that_ends_is_reported():
-    with pytest.raises(processes.ProcessLostError):
+    with pytest.raises(processes.WorkersLostError):
         list(processes.run(os._exit, [(3,)], 2))
 
 

@@ -7,7 +7,8 @@ found. The command line prints the message alone and exits with 2.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 
 def listed(known: Iterable[str], found: object) -> str:
@@ -26,6 +27,12 @@ def several(words: Iterable[str], longest: int = 300) -> str:
     """Return words for a message, as many as a line has room for."""
     text = " ".join(words)
     return text if len(text) <= longest else text[: longest - 4] + " ..."
+
+
+def first_of(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """Return the first names for a message, and how many more there are: ``x, y and 3 more``."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + more
 
 
 def meant(known: Iterable[str], found: object, alike: float = 0.6) -> str:
@@ -86,3 +93,14 @@ class ObservabilityError(ImulabError):
 
 class OptionError(ImulabError):
     """An option has a value that cannot be used; the message lists what can."""
+
+
+@contextmanager
+def readable(name: object, kind: type[ImulabError] = ReadError) -> Iterator[None]:
+    """Turn what the system says of a file that cannot be read into one line that names it."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise kind(f"{name}: no such file") from None
+    except OSError as error:
+        raise kind(f"{name}: cannot be read: {error.strerror}") from None

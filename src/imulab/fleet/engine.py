@@ -16,6 +16,7 @@ from imulab._version import VERSION
 from imulab.errors import OptionError, listed
 from imulab.fleet import ENGINES, processes
 from imulab.fleet.manifest import FleetUnit
+from imulab.fleet.processes import WorkersLostError
 from imulab.fleet.work import Job, Outcome, work
 
 _CONNECT = 10.0
@@ -24,10 +25,6 @@ _AHEAD = 3
 """Units at the scheduler for each thread of the cluster, so that none waits for the driver."""
 _LOST = 30.0
 """Seconds without scheduler, without workers, or with nothing left of what was submitted, before giving up."""
-
-
-class WorkersLostError(Exception):
-    """Processes have ended under their work; what they had not written is to be done again."""
 
 
 class Engine(Protocol):
@@ -49,18 +46,12 @@ class LocalEngine:
     def run(self, units: Sequence[FleetUnit], job: Job) -> Iterator[Outcome]:
         """Work on the units in several processes."""
         workers = min(self.workers, max(len(units), 1))
-        return (work(unit, job) for unit in units) if workers == 1 else _local(units, job, workers)
+        calls = ((unit, job) for unit in units)
+        return (work(*call) for call in calls) if workers == 1 else processes.run(work, calls, workers)
 
     def run_alone(self, unit: FleetUnit, job: Job) -> Iterator[Outcome]:
         """Work on one unit in a process of its own."""
-        return _local([unit], job, 1)
-
-
-def _local(units: Sequence[FleetUnit], job: Job, workers: int) -> Iterator[Outcome]:
-    try:
-        yield from processes.run(work, ((unit, job) for unit in units), workers)
-    except processes.ProcessLostError as error:
-        raise WorkersLostError(str(error)) from None
+        return processes.run(work, [(unit, job)], 1)
 
 
 class DaskEngine:

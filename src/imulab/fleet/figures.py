@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.errors import first_of
 from imulab.fleet import panels as small
 from imulab.fleet.display import Display, display_of
 from imulab.fleet.reporttables import number
@@ -97,8 +98,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
         traces,
         layout,
         height=grid.height(len(panels)),
-        message=f"{'Stands' if len(standing) == 1 else 'Stand'} out: {', '.join(standing[:6])}"
-        f"{f' and {len(standing) - 6} more' if len(standing) > 6 else ''}."
+        message=f"{'Stands' if len(standing) == 1 else 'Stand'} out: {first_of(standing, 6)}."
         if standing
         else "No unit stands out.",
     )

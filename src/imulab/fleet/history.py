@@ -84,7 +84,7 @@ class History:
         dialect = import_module(f"sqlalchemy.dialects.{self._engine.dialect.name}")
         insert = dialect.insert(self._calibrations).on_conflict_do_nothing().returning(self._calibrations.c.id)
         rows: list[dict[str, Any]] = []
-        with self._said(), self._engine.begin() as connection:
+        with _in_one_line(self._name), self._engine.begin() as connection:
             for summary in summaries:
                 found = connection.execute(
                     insert,
@@ -121,7 +121,7 @@ class History:
         c, p = self._calibrations.c, self._parameters.c
         found: dict[int, Past] = {}
         values: dict[int, dict[str, Parameter]] = {}
-        with self._said(), self._engine.connect() as connection:
+        with _in_one_line(self._name), self._engine.connect() as connection:
             for start in range(0, len(serials), _MANY):
                 query = (
                     sa.select(
@@ -146,16 +146,6 @@ class History:
         for item in found.values():
             past.setdefault(item.serial, []).append(item)
         return past
-
-    @contextmanager
-    def _said(self) -> Iterator[None]:
-        """Turn what the database refuses into one line."""
-        from sqlalchemy.exc import SQLAlchemyError
-
-        try:
-            yield
-        except SQLAlchemyError as error:
-            raise OptionError(f"history {self._name}: {_reason(error)}") from None
 
 
 @contextmanager
@@ -187,21 +177,28 @@ def open_history(url: str, *, there: bool = False) -> Iterator[History]:
         raise OptionError(f"history {name}: no such file")
     if address.drivername == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
-    try:
-        engine = sa.create_engine(address, connect_args={"timeout" if kind == "sqlite" else "connect_timeout": 20})
-    except ImportError as error:
-        raise OptionError(f"history {name}: its driver is missing ({error}): pip install 'imulab[postgres]'") from None
-    except SQLAlchemyError as error:
-        raise OptionError(f"history {name}: {_reason(error)}") from None
-    try:
+    with _in_one_line(name):
         try:
+            engine = sa.create_engine(address, connect_args={"timeout" if kind == "sqlite" else "connect_timeout": 20})
+        except ImportError as error:
+            raise OptionError(
+                f"history {name}: its driver is missing ({error}): pip install 'imulab[postgres]'"
+            ) from None
+    try:
+        with _in_one_line(name):
             history = History(engine, name)
-        except SQLAlchemyError as error:
-            raise OptionError(f"history {name}: {_reason(error)}") from None
         yield history
     finally:
         engine.dispose()
 
 
-def _reason(error: Exception) -> str:
-    return " ".join(str(getattr(error, "orig", None) or error).split())[:300]
+@contextmanager
+def _in_one_line(name: str) -> Iterator[None]:
+    """Turn what the database refuses into one line."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except SQLAlchemyError as error:
+        reason = " ".join(str(getattr(error, "orig", None) or error).split())[:300]
+        raise OptionError(f"history {name}: {reason}") from None

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from imulab.errors import OptionError, ReadError, listed, several
+from imulab.errors import OptionError, ReadError, listed, readable, several
 from imulab.fleet.sources import local_file, parent_of
 from imulab.procedures.registry import PROCEDURES
 from imulab.readers.formats import library
@@ -57,13 +57,8 @@ def load_fleet(path: str) -> FleetManifest:
         A row cannot be run: unknown column, duplicate or unsafe serial, unknown procedure, option or number of files;
         or there are no rows.
     """
-    with local_file(path, path) as local:
-        try:
-            data = local.read_bytes()
-        except FileNotFoundError:
-            raise ReadError(f"{path}: no such file") from None
-        except OSError as error:
-            raise ReadError(f"{path}: cannot be read: {error.strerror}") from None
+    with local_file(path, path) as local, readable(path):
+        data = local.read_bytes()
     rows = _parquet(data, path) if data.startswith(b"PAR1") else _csv(data, path)
     titles = rows[0][1]
     _check_columns(titles, path)

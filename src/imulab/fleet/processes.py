@@ -30,8 +30,8 @@ joblib starts a process anew, with a warning, that has kept 300 MB more than at 
 """
 
 
-class ProcessLostError(Exception):
-    """A process has ended under its work."""
+class WorkersLostError(Exception):
+    """Processes have ended under their work; what they had not written is to be done again."""
 
 
 def available() -> int:
@@ -48,7 +48,7 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
 
     Raises
     ------
-    ProcessLostError
+    WorkersLostError
         A process has ended under its work; the others are ended too.
     """
     from joblib import Parallel, delayed, parallel_config
@@ -67,7 +67,7 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
             for result in results:  # noqa: UP028 - `yield from` would close them too, with a warning
                 yield result
     except BrokenProcessPool as error:
-        raise ProcessLostError(str(error)) from None
+        raise WorkersLostError(str(error)) from None
 
 
 def _close(results: Generator[object, None, None]) -> None:
@@ -103,13 +103,13 @@ def _no_interrupts() -> Iterator[None]:
 
 def _begin(parent: int) -> None:
     """Keep memory, and end this process soon after the one that started it, whatever that dies of."""
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
     with suppress(AttributeError, OSError, TypeError):  # another C library, or a system that does not give its own
         for parameter, size in _KEPT.items():
             ctypes.CDLL(None).mallopt(parameter, size)
-
-
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_LOOK)
-    os._exit(1)

@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 
 from imulab.atomic_write import write_text
-from imulab.errors import OptionError
+from imulab.errors import OptionError, first_of
 from imulab.fleet import figures, reporttables
 from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
@@ -28,6 +28,7 @@ from imulab.procedures.registry import PROCEDURES
 from imulab.report import render_page
 from imulab.report.elements import Exhibits, Figure, ReportTable
 
+_NAMED = 4
 _FEWEST_TO_DRAW = 4
 """Fewer units have no distribution: the table says all there is."""
 
@@ -120,9 +121,10 @@ def fleet_exhibits(
     said = [f"{state.count('done')} of {len(state.rows)} units have their record"]
     if state.failures:
         said.append(f"{len(state.failures)} failed")
-    said.append(f"{_named(sorted(out))} {'stands' if len(out) == 1 else 'stand'} out" if out else "none stands out")
+    standing = f"{first_of(sorted(out), _NAMED)} {'stands' if len(out) == 1 else 'stand'} out"
+    said.append(standing if out else "none stands out")
     if drifting:
-        said.append(f"{_named(drifting)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
+        said.append(f"{first_of(drifting, _NAMED)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
     if capable:
         worst = min(capable, key=lambda item: item.capability.cpk if item.capability else 0.0)
         if worst.capability is not None:
@@ -131,7 +133,7 @@ def fleet_exhibits(
     if fresh:
         facts.append(("changed since last", str(len(moved))))
     if moved:
-        said.append(f"{_named(sorted(moved))} changed since the last calibration")
+        said.append(f"{first_of(sorted(moved), _NAMED)} changed since the last calibration")
     items: list[Figure | ReportTable | None] = [reporttables.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = PROCEDURES[procedure].line_title
@@ -145,10 +147,6 @@ def fleet_exhibits(
         ]
     items += [reporttables.outlier_table(statistics), reporttables.change_table(changes)]
     return Exhibits("; ".join(said) + ".", facts, [item for item in items if item is not None])
-
-
-def _named(names: Sequence[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:

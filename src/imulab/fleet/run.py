@@ -13,10 +13,11 @@ from pathlib import Path
 
 from imulab._version import VERSION
 from imulab.atomic_write import real_path, write_text
-from imulab.errors import OptionError
-from imulab.fleet.engine import Engine, WorkersLostError, open_engine
+from imulab.errors import OptionError, first_of
+from imulab.fleet.engine import Engine, open_engine
 from imulab.fleet.history import History, open_history
 from imulab.fleet.manifest import FleetManifest, FleetUnit, load_fleet
+from imulab.fleet.processes import WorkersLostError
 from imulab.fleet.sources import is_url
 from imulab.fleet.store import Store
 from imulab.fleet.table import Row, check_table, write_table
@@ -293,8 +294,7 @@ def _said_of(rows: Sequence[Row]) -> Iterator[str]:
     if shared:
         more = f" (and {_counted(len(shared) - 1, 'more set')} like these)" if len(shared) > 1 else ""
         first = shared[0]
-        shown = ", ".join(first[:3]) + (f" and {len(first) - 3} more" if len(first) > 3 else "")
-        yield f"serials {shown} were made from files of the same content{more}: is a file named twice?"
+        yield f"serials {first_of(first, 3)} were made from files of the same content{more}: is a file named twice?"
 
 
 def _counted(count: int, what: str) -> str:

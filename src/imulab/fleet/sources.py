@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from imulab.errors import ImulabError, ReadError
+from imulab.errors import ImulabError, ReadError, readable
 
 if TYPE_CHECKING:
     from imulab.readers import Layout
@@ -125,7 +125,7 @@ def sha256_of(path: Path, name: str) -> str:
         It cannot be read.
     """
     total = hashlib.sha256()
-    try:
+    with readable(name):
         parts: Sequence[Path] = [path]
         if path.is_dir():
             from imulab.readers.rosfolder import files_of
@@ -133,12 +133,7 @@ def sha256_of(path: Path, name: str) -> str:
             parts = files_of(path, name)
         for part in parts:
             with part.open("rb") as stream:
-                while data := stream.read(_BLOCK):
-                    total.update(data)
-    except FileNotFoundError:
-        raise ReadError(f"{name}: no such file") from None
-    except OSError as error:
-        raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
+                hashlib.file_digest(stream, lambda: total)
     return total.hexdigest()
 
 
@@ -231,12 +226,8 @@ class UnitFiles:
         """Read a calibration record."""
         from imulab.procedures.loading import loads
 
-        try:
+        with readable(name):
             data = self.path(name).read_bytes()
-        except FileNotFoundError:
-            raise ReadError(f"{name}: no such file") from None
-        except OSError as error:
-            raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
         self.inputs[name] = hashlib.sha256(data).hexdigest()
         return loads(data, name)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -142,12 +143,11 @@ def outlier_limit(count: int) -> float:
 
 def parameter_units(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
     """Return the unit of every parameter; of records in different units, that of most."""
-    votes: dict[tuple[str, str], dict[str, int]] = {}
+    found: dict[tuple[str, str], Counter[str]] = {}
     for summary in summaries:
         for name, parameter in summary.parameters.items():
-            count = votes.setdefault((summary.procedure, name), {})
-            count[parameter.unit] = count.get(parameter.unit, 0) + 1
-    return {key: max(count, key=lambda unit: count[unit]) for key, count in votes.items()}
+            found.setdefault((summary.procedure, name), Counter())[parameter.unit] += 1
+    return {key: count.most_common(1)[0][0] for key, count in found.items()}
 
 
 def line_statistics(

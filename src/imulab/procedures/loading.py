@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from imulab.device.blob import Blob, is_blob, load_blob
-from imulab.errors import RecordError, file_name
+from imulab.errors import RecordError, file_name, readable
 from imulab.procedures.registry import PROCEDURES
 from imulab.records.calibration import Calibration
 from imulab.records.reading import parsed
@@ -32,12 +32,8 @@ def load(path: str | Path) -> Calibration:
 
 def load_sealed(path: str | Path) -> tuple[Calibration, str]:
     """Read a calibration record and its ``content_sha256``; errors as for `load`."""
-    try:
+    with readable(path, RecordError):
         data = Path(file_name(path)).read_bytes()
-    except FileNotFoundError:
-        raise RecordError(f"{path}: no such file") from None
-    except OSError as error:
-        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
     return loads_sealed(data, str(path))
 
 

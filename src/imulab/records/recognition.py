@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from imulab.errors import ReadError
+from imulab.errors import readable
 
 _LARGEST_RECORD = 1 << 26
 
@@ -15,14 +15,9 @@ def is_json(file: str) -> bool:
 
     if file == "-" or (Path(file).exists() and not Path(file).is_file()):
         return False  # a pipe can be read only once, as a recording
-    try:
-        with Path(file).open("rb") as stream:
-            if not stream.read(64).lstrip().startswith(b"{"):
-                return False
-            stream.seek(0)
-            content = stream.read(_LARGEST_RECORD)
-            return FORMAT.encode() in content or b'"content_sha256"' in content
-    except FileNotFoundError:
-        raise ReadError(f"{file}: no such file") from None
-    except OSError as error:
-        raise ReadError(f"{file}: cannot be read: {error.strerror}") from None
+    with readable(file), Path(file).open("rb") as stream:
+        if not stream.read(64).lstrip().startswith(b"{"):
+            return False
+        stream.seek(0)
+        content = stream.read(_LARGEST_RECORD)
+        return FORMAT.encode() in content or b'"content_sha256"' in content

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.errors import first_of
 from imulab.estimation.least_squares import Observability, coverage_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.blend import Blended
@@ -152,11 +153,10 @@ def vertical_warnings(found: Found, method: str) -> list[str]:
     for axis, column in zip(AXES, vertical.T, strict=True):
         which = np.flatnonzero(column).tolist()
         if len(which) > 1:
-            named = [found.attitudes.label(index) for index in which[:_MOST_NAMED]]
-            more = f" and {len(which) - _MOST_NAMED} more" if len(which) > _MOST_NAMED else ""
+            named = first_of([found.attitudes.label(index) for index in which], _MOST_NAMED)
             warnings.append(
                 f"axis {axis} is vertical within {np.degrees(CLOSEST):.0f} deg in {len(which)} attitudes ("
-                f"{', '.join(named)}{more}): the source of method linearised has no axis vertical in two; "
+                f"{named}): the source of method linearised has no axis vertical in two; "
                 "tumble plan --method linearised chooses attitudes without such"
             )
     return warnings

@@ -10,7 +10,7 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from imulab.errors import DataError, ObservabilityError, OptionError
+from imulab.errors import DataError, ObservabilityError, OptionError, first_of
 from imulab.estimation.least_squares import (
     Observability,
     covariance,
@@ -351,7 +351,7 @@ def _solve(
     if seen.rank < size:
         names = parameter_names(problem.order, problem.cross)
         confused = seen.confused(names)
-        shown = " ".join(confused[:8]) + (f" and {len(confused) - 8} more" if len(confused) > 8 else "")
+        shown = first_of(confused, 8, " ")
         help_from = helpful_attitudes(problem.order, solution, count=2)
         found = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
         trace = f"; {attitudes.trace.describe()}" if attitudes.trace is not None and n < size else ""

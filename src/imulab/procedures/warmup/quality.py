@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.errors import first_of
 from imulab.procedures.warmup.curves import SETTLED, Curves
 from imulab.procedures.warmup.engineering import in_engineering
 from imulab.procedures.warmup.judge import Judged, Worst
@@ -93,8 +94,7 @@ def _longest(flags: NDArray[np.bool_]) -> int:
 
 
 def _named(names: list[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return ", ".join(names[:_MOST_NAMED]) + more
+    return first_of(names, _MOST_NAMED)
 
 
 def _ends(curves: Curves, settled: bool) -> list[str]:
