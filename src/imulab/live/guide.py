@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.errors import ImulabError, ObservabilityError
+from imulab.errors import ImulabError
 from imulab.gravity import Gravity
 from imulab.live.targets import Target, predicted_share, share_of, shares_of
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.fit import TumbleFit, fit_tumble
 from imulab.procedures.tumble.model import parameter_count, parameter_names
-from imulab.procedures.tumble.optimal import Search, information_rows
-from imulab.procedures.tumble.plan import MOST_ATTITUDES, plan_tumble
+from imulab.procedures.tumble.optimal import Search, information_rows, quick_set
+from imulab.procedures.tumble.plan import MOST_ATTITUDES, sphere_candidates
 from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
@@ -32,6 +32,9 @@ _FIVE = 5
 _LOWERS = 0.05
 _LONGEST = 10.0
 _ROUNDS = 4
+_SEED = 1
+_OTHERS = 0.1
+"""What a parameter without a target counts for, over what the one with the lowest target does."""
 _GUESSED_NOISE = 1e-4
 _PRIOR = 1e-2
 """Before they are measured, parameters are known to about this in units of g: enough to weigh one hold."""
@@ -243,30 +246,45 @@ class Guide:
             left = self.wanted() - len(there)
             return self._planned(max(left, least), there) if left > 0 or least > 1 else np.empty((0, 3))
         count, noise = max(least, 3), self.noise()
-        tried: dict[int, Array] = {}
+        tried: list[int] = []
         for _ in range(_ROUNDS):
-            tried[count] = self._planned(count, there)
-            covariance = Search(self.model_order, "A", there).covariance(tried[count])
+            tried.append(count)
+            covariance = Search(self.model_order, "A", there).covariance(self._planned(count, there, move=False))
             share = self._predicted(covariance, noise)
             # Variances fall as the number of attitudes rises, in proportion.
             need = int(np.ceil((count + len(there)) * share**2)) - len(there)
-            need = min(max(need, least), MOST_ATTITUDES)
-            if need in tried or need == count:
+            count = min(max(need, least), MOST_ATTITUDES)
+            if count in tried:
                 break
-            count = need
-        return tried[min(tried, key=lambda each: abs(each - need))]
+        return self._planned(count, there)
 
     def _predicted(self, covariance: Array, noise: float) -> float:
         sizes = (noise * np.sqrt(np.diag(covariance))).tolist()
         named = dict(zip(parameter_names(self.model_order), sizes, strict=True))
         return max(predicted_share(target, named, self.local_gravity) for target in self.targets)
 
-    def _planned(self, count: int, there: Array) -> Array:
-        try:
-            return plan_tumble(attitudes=count, order=self.model_order, already=there).directions
-        except ObservabilityError:  # readings that no unit at rest has, as of a dead axis: a plan as if there were none
-            fewest = max(count, parameter_count(self.model_order))
-            return plan_tumble(attitudes=fewest, order=self.model_order).directions
+    def _weight(self) -> Array:
+        """Return what the variance of each parameter counts for: most where a target is, and the more the lower it is."""
+        names = parameter_names(self.model_order)
+        shares = np.array(
+            [
+                max((predicted_share(t, {name: 1.0}, self.local_gravity) for t in self.targets), default=0.0)
+                for name in names
+            ]
+        )
+        weight: Array = np.maximum(shares**2, _OTHERS * (shares.max() ** 2 or 1.0))
+        return weight / weight.max()
+
+    def _planned(self, count: int, there: Array, *, move: bool = True) -> Array:
+        points = sphere_candidates()
+        found = quick_set(Search(self.model_order, "A", there), points, count, _SEED, weight=self._weight(), move=move)
+        if found is not None:
+            return found
+        # Readings that no unit at rest has, as of a dead axis, or attitudes too much alike: a plan as if none were there.
+        fewest = max(count, parameter_count(self.model_order) + 1)
+        anew = quick_set(Search(self.model_order, "A", np.empty((0, 3))), points, fewest, _SEED, move=move)
+        assert anew is not None
+        return anew
 
     def next_direction(self) -> Array | None:
         """Return the upward direction to take next: of those planned the one that lowers the worst axis most."""

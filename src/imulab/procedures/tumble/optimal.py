@@ -36,6 +36,9 @@ _AS_GOOD = 1.01
 """Sums of variances within this factor of the least are taken for equal."""
 _RIDGE = 1e-9
 """Information that keeps the matrix regular while attitudes are still missing."""
+_UNDETERMINED = 1e6
+_QUICK_ROUNDS = 2
+_QUICK_RADII = np.radians([8.0, 3.0, 3.0, 1.0])
 
 
 def information_rows(directions: Array, order: int) -> Array:
@@ -129,14 +132,37 @@ def optimal_set(search: Search, points: Array, count: int, seed: int, *, free: b
     return _most_alike(search, polished + [each for one in polished for each in _balance(search, one, rng)])
 
 
-def _exchange(search: Search, points: Array, rows: Array, count: int, rng: np.random.Generator) -> Array:
+def quick_set(
+    search: Search, points: Array, count: int, seed: int, *, weight: Array | float = 1.0, move: bool = True
+) -> Array | None:
+    """Choose as `optimal_set` does, but from one start: within hundredths of a second, for who waits for the answer.
+
+    The sum of weight times variance is made least. Returns the directions, shape (count, 3), or None where this choice
+    does not determine the model.
+    """
+    rng = np.random.default_rng(seed)
+    chosen = _exchange(search, points, information_rows(points, search.order), count, rng, weight)
+    if np.diag(search.covariance(chosen)).max() > _UNDETERMINED:
+        return None
+    if not move:
+        return chosen
+    for _ in range(_QUICK_ROUNDS):
+        variance = np.diag(search.covariance(chosen)).reshape(-1, 3)
+        weight = weight * (variance / variance.mean(axis=1, keepdims=True)).ravel() ** 2
+        chosen = _polish(search, chosen, rng, _QUICK_RADII, weight)
+    return chosen
+
+
+def _exchange(
+    search: Search, points: Array, rows: Array, count: int, rng: np.random.Generator, weight: Array | float = 1.0
+) -> Array:
     """Exchange attitudes from a random start until no exchange helps."""
     chosen = rng.choice(len(rows), count, replace=False)
     for _ in range(_SWEEPS):
         moved = False
         for place in range(count):
             others = np.delete(chosen, place)
-            gain = search.gain(rows, rows[others])
+            gain = search.gain(rows, rows[others], weight)
             gain[search.taken(points, points[others])] = -np.inf
             best = int(np.argmax(gain))
             if gain[best] > gain[chosen[place]] * (1 + 1e-9) or gain[chosen[place]] == -np.inf:

@@ -118,7 +118,7 @@ def plan_tumble(
             f"{attitudes} attitudes{known}: order {order} has {size} parameters; expected at least as many"
         )
     free = candidates is None
-    points = _sphere_candidates() if candidates is None else _distinct(candidates)
+    points = sphere_candidates() if candidates is None else _distinct(candidates)
     if len(points) + len(before) < size:
         raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {size}")
     search = Search(order, criterion, before, distinct_verticals)
@@ -206,8 +206,8 @@ def _steps(step: float) -> int:
     return count
 
 
-def _sphere_candidates() -> Array:
-    """An even lattice, with the faces, edges and corners of a cube, which fixtures give exactly."""
+def sphere_candidates() -> Array:
+    """Return an even lattice, with the faces, edges and corners of a cube, which fixtures give exactly, (n, 3)."""
     cube = np.array([v for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)])
     return np.vstack([cube / np.linalg.norm(cube, axis=1, keepdims=True), sphere_points(_CANDIDATES)])
 
