@@ -264,7 +264,7 @@ class Guide:
         return max(predicted_share(target, named, self.local_gravity) for target in self.targets)
 
     def _weight(self) -> Array:
-        """Return what the variance of each parameter counts for: most where a target is, and the more the lower it is."""
+        """Return what the variance of each parameter counts for: the more, the lower its target is."""
         names = parameter_names(self.model_order)
         shares = np.array(
             [
@@ -280,7 +280,7 @@ class Guide:
         found = quick_set(Search(self.model_order, "A", there), points, count, _SEED, weight=self._weight(), move=move)
         if found is not None:
             return found
-        # Readings that no unit at rest has, as of a dead axis, or attitudes too much alike: a plan as if none were there.
+        # Readings that no unit at rest has, as of a dead axis, or attitudes too much alike: plan as if none were there.
         fewest = max(count, parameter_count(self.model_order) + 1)
         anew = quick_set(Search(self.model_order, "A", np.empty((0, 3))), points, fewest, _SEED, move=move)
         assert anew is not None

@@ -1,0 +1,118 @@
+"""`imulab live` as a process on a pseudo-terminal: from the plug to the record, killed, unplugged and refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from liveports import content, device, lines_of, live
+
+pytest.importorskip("serial", reason="pyserial is in the extra [live]")
+FIT = ["--gravity", "9.81+-0", "--order", "1"]
+SPEED = 8
+
+
+def tumble(attitudes: int, **options: object) -> il.Recording:
+    """A test at 100 Hz with holds of 4 s."""
+    given = {"order": 1, "gravity": 9.81, "hold": "4 s", "move": "1 s", "gyro": False, "noise": "0.3 mg"} | options
+    return il.simulate_tumble(attitudes=attitudes, **given)
+
+
+def fitted(folder: Path, *words: str) -> dict:
+    done = subprocess.run(
+        [sys.executable, "-m", "imulab", "tumble", "fit", "rec.csv", *words, "-o", "fit.json"],
+        cwd=folder,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return content(folder / "fit.json")
+
+
+def test_from_the_plug_to_the_record(tmp_path):
+    recording = tumble(20)
+    with device(lines_of(recording), 100 * SPEED) as unit:
+        words = [f"serial:{unit.port}", "--plain", "--attitudes", "10", *FIT, "--save", "rec.csv", "-o", "live.json"]
+        with live(words, tmp_path) as process:
+            assert process.ended(30) == 0, process.text
+    assert "titles with units: time accel_x accel_y accel_z" in process.text
+    saved = il.read(tmp_path / "rec.csv")
+    sent = np.searchsorted(np.round(recording.time * 1e6), np.round(saved.si("time") * 1e6))
+    assert (np.diff(sent) == 1).all()
+    for name in ("accel_x", "accel_y", "accel_z"):
+        np.testing.assert_array_equal(saved.columns[name], recording.columns[name][sent].round(5))
+    assert content(tmp_path / "live.json") == fitted(tmp_path, *FIT)
+
+
+def kills(folder: Path, times: int, seed: int) -> None:
+    """Kill a session again and again, then let it end; what it had a second before is in the file each time."""
+    rng, recording = np.random.default_rng(seed), tumble(240, seed=seed)
+    lines, stamps = lines_of(recording), np.round(recording.time * 1e6)
+    with device(lines, 100 * SPEED) as unit:
+        words = [f"serial:{unit.port}", "--plain", "--resume", "--attitudes", "12", *FIT, "--save", "rec.csv"]
+        kept = np.empty(0)
+        for _ in range(times):
+            sent = len(unit.sent)
+            with live(words, folder) as process:
+                begun = process.said("titles with units")
+                last = begun + rng.uniform(0, 3)
+                while process.running and time.monotonic() < last:
+                    time.sleep(0.01)
+                killed = time.monotonic()
+                process.kill()
+            before, kept = kept, saved_stamps(folder)
+            assert (kept[: len(before)] == before).all()
+            new = kept[len(before) :]
+            due = [stamps[k] for k, t in unit.sent[sent:] if t < killed - 1.0 - SLACK]
+            if killed > begun + 1.0 + SLACK:
+                assert len(new)
+                assert new[-1] >= due[-1]
+            # Whole rows that follow one another, from where this session began to listen.
+            assert (np.diff(np.searchsorted(stamps, new)) == 1).all()
+        with live([*words, "-o", "live.json"], folder) as process:
+            assert process.ended(90) == 0, process.text
+    saved = il.read(folder / "rec.csv")
+    places = np.searchsorted(stamps, np.round(saved.si("time") * 1e6))
+    for name in ("accel_x", "accel_y", "accel_z"):
+        np.testing.assert_array_equal(saved.columns[name], recording.columns[name][places].round(5))
+    assert content(folder / "live.json") == fitted(folder, *FIT)
+
+
+SLACK = 0.3
+"""What the pipe, the pseudo-terminal and two busy processors may take, s."""
+
+
+def saved_stamps(folder: Path) -> np.ndarray:
+    """Stamps of the rows that are whole, read apart from imulab."""
+    rows = (folder / "rec.csv").read_bytes().split(b"\n")[:-1]
+    return np.array([float(row.split(b",")[0]) for row in rows if row[:1].isdigit()])
+
+
+def test_killed_and_gone_on_with(tmp_path):
+    kills(tmp_path, 3, 1)
+
+
+@pytest.mark.slow
+def test_killed_twenty_times(tmp_path, reduced):
+    kills(tmp_path, 5 if reduced else 20, 2)
+
+
+def test_unplugged_in_the_middle(tmp_path):
+    with device(lines_of(tumble(20)), 100 * SPEED) as unit:
+        words = [f"serial:{unit.port}", "--plain", "--save", "rec.csv", "-o", "live.json", *FIT]
+        with live(words, tmp_path) as process:
+            process.said("attitude 3 accepted")
+            unit.unplug()
+            assert process.ended(5.0) == 2
+    last = process.lines[-1][1]
+    assert last.startswith(f"imulab: serial:{unit.port}@115200: the connection is lost (")
+    assert last.endswith(" attitudes: --resume goes on with it")
+    assert not (tmp_path / "live.json").exists()
+    assert len(il.find_attitudes(il.read(tmp_path / "rec.csv"))) >= 3
