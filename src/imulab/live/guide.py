@@ -273,7 +273,8 @@ class Guide:
             ]
         )
         weight: Array = np.maximum(shares**2, _OTHERS * (shares.max() ** 2 or 1.0))
-        return weight / weight.max()
+        weight /= weight.max()
+        return weight
 
     def _planned(self, count: int, there: Array, *, move: bool = True) -> Array:
         points = sphere_candidates()
