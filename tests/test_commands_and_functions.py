@@ -4,6 +4,7 @@ import inspect
 import json
 import keyword
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,7 +51,6 @@ WITHOUT = {"demo", "live"}
 READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
 APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
 OTHERWISE = {
-    "apply": {"temperature_column"},
     "show": {"formats"},  # a list for people
     "tumble fit": {"latitude", "height"},  # gravity=il.normal_gravity(...)
     "tumble check": {"latitude", "height"},
@@ -138,6 +138,7 @@ def folder(tmp_path_factory):
     still = il.simulate_array(experiment="static", duration=30.0)
     il.calibrate_array(still).save(place / "array.json")
     cycles = il.simulate_warmup([-40, 0, 60], cycles=2, duration="400 s", rate="2 Hz")
+    il.write(replace(cycles[0], metadata={}), place / "cycle.csv")
     il.fit_warmup(cycles, temperatures=(-40, 0, 60), model="knot-cubic").save(place / "warm.json")
     il.plan_centrifuge("1,10", cycles=1).save(place / "plan.toml")
     return place
@@ -241,6 +242,10 @@ MADE = {
     "apply": (
         ["unit1.json", "tumble.csv", "-o", "one.csv"],
         lambda out: il.write(il.apply("unit1.json", "tumble.csv"), out),
+    ),
+    "apply of a warm-up table": (
+        ["warm.json", "cycle.csv", "--temperature-column", "--latest-start", "9 s", "-o", "one.csv"],
+        lambda out: il.write(il.apply("warm.json", "cycle.csv", temperature_column=True, latest_start=9.0), out),
     ),
     "tumble fit": (
         ["tumble.csv", "--order", "1", "--loss", "square", "-o", "one.json"],

@@ -27,8 +27,6 @@ KNOWN_NAMES = {
 """Modules that name the structs of the C core, some of which are called as procedures are."""
 KNOWN_INSIDE = {
     "imulab.exporters.model",  # the sections of a tumble record, which other programs' files are made from
-    "imulab.procedures.exporting",  # method and memory of an array in firmware, as texts; noise for keys
-    "imulab.fleet.simulate",  # a simulated line is one of tumble tests
 }
 
 

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from imulab.fleet.report import write_fleet_report as write_fleet_report
     from imulab.fleet.run import fleet_status as fleet_status
     from imulab.fleet.run import run_fleet as run_fleet
-    from imulab.fleet.simulate import simulate_fleet as simulate_fleet
     from imulab.gravity import normal_gravity as normal_gravity
     from imulab.procedures.allan import allan_deviation as allan_deviation
     from imulab.procedures.apply import apply as apply
@@ -65,6 +64,7 @@ if TYPE_CHECKING:
     from imulab.procedures.tumble.planning import plan_tumble as plan_tumble
     from imulab.procedures.tumble.segment import find_attitudes as find_attitudes
     from imulab.procedures.tumble.simulate import simulate_tumble as simulate_tumble
+    from imulab.procedures.tumble.simulated_line import simulate_fleet as simulate_fleet
     from imulab.procedures.warmup.cycles import find_power_cycle as find_power_cycle
     from imulab.procedures.warmup.fit import WarmupFit as WarmupFit
     from imulab.procedures.warmup.fit import fit_warmup as fit_warmup
@@ -120,7 +120,7 @@ _HOME = {
     "read": "readers",
     "read_blocks": "readers",
     "simulate_centrifuge": "procedures.centrifuge.rig",
-    "simulate_fleet": "fleet.simulate",
+    "simulate_fleet": "procedures.tumble.simulated_line",
     "simulate_noise": "procedures.noise.simulate",
     "simulate_power_cycle": "procedures.warmup.simulate",
     "simulate_tumble": "procedures.tumble.simulate",

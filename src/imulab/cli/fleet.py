@@ -134,7 +134,7 @@ def simulate(
     Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit 5
     is far off, and unit 7 changes between its two calibrations.
     """
-    from imulab.fleet.simulate import simulate_fleet
+    from imulab.procedures.tumble.simulated_line import simulate_fleet
 
     if not output:
         raise OptionError("output '': expected the name of a folder to write to")

@@ -57,9 +57,9 @@ def apply(
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
+    from imulab.power_on import with_power_on_temperature
     from imulab.procedures.apply import apply_blocks, loaded
     from imulab.procedures.loading import load_any
-    from imulab.procedures.warmup.poweron import with_power_on_temperature
     from imulab.readers import read_blocks
 
     if len(files) < 2:
@@ -111,8 +111,8 @@ class _Rows:
 
 def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
+    from imulab.power_on import TAKEN_FROM
     from imulab.procedures.apply import beyond_message, beyond_test_of, warnings_of
-    from imulab.procedures.warmup.poweron import TAKEN_FROM
     from imulab.verdict import Note
 
     counts, largest, name = [0] * len(records), [0.0] * len(records), ""

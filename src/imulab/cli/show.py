@@ -47,25 +47,6 @@ def describe_record(record: Calibration, *, provenance: bool = True) -> str:
     return "\n".join(lines).rstrip()
 
 
-def describe_gyro(record: Calibration, accelerometers: str) -> str:
-    """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
-    from imulab.procedures.tumble.figures import gyro_headline
-
-    table = next(item for item in exhibits_of(record).items if isinstance(item, ReportTable))
-    rows = [row for row in table.rows if row[0].startswith("gyro_")]
-    serial = record.sensor.get("serial", "unit without serial number")
-    return "\n".join(
-        [
-            verdict_line(record.verdict),
-            f"gyroscopes of {serial}: {gyro_headline(record)}",
-            f"accelerometers: unchanged from {accelerometers}",
-            "",
-            table.title,
-            *aligned(table.columns, rows),
-        ]
-    )
-
-
 def verdict_line(verdict: Verdict) -> str:
     """Return a verdict in one line: its state, the gravest reason, and how many more there are."""
     if not verdict.reasons:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,6 +27,9 @@ from imulab.cli.result import finish
 from imulab.procedures.options import FLAG
 from imulab.procedures.tumble.choices import CLOCKS, CRITERIA, METHODS, SENSITIVITIES, STARTS
 from imulab.procedures.tumble.task import GRAVITY, OPTIONS
+
+if TYPE_CHECKING:
+    from imulab.records.calibration import Calibration
 
 _OF_THE_RECORD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the file's head, else of the record.")
 
@@ -157,7 +160,6 @@ def gyro(
     json: AsJson = False,
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
-    from imulab.cli.show import describe_gyro
     from imulab.procedures.loading import load
     from imulab.procedures.tumble.gyro import fit_gyro
     from imulab.procedures.tumble.gyrorecord import with_gyro
@@ -180,7 +182,30 @@ def gyro(
         output,
         report,
         json=json,
-        describe=lambda both: describe_gyro(both, accel),
+        describe=lambda both: _of_gyroscopes(both, accel),
+    )
+
+
+def _of_gyroscopes(record: Calibration, accelerometers: str) -> str:
+    """Return what a fit of the gyroscopes found, without the accelerometers, whose record it rests on."""
+    from imulab.cli.show import verdict_line
+    from imulab.procedures.reports import exhibits_of
+    from imulab.procedures.tumble.figures import gyro_headline
+    from imulab.report.elements import ReportTable
+    from imulab.shown import aligned
+
+    table = next(item for item in exhibits_of(record).items if isinstance(item, ReportTable))
+    rows = [row for row in table.rows if row[0].startswith("gyro_")]
+    serial = record.sensor.get("serial", "unit without serial number")
+    return "\n".join(
+        [
+            verdict_line(record.verdict),
+            f"gyroscopes of {serial}: {gyro_headline(record)}",
+            f"accelerometers: unchanged from {accelerometers}",
+            "",
+            table.title,
+            *aligned(table.columns, rows),
+        ]
     )
 
 

@@ -14,6 +14,7 @@ from imulab.columns import KINDS, triad
 from imulab.device.blob import Blob
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, OptionError, RecordError
+from imulab.power_on import with_power_on_temperature
 from imulab.procedures.inputs import Data, Reading, as_recording, described
 from imulab.procedures.loading import load_any
 from imulab.procedures.procedure import Section
@@ -99,6 +100,7 @@ def apply(
     *,
     again: bool = False,
     latest_start: float | str = "5 s",
+    temperature_column: bool = False,
     **reading: Unpack[Reading],
 ) -> Recording:
     """Return data corrected by a record; columns that it does not touch pass unchanged.
@@ -116,6 +118,8 @@ def apply(
         Whether to correct it though the same record corrected it before.
     latest_start
         A recording that starts later after power-on, s, is refused by a warm-up table.
+    temperature_column
+        Whether a warm-up table takes a power-on temperature that is missing from the first row's column temperature.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.
@@ -155,6 +159,8 @@ def apply(
             f"{recording.name}: already corrected by {ready.name}: a second time would take its errors off twice; "
             "expected the recording as it was measured, or --again (again=True)"
         )
+    if temperature_column and any(part.since_power_on for part, _ in ready.sections):
+        (recording,) = with_power_on_temperature([recording])
     corrected = recording
     for part, columns in sections_for(ready.sections, recording):
         assert part.apply is not None

@@ -13,16 +13,16 @@ from imulab import exporters
 from imulab.device.array_settings import Fusion
 from imulab.errors import ImulabError, OptionError, listed
 from imulab.exporters import EXPORTERS, ExportOptions
-from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.inputs import as_record
 from imulab.procedures.loading import load
-from imulab.procedures.noise.wants import for_export
+from imulab.procedures.registry import procedure_of
 from imulab.procedures.unit_tables import tables_of
 from imulab.quantities import whole
 from imulab.records.calibration import Calibration
 from imulab.verdict import SENTENCES
 
 Record: TypeAlias = Calibration | str | PathLike[str]
+_FIRMWARE = ("c", "blob")
 _DEVICE_IDS = 2**32
 
 
@@ -93,7 +93,7 @@ def export(
     loaded = [load(os.fspath(one)) if isinstance(one, str | PathLike) else as_record(one, "export") for one in given]
     names = [os.fspath(one) if isinstance(one, str | PathLike) else "the record" for one in given]
     fusion = None if method is None and memory is None else _fusion(to, method, memory, loaded)
-    if to in ("c", "blob"):
+    if to in _FIRMWARE:
         for name, record in zip(names, loaded, strict=True):
             try:
                 tables_of(record, fusion)
@@ -103,7 +103,7 @@ def export(
         if record.verdict.state == "bad":
             tell(f"{name}: the record's verdict is bad, {SENTENCES['bad']}: {record.verdict.reasons[0]}")
     file = os.fspath(noise) if isinstance(noise, str | PathLike) else "the noise"
-    found: Mapping[str, Any] = for_export(noise) if isinstance(noise, Calibration) else {}
+    found: Mapping[str, Any] = _noise_of(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
         found = noise if isinstance(noise, Mapping) else _noise(file)
     options = ExportOptions(lossy, number, found, file if noise else "", fusion, tell)
@@ -111,21 +111,29 @@ def export(
 
 
 def _fusion(to: str, method: str | None, memory: str | float | None, records: Sequence[Calibration]) -> Fusion:
-    array = next((record for record in records if record.procedure == "gyro_array"), None)
-    if to not in ("c", "blob") or array is None:
-        raise OptionError("method and memory say how a gyro array fuses: expected its record, and target c or blob")
-    return fusion_text(method, None if memory is None else str(memory), "{}", carried(array))
+    for record in records if to in _FIRMWARE else ():
+        fusion = procedure_of(record).fusion
+        if fusion is not None:
+            return fusion(record, method, None if memory is None else str(memory))
+    raise OptionError("method and memory say how a gyro array fuses: expected its record, and target c or blob")
 
 
-def _noise(file: str) -> dict[str, Any]:
+def _noise_of(record: Calibration, name: str) -> Mapping[str, Any]:
+    noise = procedure_of(record).noise
+    if noise is None:
+        raise OptionError(f"{name}: expected what 'imulab allan --json' printed, found a {record.procedure} record")
+    return noise(record)
+
+
+def _noise(file: str) -> Mapping[str, Any]:
     try:
         content = json.loads(Path(file).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise OptionError(f"{file}: no such file") from None
     except (OSError, ValueError) as error:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found no JSON ({error})") from None
-    if isinstance(content, dict) and content.get("procedure") == "noise":
-        return for_export(load(file))
+    if isinstance(content, dict) and "procedure" in content:
+        return _noise_of(load(file), file)
     if not isinstance(content, dict) or "columns" not in content:
         raise OptionError(f"{file}: expected what 'imulab allan --json' printed, found JSON without 'columns'")
-    return content
+    return dict(content)

@@ -17,6 +17,7 @@ from imulab.procedures.options import Option
 if TYPE_CHECKING:
     import numpy as np
 
+    from imulab.device.array_settings import Fusion
     from imulab.device.tables import DeviceTable
     from imulab.device.unit import DeviceUnit
     from imulab.recording import Recording, Source
@@ -149,8 +150,11 @@ class Procedure:
         Record to headline, facts, figures and tables.
     tables
         Record to the tables of a unit, in the order in which they are applied.
-    fuses
-        Whether `tables` takes the method and memory (`Fusion`) by which the unit is to fuse.
+    fusion
+        Record, and texts of method and memory or None, to how the unit is to fuse, which `tables` then takes; None
+        where it fuses nothing.
+    noise
+        Record to what exporters make noise keys of, in the form of ``allan --json``; None where it states no noise.
     sections
         The kinds of these tables.
     elsewhere
@@ -183,7 +187,8 @@ class Procedure:
     exhibits: Callable[[Calibration], Exhibits]
     tables: Callable[..., tuple[DeviceTable, ...]]
     sections: tuple[Section, ...]
-    fuses: bool = False
+    fusion: Callable[[Calibration, str | None, str | None], Fusion] | None = None
+    noise: Callable[[Calibration], Mapping[str, Any]] | None = None
     elsewhere: str | None = None
     not_applied: str | None = None
     rows: Callable[[Calibration], Sequence[Row]] | None = None

@@ -17,7 +17,7 @@ ENTRY = Procedure(
     exhibits=deferred(f"{_HERE}.figures:exhibits"),
     summary=deferred(f"{_HERE}.figures:summary"),
     tables=deferred(f"{_HERE}.device:tables_of"),
-    fuses=True,
+    fusion=deferred(f"{_HERE}.memory:fusion_of_record"),
     sections=(Section("array", golden=deferred(f"{_HERE}.device:golden")),),
     not_applied="'imulab array fuse --calibration' takes it",
     elsewhere="{target} fuses no array of gyroscopes",

@@ -19,6 +19,17 @@ def carried(calibration: Calibration | Blob | None) -> Fusion:
     return fusion_of(None if calibration is None else calibration.model.get("fusion"))
 
 
+def fusion_of_record(record: Calibration, method: str | None, memory: str | None) -> Fusion:
+    """Return how a unit is to fuse: by the texts that are given, else as its record carries.
+
+    Raises
+    ------
+    OptionError
+        A text is unknown.
+    """
+    return fusion_text(method, memory, "{}", carried(record))
+
+
 def memory_text(memory: str | float, start: int) -> str:
     """Return ``growing memory``, ``growing memory from 100 on`` or ``memory 0.01``."""
     if isinstance(memory, float):

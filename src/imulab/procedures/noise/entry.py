@@ -19,6 +19,7 @@ ENTRY = Procedure(
     sections=(),
     not_applied="it says how large the noise is, which no correction takes away; 'imulab export --noise' takes it",
     elsewhere="it holds no calibration; 'imulab noise fit --for' prints what filters want of it",
+    noise=deferred(f"{_HERE}.wants:for_export"),
     rows=deferred(f"{_HERE}.engineering:rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
 )

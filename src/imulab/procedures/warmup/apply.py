@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, UnitError
-from imulab.procedures.warmup.poweron import LATEST_START, check_clock, check_start, power_on_temperature
+from imulab.power_on import LATEST_START, check_clock, check_start, power_on_temperature
 from imulab.recording import Array, Recording, check_time
 from imulab.units import conversion_factor
 from imulab.verdict import Note

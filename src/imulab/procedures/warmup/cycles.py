@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, UnitError
-from imulab.procedures.warmup.poweron import (
+from imulab.power_on import (
     LATEST_START,
     check_clock,
     check_start,
