@@ -113,7 +113,7 @@ def test_an_option_of_few_words_offers_them(path):
     from imulab.cli import common
     from imulab.cli.app import command
 
-    options = {name: p for p in dict(common._commands(command()))[path].params for name in p.opts}
+    options = {name: p for p in dict(common.commands_of(command()))[path].params for name in p.opts}
     for name in OF_FEW_WORDS[path]:
         words = [word.value for word in options[name].shell_complete(None, "")]
         assert words
@@ -155,7 +155,7 @@ def test_every_command_takes_both(capsys):
     from imulab.cli import common
     from imulab.cli.app import command
 
-    for path, found in common._commands(command()):
+    for path, found in common.commands_of(command()):
         options = [option for parameter in found.params for option in parameter.opts]
         assert {"-q", "--quiet", "-v", "--verbose"} <= set(options), path
         assert len(options) == len(set(options)), path

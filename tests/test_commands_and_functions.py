@@ -46,8 +46,8 @@ FUNCTIONS = {
     "fleet report": il.write_fleet_report,
     "fleet simulate": il.simulate_fleet,
 }
-WITHOUT = {"demo", "live"}
-"""One runs other commands, the other is a person's session at a terminal."""
+WITHOUT = {"demo", "live", "open"}
+"""One runs other commands, the others are a person's session at a terminal or in a browser."""
 READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
 APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
 OTHERWISE = {
@@ -62,7 +62,7 @@ OTHERWISE = {
     "noise fit": {"for_", "rate", "step", "regress", "steps"},  # NoiseFit.wants; None is what the words no and say mean
 }
 """Options that functions have by another name, or say in another way."""
-COMMANDS = dict(common._commands(command()))
+COMMANDS = dict(common.commands_of(command()))
 G = 9.80665
 DEGREE = np.pi / 180
 

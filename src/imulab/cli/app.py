@@ -33,7 +33,7 @@ _GROUPS = {
     "noise": "Model the noise of sensors at rest, for filters.",
     "fleet": "Calibrate many units, and watch the line.",
 }
-_SINGLE = ("convert", "export", "allan", "live")
+_SINGLE = ("convert", "export", "allan", "live", "open")
 """Commands with a module of their own; the others that are in no group are those of records."""
 _SUMMARIES = {
     "apply": "Correct a recording by records.",
@@ -43,6 +43,7 @@ _SUMMARIES = {
     "convert": "Write a recording of any kind as CSV or Parquet.",
     "export": "Write firmware, a blob, or another program's files.",
     "live": "Guide a test while the unit is connected.",
+    "open": "Open the workbench in the browser.",
     "allan": "Print Allan deviation and noise coefficients.",
     "tumble plan": "Choose the attitudes to measure.",
     "tumble simulate": "Simulate a recording of a tumble test.",

@@ -23,7 +23,7 @@ def offer(root: Any) -> None:
     app = typer.Typer()
     app.command()(_common)
     quiet, verbose, no_project, unpack_limit = typer.main.get_command(app).params[:4]
-    for path, command in _commands(root):
+    for path, command in commands_of(root):
         names = {parameter.name for parameter in command.params}
         given = sorted(names & set(project.KEYS))
         command.params += [quiet, verbose, *([no_project] if given else [])]
@@ -44,10 +44,11 @@ def _stand_in(default: Any) -> str:
     return "NUMBER" if default.replace(".", "", 1).isdigit() else "QUANTITY"
 
 
-def _commands(group: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def commands_of(group: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every command below a group, with its path (``tumble fit``)."""
     for name, command in group.commands.items():
         if hasattr(command, "commands"):
-            yield from _commands(command, f"{path}{name} ")
+            yield from commands_of(command, f"{path}{name} ")
         else:
             yield f"{path}{name}", command
 

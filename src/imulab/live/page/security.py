@@ -23,7 +23,7 @@ LOCAL = "127.0.0.1"
 _NAMES = (LOCAL, "localhost")
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """Nothing inline, nothing from elsewhere: a file's text that reached the page as HTML would still not run."""
 _REPORT_POLICY = "sandbox allow-scripts allow-popups allow-modals"

@@ -1,0 +1,248 @@
+"""The workbench: files that are dropped on the page, their curves, and the commands that are run on them.
+
+Addresses, below ``/api/workbench``: ``files`` (GET; PUT, GET and DELETE of one), ``zip`` (a folder), ``reports`` (one
+that a command of this session has drawn), ``forms``, ``open`` and ``curves`` of a recording, ``command`` (what a form
+would run), ``jobs`` (POST runs it, DELETE cancels it). Messages to pages: ``files``, ``opening``, ``job``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from shlex import join
+from typing import Any, ClassVar
+from urllib.parse import quote
+
+from starlette.background import BackgroundTask
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from imulab.errors import OptionError, quoted
+from imulab.live.page.files import Files
+from imulab.live.page.forms import Form
+from imulab.live.page.jobs import Job, Jobs
+from imulab.live.page.openings import Opening, Openings
+from imulab.live.page.parts import Hub, Message, Part, to_json
+from imulab.live.page.security import receive_file, report_response
+from imulab.procedures.options import ELEMENT, READING
+
+_WIDEST = 4000
+_READING = tuple(option.name for option in (*READING, ELEMENT))
+_HERE = "/api/workbench"
+
+
+class Workbench(Part):
+    """The part of the page where recordings become records.
+
+    Parameters
+    ----------
+    files
+        Of the session.
+    forms
+        The commands that it offers.
+    """
+
+    name: ClassVar[str] = "workbench"
+
+    def __init__(self, files: Files, forms: Mapping[str, Form]) -> None:
+        super().__init__()
+        self._files, self._forms = files, forms
+        self._hub = Hub()
+        self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
+        self._coming: set[str] = set()
+        self.routes = [
+            Route(f"{_HERE}/files", self._list),
+            Route(f"{_HERE}/files/{{name:path}}", self._receive, methods=["PUT"]),
+            Route(f"{_HERE}/files/{{name:path}}", self._remove, methods=["DELETE"]),
+            Route(f"{_HERE}/files/{{name:path}}", self._send),
+            Route(f"{_HERE}/zip/{{name:path}}", self._zip),
+            Route(f"{_HERE}/reports/{{name:path}}", self._report),
+            Route(f"{_HERE}/forms", lambda request: _json(list(self._forms.values()))),
+            Route(f"{_HERE}/open", self._open, methods=["POST"]),
+            Route(f"{_HERE}/curves", self._curves),
+            Route(f"{_HERE}/command", self._command, methods=["POST"]),
+            Route(f"{_HERE}/jobs", self._run, methods=["POST"]),
+            Route(f"{_HERE}/jobs/{{number:int}}", self._cancel, methods=["DELETE"]),
+        ]
+
+    def begin(self, hub: Hub) -> None:
+        """Begin to tell pages."""
+        self._hub = hub
+
+    def greet(self) -> Iterable[Message]:
+        """Yield the files and what was run."""
+        yield self._list_message()
+        for job in list(self._jobs.jobs.values()):
+            yield _job_message(job)
+
+    def end(self) -> None:
+        """End what runs, and remove what only the page needs."""
+        self._jobs.end()
+        self._openings.end()
+
+    def _list_message(self) -> Message:
+        return {"type": "files", "folder": str(self._files.folder), "files": self._files.entries()}
+
+    def _tell_job(self, job: Job) -> None:
+        self._hub.tell(_job_message(job))
+        if job.ended is not None:
+            self._hub.tell(self._list_message())
+
+    def _tell_opening(self, opening: Opening) -> None:
+        self._hub.tell(_opening_message(opening))
+
+    async def _list(self, request: Request) -> Response:
+        return _json(self._list_message())
+
+    async def _receive(self, request: Request) -> Response:
+        used = {path for job in self._jobs.jobs.values() for path in job.outputs}  # a report is one that was drawn
+        name = self._files.unused(request.path_params["name"], used | self._coming)
+        self._coming.add(name)
+        try:
+            await receive_file(request, Path(name))
+        finally:
+            self._coming.discard(name)
+        self._hub.tell(self._list_message())
+        return _json({"name": name})
+
+    async def _remove(self, request: Request) -> Response:
+        name = self._files.path(request.path_params["name"])
+        path = Path(name)
+        if path.parent != self._files.folder or not path.is_file():
+            raise OptionError(f"{name}: is not in the session's folder")
+        path.unlink()
+        self._hub.tell(self._list_message())
+        return _json({})
+
+    async def _send(self, request: Request) -> Response:
+        name = self._files.path(request.path_params["name"])
+        if Path(name).is_dir():
+            raise OptionError(f"{name}: is a folder")
+        return _attachment(name, Path(name).name)
+
+    async def _zip(self, request: Request) -> Response:
+        name = self._files.path(request.path_params["name"])
+        if not Path(name).is_dir():
+            raise OptionError(f"{name}: expected a folder")
+        packed = await run_in_threadpool(_packed, Path(name))
+        task = BackgroundTask(Path(packed).unlink, missing_ok=True)
+        return _attachment(packed, f"{Path(name).name}.zip", background=task)
+
+    async def _report(self, request: Request) -> Response:
+        """Show a report that a command of this session has drawn: pages from elsewhere are only to be saved."""
+        name = self._files.path(request.path_params["name"])
+        drawn = {path for job in self._jobs.jobs.values() if job.state == "done" for path in job.outputs}
+        if name not in drawn or not name.endswith(".html"):
+            raise OptionError(f"{name}: no report of this session; save it to look at it")
+        return report_response(Path(name).read_text(encoding="utf-8"))
+
+    async def _open(self, request: Request) -> Response:
+        given = await _object(request)
+        reading = given.get("reading") or {}
+        if not isinstance(reading, dict) or not all(
+            key in _READING and isinstance(text, str) for key, text in reading.items()
+        ):
+            raise OptionError(f"reading: expected texts for {' '.join(_READING)}")
+        name = self._files.path(str(given.get("file")))
+        layout = reading.get("layout", "")
+        if set(layout) & {"/", "\\"} or Path(layout or "\0").exists():
+            reading = {**reading, "layout": self._files.path(layout)}
+        return _json(_opening_message(self._openings.open(name, reading)))
+
+    async def _curves(self, request: Request) -> Response:
+        query = request.query_params
+        start, stop, width = (_number(query.get(key), key) for key in ("from", "to", "width"))
+        opening = self._openings.known(query.get("file", ""))
+        shown = await run_in_threadpool(
+            self._openings.view, opening, start, stop, int(min(max(width or 1000, 10), _WIDEST))
+        )
+        return _json({key: value for key, value in asdict(shown).items() if key != "rows"})
+
+    def _made(self, given: Mapping[str, Any]) -> tuple[Form, list[str], list[str]]:
+        """Return the form, the words and the outputs that a page's values make."""
+        form = self._forms.get(str(given.get("command")))
+        values = given.get("values")
+        if form is None or not isinstance(values, dict):
+            raise OptionError(f"command {quoted(given.get('command'))}: not among those offered")
+        first = Path(next((_first(values.get(field.name)) for field in form.fields if not field.flag), ""))
+        outputs: list[str] = []
+        taken = {path for job in self._jobs.jobs.values() if job.state == "running" for path in job.outputs}
+
+        def output(name: str, ending: str) -> str:
+            """Name what is made after the first file, and after what is done where that alone would not tell."""
+            stem = first.name.partition(".")[0] or form.path.replace(" ", "-")
+            done = str(values.get("to") or form.path.split()[-1])
+            told = f"{stem}{ending}" if ending not in ("", first.suffix) else f"{stem}-{done}{ending}"
+            outputs.append(self._files.new(name) if name else self._files.unused(told, taken.union(outputs)))
+            return outputs[-1]
+
+        return form, form.words(values, self._files.path, output), outputs
+
+    async def _command(self, request: Request) -> Response:
+        _, words, outputs = self._made(await _object(request))
+        return _json({"command": join(["imulab", *words]), "outputs": outputs})
+
+    async def _run(self, request: Request) -> Response:
+        form, words, outputs = self._made(await _object(request))
+        return _json(_job_message(self._jobs.run(form.path, words, outputs)))
+
+    async def _cancel(self, request: Request) -> Response:
+        await run_in_threadpool(self._jobs.cancel, request.path_params["number"])
+        return _json({})
+
+
+def _first(value: Any) -> str:
+    return str(value[0] if isinstance(value, list) and value else value or "")
+
+
+def _json(value: Any) -> Response:
+    return Response(to_json(value), media_type="application/json")
+
+
+def _job_message(job: Job) -> Message:
+    there = [path for path in job.outputs if os.path.lexists(path)] if job.ended is not None else []
+    return {"type": "job", **asdict(job), "outputs": there}
+
+
+def _opening_message(opening: Opening) -> Message:
+    return {"type": "opening", "file": opening.name, "reading": opening.reading, **opening.about}
+
+
+def _number(text: str | None, key: str) -> float | None:
+    try:
+        return None if text in (None, "") else float(text)
+    except ValueError:
+        raise OptionError(f"{key} {quoted(text)}: expected a number") from None
+
+
+async def _object(request: Request) -> dict[str, Any]:
+    try:
+        found = json.loads(await request.body())
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise OptionError("expected a JSON object")
+    return found
+
+
+def _attachment(path: str, name: str, **more: Any) -> FileResponse:
+    """Return a file to be saved, whatever it says that it is."""
+    kept = {"content-disposition": f"attachment; filename*=UTF-8''{quote(name, safe='')}"}
+    return FileResponse(path, headers=kept, media_type="application/octet-stream", **more)
+
+
+def _packed(folder: Path) -> str:
+    """Return a new file that holds the files of a folder, packed."""
+    handle, name = tempfile.mkstemp(prefix="imulab-", suffix=".zip")
+    with os.fdopen(handle, "wb") as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and not path.is_symlink():
+                archive.write(path, path.relative_to(folder.parent))
+    return name

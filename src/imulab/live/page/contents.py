@@ -1,0 +1,104 @@
+"""Reads one file for the page in a process of its own, and prints what it finds, a JSON object a line.
+
+``python -P -m imulab.live.page.contents FILE FOLDER READING`` writes the curves into the folder. A file that is
+damaged, hostile or large so costs the server nothing, and can be given up at any time.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from imulab.columns import triad
+from imulab.errors import ImulabError
+from imulab.live.page.curves import Head, Writer
+from imulab.procedures.options import ELEMENT, READING, part_of, read_options
+from imulab.recording import Array, Recording
+
+_EVERY = 0.15
+
+
+def contents(file: str, folder: Path, reading: dict[str, str]) -> Iterator[dict[str, Any]]:
+    """Write the curves of a file, and yield what is known of it.
+
+    Parameters
+    ----------
+    file
+        Its path.
+    folder
+        Where the curves go.
+    reading
+        Options of reading, as typed: ``layout``, ``topic``, ``instance``, ``window``, ``element``.
+
+    Yields
+    ------
+    dict
+        ``head``: the fields of `Head`, with ``metadata`` and ``notes``, again and again, the last with ``done``; then
+        ``attitudes``: begin and end of each, s, or ``unknown``: why there are none.
+
+    Raises
+    ------
+    ImulabError
+        The file cannot be read.
+    """
+    from imulab.readers import read_blocks
+
+    options = read_options((*READING, ELEMENT), reading, "--{}")
+    writer, notes, said, block = Writer(folder), dict[str, None](), 0.0, None
+    for block in read_blocks(file, options["layout"], **part_of(options)):
+        writer.add(block)
+        notes |= dict.fromkeys(block.notes)
+        if monotonic() - said > _EVERY:
+            said = monotonic()
+            yield {"head": asdict(writer.head), "metadata": dict(block.metadata), "notes": list(notes)}
+    about = {"metadata": dict(block.metadata) if block else {}, "notes": list(notes)}
+    yield {"head": asdict(writer.head), **about, "done": True}
+    yield attitudes(folder, writer.head, Path(file).name)
+
+
+def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
+    """Return the static attitudes of a recording that a `Writer` has written; errors as a text."""
+    from imulab.procedures.tumble.segment import find_attitudes
+
+    names = triad("accel")
+    if not head.timed or not set(names) <= set(head.units):
+        return {"attitudes": []}
+    numbers = {each: number for number, each in enumerate(head.units)}
+    columns = {each: _all(folder / f"{numbers[each]}.values", head.rows) for each in names}
+    columns["time"] = _all(folder / "time.values", head.rows)
+    units = {**{each: head.units[each] for each in names}, "time": "s"}
+    try:
+        found = find_attitudes(Recording(columns, units, name=name))
+    except ImulabError as error:
+        return {"attitudes": [], "unknown": str(error)}
+    return {"attitudes": [list(ends) for ends in zip(found.start.tolist(), found.stop.tolist(), strict=True)]}
+
+
+def _all(path: Path, count: int) -> Array:
+    return np.fromfile(path, "<f8", count)
+
+
+def main() -> int:
+    """Read the file that the command line names; the exit status is 2 where it cannot be read."""
+    file, folder, reading = sys.argv[1:4]
+    try:
+        for found in contents(file, Path(folder), json.loads(reading)):
+            print(json.dumps(found), flush=True)
+    except ImulabError as error:
+        print(json.dumps({"error": str(error)}), flush=True)
+        return 2
+    except MemoryError:
+        print(json.dumps({"error": f"{Path(file).name}: too large for the memory of this machine"}), flush=True)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

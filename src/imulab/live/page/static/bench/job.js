@@ -1,0 +1,78 @@
+// What a command has said and made.
+
+import { h, put, show } from "../dom.js";
+import { commandLine } from "./form.js";
+import { address, ask } from "./net.js";
+
+const STATES = { running: "running", done: "done", refused: "refused", cancelled: "cancelled" };
+const FAILED_TEST = /^fail\b/;
+
+// `act.look(name)` shows a file, `act.kind(name)` is its kind.
+export function card(job, act) {
+  const state = h("span", { class: "chip" });
+  const time = h("span", { class: "time" });
+  const said = h("ul", { class: "heard", "aria-live": "polite" });
+  const text = h("pre", { tabindex: 0, "aria-label": "result" });
+  const verdict = h("p", { class: "state", hidden: true });
+  const made = h("div", { class: "made" });
+  const frame = h("div", { class: "report" });
+  const cancel = h("button", { type: "button", onclick: () => { cancel.disabled = true; ask(`jobs/${job.number}`, undefined, { method: "DELETE" }).catch(() => {}); } }, "Cancel");
+  const element = h("details", { class: "job", open: true, id: `job-${job.number}` },
+    h("summary", {}, h("strong", {}, job.path), state, time),
+    commandLine(job.command), h("p", { class: "go" }, cancel), verdict, said, made, text, frame);
+  let now = null;
+
+  function tick() {
+    const seconds = (now.ended ?? Date.now() / 1000) - now.began;
+    put(time, `${seconds < 10 ? Math.max(seconds, 0).toFixed(1) : Math.round(seconds)} s`);
+    if (now.ended === null) setTimeout(tick, 500);
+  }
+
+  function report(name) {
+    if (frame.firstChild) { frame.replaceChildren(); return; }
+    const source = address("reports", name);
+    frame.append(
+      h("p", {}, h("a", { href: source, target: "_blank", rel: "noopener" }, "the report on a page of its own")),
+      h("iframe", { src: source, sandbox: "allow-scripts allow-popups allow-modals", title: `report ${name}`, loading: "eager" }));
+  }
+
+  function buttons(name) {
+    const short = name.slice(Math.max(name.lastIndexOf("/"), name.lastIndexOf("\\")) + 1);
+    const kind = act.kind(name) || (short.endsWith(".html") ? "report" : short.includes(".") ? "recording" : "folder");
+    const save = (href, label) => h("a", { class: "button", href, download: "" }, label);
+    if (kind === "folder") return [save(address("zip", name), `Save ${short}.zip`)];
+    if (kind === "report") return [h("button", { type: "button", onclick: () => report(name) }, `Show ${short}`), save(address("files", name), `Save ${short}`)];
+    return [save(address("files", name), `Save ${short}`), h("button", { type: "button", onclick: () => act.look(name) }, `Look at ${short}`)];
+  }
+
+  function update(next) {
+    const ended = next.ended !== null && now?.ended == null;
+    now = next;
+    const failed = FAILED_TEST.test(now.text);
+    put(state, failed ? "fail" : STATES[now.state]);
+    state.className = `chip ${failed ? "refused" : now.state}`;
+    show(cancel.parentElement, now.state === "running");
+    for (const line of now.said.slice(said.children.length)) {
+      const own = line.replace(/^imulab: /, "");
+      said.append(h("li", { class: /^(note|warning)/.test(own) ? own.split(":")[0] : now.status === 0 ? "" : "bad" }, own));
+    }
+    if (!ended) return;
+    const [first, ...rest] = now.text.split("\n");
+    const found = /^(good|look|bad|pass|fail)\b/.exec(first);
+    show(verdict, Boolean(found));
+    if (found) {
+      put(verdict, first);
+      verdict.className = `state ${{ pass: "good", fail: "bad" }[found[1]] || found[1]}`;
+    }
+    put(text, found ? rest.join("\n").replace(/^\n+/, "") : now.text);
+    show(text, Boolean(text.textContent.trim()));
+    made.replaceChildren(...now.outputs.flatMap(buttons));
+    const drawn = now.outputs.find(name => name.endsWith(".html"));
+    if (drawn && now.state === "done" && Date.now() / 1000 - now.ended < 20) report(drawn);
+  }
+
+  show(text, false);
+  update(job);
+  tick();
+  return { element, update };
+}

@@ -1,0 +1,396 @@
+"""Forms, files and jobs of the workbench, and the addresses that join them."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import queue
+import re
+import shlex
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+
+pytest.importorskip("starlette", reason="the page needs imulab[live]")
+
+import imulab as il
+from imulab.cli import main
+from imulab.cli.app import command
+from imulab.cli.common import commands_of
+from imulab.errors import OptionError
+from imulab.live.page import server
+from imulab.live.page.bench import Workbench
+from imulab.live.page.files import Files, checked
+from imulab.live.page.forms import forms
+from imulab.live.page.jobs import Jobs
+
+COMMANDS = dict(commands_of(command()))
+FORMS = forms(COMMANDS.items())
+HOSTILE = (
+    "../../etc/passwd",
+    "/etc/passwd",
+    "..",
+    ".",
+    "",
+    ".hidden",
+    "a/b.csv",
+    "a\\b.csv",
+    "C:x",
+    "a\0b",
+    "a\nb",
+    "a\u202eb",
+    "x" * 300,
+)
+
+
+def words(path: str, **values: Any) -> list[str]:
+    return FORMS[path].words(values, lambda name: name, lambda name, ending: f"folder/{name or 'found'}{ending}")
+
+
+@pytest.mark.parametrize("path", COMMANDS)
+def test_a_form_has_what_the_help_of_its_command_has(path, capsys):
+    assert main([*path.split(), "--help"], project=False) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    form = FORMS[path]
+    assert " ".join(form.help.split()[:5]) in shown
+    options = [field for field in form.fields if field.flag]
+    assert {each.name for each in form.fields} == {each.name for each in COMMANDS[path].params}
+    for field in options:
+        assert field.flag in shown
+        assert field.shows in shown
+        assert " ".join(field.help.split()) in shown
+        if field.default and field.kind != "switch":
+            assert field.default in shown
+
+
+def test_every_argument_of_a_procedure_is_a_file_of_the_session():
+    apart = {"live", "open", "demo"}
+    arguments = [f for path, form in FORMS.items() if path not in apart for f in form.fields if not f.flag]
+    assert {field.kind for field in arguments} == {"file", "files"}
+    assert not any(field.other for field in arguments)
+
+
+def test_no_text_of_a_form_is_a_file_without_being_called_one():
+    """Options that the help says are files are such of the session, or are written there."""
+    for path, form in FORMS.items():
+        if not path.startswith(("fleet", "live", "open", "demo")):
+            named = [f for f in form.fields if re.search(r"FILE|RECORD|[A-Z]\.[a-z]", f.shows)]
+            assert {f.kind for f in named} <= {"file", "files", "output"}, path
+
+
+@pytest.mark.parametrize(
+    ("path", "values", "expected"),
+    [
+        ("tumble fit", {"file": "r.csv", "order": "auto"}, "tumble fit r.csv"),
+        ("tumble fit", {"file": "r.csv", "order": "2", "cross": True, "output": True, "report": "a b.html"},
+         "tumble fit r.csv --order 2 --cross -o folder/found.json --report 'folder/a b.html.html'"),
+        ("tumble fit", {"file": "r.csv", "gravity": "-1", "output": None}, "tumble fit r.csv --gravity=-1"),
+        ("apply", {"files": ["r.json", "f.csv"], "again": True}, "apply r.json f.csv --again"),
+        ("tumble check", {"file": "r.csv", "record": "r.json"}, "tumble check r.json r.csv"),
+        ("export", {"records": ["r.json"], "to": "c", "output": True}, "export r.json --to c -o folder/found"),
+        ("tumble plan", {"attitudes": "9", "distinct_verticals": False},
+         "tumble plan --attitudes 9 --repeated-verticals"),
+        ("array simulate", {"fault": "dead:1 stuck:2", "output": True},
+         "array simulate -o folder/found.csv --fault dead:1 --fault stuck:2"),
+        ("warmup fit", {"files": ["a.csv"], "temperatures": "-40,0"}, "warmup fit a.csv --temperatures=-40,0"),
+    ],
+)  # fmt: skip
+def test_values_become_the_words_that_one_would_type(path, values, expected):
+    assert words(path, **values) == shlex.split(expected)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({}, "FILE: expected a file"),
+        ({"file": "r.csv", "metod": "norm"}, "no field 'metod'; expected .*did you mean 'method'"),
+        ({"file": "r.csv", "method": "nrom"}, "--method 'nrom': expected one of norm linearised; did you mean 'norm'"),
+        ({"file": "r.csv", "cross": "yes"}, "--cross: expected yes or no"),
+        ({"file": "r.csv", "gravity": {"x": 1}}, "--gravity: expected a text"),
+        ({"file": "r.csv", "gravity": "9\0"}, "--gravity: expected a text"),
+    ],
+)
+def test_values_that_cannot_be_are_refused_by_a_sentence(values, said):
+    with pytest.raises(OptionError, match=said):
+        words("tumble fit", **values)
+
+
+def test_a_word_in_the_place_of_a_file_names_no_file_outside(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("secret").write_text("x")
+    files = Files(Path("session"))
+
+    def made(layout: str) -> list[str]:
+        return FORMS["convert"].words(
+            {"file": "session/r.csv", "layout": layout}, files.path, lambda name, ending: name
+        )
+
+    Path("session/r.csv").write_text("x")
+    Path("session/l.toml").write_text("x")
+    assert made("phyphox")[-2:] == ["--layout", "phyphox"]
+    assert made("session/l.toml")[-2:] == ["--layout", "session/l.toml"]
+    for layout in ("secret", "/etc/passwd", "../secret", "session/../secret"):
+        with pytest.raises(OptionError, match=r"not among the files of this session|without a path"):
+            made(layout)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_names_are_refused(tmp_path, name):
+    with pytest.raises(OptionError, match="expected the name of a file"):
+        checked(tmp_path, name)
+
+
+@pytest.mark.parametrize(
+    "name", ["<img src=x onerror=alert(1)>.csv", "-o.csv", "a b;rm -rf $HOME`id`.csv", "µ ü.csv", "con.csv"]
+)
+def test_odd_names_are_names(tmp_path, name):
+    assert checked(tmp_path, name) == tmp_path / name
+
+
+def test_a_session_lists_its_files_with_their_kinds(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    il.write_csv(il.simulate_tumble(attitudes=12, gravity=9.81), "-given.csv")
+    files = Files(Path("session"), ["-given.csv"])
+    il.fit_tumble("-given.csv", order=1, gravity=9.81).save("session/r.json")
+    Path("session/r.html").write_text("x")
+    Path("session/fw").mkdir()
+    Path("session/.part").write_text("x")
+    Path("session/link.csv").symlink_to("/etc/passwd")
+    assert [(entry.name, entry.kind) for entry in files.entries()] == [
+        ("./-given.csv", "recording"), ("session/fw", "folder"), ("session/link.csv", "recording"),
+        ("session/r.html", "report"), ("session/r.json", "record"),
+    ]  # fmt: skip
+    assert files.path("./-given.csv") == "./-given.csv"
+    for name in ("r.json", "session/link.csv", "session/.part", "session/none", "session/", "/etc/passwd", "-", ""):
+        with pytest.raises(OptionError):
+            files.path(name)
+    assert files.unused("r.json") == "session/r-2.json"
+    with pytest.raises(OptionError, match="is there already"):
+        files.new("r.json")
+    assert files.end()
+
+
+def test_an_empty_folder_goes_with_its_session(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert not Files(Path("session")).end()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OptionError, match=r"none\.csv: no such file"):
+        Files(Path("session"), ["none.csv"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def until(condition: Callable[[], Any], seconds: float = 30) -> Any:
+    ends = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < ends, "it has not come to that"
+        time.sleep(0.02)
+    return found
+
+
+def test_a_job_is_the_command_itself(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    il.write_csv(il.simulate_tumble(attitudes=12, gravity=9.81), "a b.csv")
+    told: list[str] = []
+    jobs = Jobs(lambda job: told.append(job.state))
+    job = jobs.run("tumble fit", ["tumble", "fit", "a b.csv", "--order", "1", "-o", "r.json"], ["r.json"])
+    until(lambda: job.ended)
+    assert (job.state, job.status, told[0], told[-1]) == ("done", 0, "running", "done")
+    assert job.command == "imulab tumble fit 'a b.csv' --order 1 -o r.json"
+    assert main(shlex.split(job.command.replace("r.json", "s.json"))[1:], project=False) == 0
+    assert capsys.readouterr().out.replace("s.json", "r.json") == job.text
+    assert same_record(Path("r.json").read_bytes(), Path("s.json").read_bytes())
+
+
+def same_record(one: bytes, other: bytes) -> bool:
+    """Whether two records are the same bit for bit, apart from when they were made."""
+
+    def apart(data: bytes) -> bytes:
+        return b"\n".join(
+            line for line in data.splitlines() if b'"created"' not in line and b'"content_sha256"' not in line
+        )
+
+    return apart(one) == apart(other) and len(apart(one)) > 1000
+
+
+def test_a_refusal_is_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    jobs = Jobs(lambda job: None)
+    job = jobs.run("tumble fit", ["tumble", "fit", "none.csv", "-o", "r.json"], ["r.json"])
+    until(lambda: job.ended)
+    assert (job.state, job.status, job.said, job.text) == ("refused", 2, ["imulab: none.csv: no such file"], "")
+
+
+def test_a_module_in_the_working_folder_is_not_imported(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("numpy", "imulab", "typer"):
+        Path(f"{name}.py").write_text("open('executed', 'w')")
+    job = Jobs(lambda job: None).run("show", ["show", "--formats"], [])
+    until(lambda: job.ended)
+    assert (job.state, Path("executed").exists()) == ("done", False)
+
+
+def test_cancelling_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    il.write_csv(il.simulate_tumble(attitudes=24, gravity=9.81), "rec.csv")
+    jobs = Jobs(lambda job: None)
+    slow = ["tumble", "fit", "rec.csv", "--order", "2", "--monte-carlo", "500000", "-o", "r.json", "--report", "r.html"]
+    job = jobs.run("tumble fit", slow, ["r.json", "r.html"])
+    group = jobs._processes[job.number].pid
+    time.sleep(2.5)
+    assert job.state == "running"
+    jobs.cancel(job.number)
+    until(lambda: job.ended)
+    assert job.state == "cancelled"
+    assert [path.name for path in tmp_path.iterdir()] == ["rec.csv"]
+    with pytest.raises(ProcessLookupError):
+        os.killpg(group, 0)
+    jobs.cancel(job.number)  # again: nothing happens
+    jobs.cancel(77)
+
+
+def test_many_words_are_cut(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("imulab.live.page.jobs._LONGEST", 100)
+    job = Jobs(lambda job: None).run("show", ["show", "--formats"], [])
+    until(lambda: job.ended)
+    assert job.text[100:].startswith("\n... and ")
+    assert job.state == "done"
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch) -> Iterator[SimpleNamespace]:
+    """A workbench that runs, and a way to ask it."""
+    monkeypatch.chdir(tmp_path)
+    lines: queue.Queue[str] = queue.Queue()
+    part = Workbench(Files(Path("session")), FORMS)
+    options = {"browser": False, "limit": 10**7, "tell": lines.put}
+    thread = threading.Thread(target=server.serve, args=([part],), kwargs=options, daemon=True)
+    thread.start()
+    host, _, token = lines.get(timeout=20).removeprefix("http://").partition("/?token=")
+
+    def ask(path: str, body: Any = None, method: str | None = None, **headers: str) -> SimpleNamespace:
+        data = json.dumps(body) if isinstance(body, dict) else body
+        connection = http.client.HTTPConnection(host, timeout=30)
+        given = {"x-imulab-token": token} | {key.replace("_", "-"): value for key, value in headers.items()}
+        connection.request(method or ("POST" if data else "GET"), f"/api/workbench/{path}", data, given)
+        answer = connection.getresponse()
+        body = answer.read()
+        connection.close()
+        return SimpleNamespace(status=answer.status, body=body, headers=answer.headers, json=lambda: json.loads(body))
+
+    yield SimpleNamespace(ask=ask, part=part)
+    part._hub.stop()
+    thread.join(20)
+    assert not thread.is_alive()
+
+
+def run(bench: SimpleNamespace, path: str, **values: Any) -> Any:
+    job = bench.ask("jobs", {"command": path, "values": values}).json()
+    assert "error" not in job, job
+    return until(lambda: (found := bench.part._jobs.jobs[job["number"]]).ended and found)
+
+
+def test_from_the_recording_to_the_firmware(bench, tmp_path):
+    il.write_csv(il.simulate_tumble(attitudes=12, gravity=9.81), "rec.csv")
+    name = bench.ask("files/rec.csv", Path("rec.csv").read_bytes(), "PUT").json()["name"]
+    assert name == "session/rec.csv"
+    assert bench.ask("files/rec.csv", b"other", "PUT").json()["name"] == "session/rec-2.csv"
+    bench.ask("open", {"file": name, "reading": {}})
+    about = until(lambda: "attitudes" in (found := bench.ask("open", {"file": name}).json()) and found)
+    assert len(about["attitudes"]) == 12
+    shown = bench.ask(f"curves?file={quote(name)}&width=200").json()
+    assert len(shown["low"]["accel_x"]) == len(shown["at"]) == 200
+    said = bench.ask(
+        "command", {"command": "tumble fit", "values": {"file": name, "output": True, "report": True}}
+    ).json()
+    assert said["command"] == "imulab tumble fit session/rec.csv -o session/rec.json --report session/rec.html"
+    job = run(bench, "tumble fit", file=name, output=True, report=True)
+    assert (job.state, job.command) == ("done", said["command"])
+    record = bench.ask("files/session%2Frec.json")
+    assert record.headers["content-disposition"] == "attachment; filename*=UTF-8''rec.json"
+    assert main(["tumble", "fit", "session/rec.csv", "-o", "own.json"], project=False) == 0
+    assert same_record(record.body, Path("own.json").read_bytes())
+    report = bench.ask("reports/session%2Frec.html")
+    assert report.headers["content-security-policy"].startswith("sandbox ")
+    assert report.body == Path("session/rec.html").read_bytes()
+    job = run(bench, "export", records=["session/rec.json"], to="c", output=True)
+    packed = bench.ask(f"zip/{quote(job.outputs[0], safe='')}")
+    names = zipfile.ZipFile(BytesIO(packed.body)).namelist()
+    assert sorted(names) == sorted(f"rec-c/{path.name}" for path in (tmp_path / "session" / "rec-c").iterdir())
+    kinds = {entry["short"]: entry["kind"] for entry in bench.ask("files").json()["files"]}
+    assert kinds == {
+        "rec-2.csv": "recording",
+        "rec-c": "folder",
+        "rec.csv": "recording",
+        "rec.html": "report",
+        "rec.json": "record",
+    }
+    assert bench.ask("files/session%2Frec-2.csv", None, "DELETE").status == 200
+    assert not Path("session/rec-2.csv").exists()
+
+
+@pytest.mark.parametrize("name", [name for name in HOSTILE if name])
+@pytest.mark.parametrize(
+    ("kind", "method"), [("files", "PUT"), ("files", "GET"), ("files", "DELETE"), ("zip", "GET"), ("reports", "GET")]
+)
+def test_no_address_leads_out_of_the_session(bench, tmp_path, kind, method, name):
+    before = sorted(tmp_path.rglob("*"))
+    answer = bench.ask(f"{kind}/{quote(name, safe='')}", b"x" if method == "PUT" else None, method)
+    assert answer.status in (400, 404, 405)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_page_from_elsewhere_is_not_shown_but_saved(bench):
+    bench.ask("files/evil.html", b"<script>alert(1)</script>", "PUT")
+    assert bench.ask("reports/session%2Fevil.html").status == 400
+    saved = bench.ask("files/session%2Fevil.html")
+    assert saved.headers["content-type"] == "application/octet-stream"
+    assert saved.headers["content-disposition"].startswith("attachment")
+
+
+def test_an_upload_beyond_the_limit_is_refused_and_leaves_nothing(bench, tmp_path):
+    assert bench.ask("files/big.csv", b"x" * (10**7 + 1), "PUT").status == 413
+    assert bench.ask("files/big.csv", iter([b"x" * 10**6] * 11), "PUT").status == 400
+    assert list((tmp_path / "session").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "said"),
+    [
+        ("open", {"file": "/etc/passwd"}, "not among the files"),
+        ("open", {"file": "none.csv"}, "not among the files"),
+        ("open", {"file": 5, "reading": 7}, "not among the files|reading: expected"),
+        ("curves?file=none", None, "is not open"),
+        ("curves?file=none&from=x", None, "from 'x': expected a number"),
+        ("command", {"command": "live", "values": []}, "not among those offered"),
+        ("jobs", {"command": "tumble fit", "values": {"file": "/etc/passwd"}}, "not among the files"),
+        ("jobs", {"command": "tumble simulate", "values": {"output": "../x.csv"}}, "expected the name of a file"),
+        ("jobs", b"[1", "expected a JSON object"),
+        ("jobs", b"[" * 50_000, "expected a JSON object"),
+    ],
+)
+def test_what_cannot_be_is_answered_by_a_sentence(bench, tmp_path, path, body, said):
+    answer = bench.ask(path, body)
+    assert answer.status == 400
+    assert any(each in answer.json()["error"] for each in said.split("|"))
+    assert list(tmp_path.iterdir()) == [tmp_path / "session"]
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["--port", "x"], "--port 'x': expected a whole number"),
+    (["--port", "70000"], "--port 70000: expected 0 to 65535"),
+    (["none.csv"], "none.csv: no such file"),
+])  # fmt: skip
+def test_open_refuses_by_a_sentence(imulab, tmp_path, arguments, said):
+    ran = imulab("open", "--no-browser", *arguments)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (2, "", f"imulab: {said}\n")
+    assert list(tmp_path.iterdir()) == []
