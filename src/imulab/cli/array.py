@@ -131,7 +131,7 @@ def calibrate(
     from imulab.cli.result import finish
     from imulab.procedures.run import run_task
 
-    check_outputs([output, report], [name for name in (still, moving, options["layout"]) if name])
+    check_outputs([output, report], [name for name in (still, moving, options["layout"], options["noise"]) if name])
     files = [still] if moving is None else [still, moving]
     finish(run_task("array", files, options, GivenFiles()), output, report, json=json)
 

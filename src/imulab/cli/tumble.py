@@ -155,6 +155,9 @@ def gyro(
     clock_of: Annotated[
         str, one_of(CLOCKS, "Whose time stamps are right where two clocks differ.", "--clock-of")
     ] = "gyro",
+    noise: Annotated[
+        str | None, typer.Option(metavar="RECORD", help="Noise record of the same gyroscopes, for u of their biases.")
+    ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -165,7 +168,7 @@ def gyro(
     from imulab.procedures.tumble.gyrorecord import with_gyro
     from imulab.procedures.tumble.segment import find_attitudes
 
-    inputs = [name for name in (file, accel, accel_file, options["layout"], accel_layout) if name]
+    inputs = [name for name in (file, accel, accel_file, options["layout"], accel_layout, noise) if name]
     check_outputs([output, report], inputs)
     record = load(accel)
     how = reading(options)
@@ -176,6 +179,7 @@ def gyro(
     result = fit_gyro(
         record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
+        noise=None if noise is None else load(noise),
     )  # fmt: skip
     finish(
         with_gyro(record, result, recording, own),

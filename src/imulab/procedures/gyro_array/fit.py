@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from imulab.device.array_settings import Fusion
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError
 from imulab.estimation.allan import AllanCurve
-from imulab.estimation.column_noise import ColumnNoise, columns_noise, noise_lines
+from imulab.estimation.column_noise import noise_lines
 from imulab.estimation.noise_coefficients import COEFFICIENTS, coefficients_dict
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.estimation.sampling import sampling_rate
@@ -22,6 +21,7 @@ from imulab.procedures.gyro_array.clocks import on_one_clock
 from imulab.procedures.gyro_array.latency import align_in_time, latency_notes
 from imulab.procedures.gyro_array.model import Elements, feedback_notes, find_elements, fixed_weights
 from imulab.procedures.gyro_array.rest import find_rest
+from imulab.procedures.gyro_array.restnoise import AtRest, at_rest, unseen
 from imulab.procedures.result import Result
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -33,8 +33,6 @@ _FEWEST_DIFFERENCES = 4  # per element, for the covariance matrix
 _OVERLAP = 8
 _CLIPPED_RUN = 3
 _SHARED = 0.5
-_CANDIDATES = ("N", "NK", "NB", "NG", "NBK")
-"""Models of the noise: a stretch at rest is too short to tell more."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,18 +43,6 @@ class ArrayFit(Result):
     curves: tuple[tuple[AllanCurve, ...], ...]
 
 
-@dataclass(frozen=True)
-class _AtRest:
-    """What the recording at rest says: curves and coefficients per axis and element; rad/s."""
-
-    bias: Array
-    curves: tuple[tuple[AllanCurve, ...], ...]
-    noise: tuple[tuple[ColumnNoise, ...], ...]
-    white: Array
-    duration: float
-    rate: float
-
-
 def calibrate_array(
     still: Recording,
     moving: Recording | None = None,
@@ -64,13 +50,14 @@ def calibrate_array(
     averaging_time: float = 1.0,
     serial: str | None = None,
     fusion: Fusion | None = None,
+    noise: Calibration | None = None,
 ) -> ArrayFit:
     """Calibrate the elements of an array from a recording at rest and, if there is one, a recording in motion.
 
     At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
-    come from the model of its noise, and so does the bias's uncertainty (`ColumnNoise.mean_uncertainty`); the
-    covariance matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
-    covariance; Vaccaro and Zaki 2017). In motion: `align`.
+    come from the model of its noise, and so does the bias's uncertainty, unless `noise` is given; the covariance matrix
+    at `averaging_time` is half the mean of the products of successive differences of means (the Allan covariance;
+    Vaccaro and Zaki 2017). In motion: `align`.
 
     Parameters
     ----------
@@ -80,6 +67,8 @@ def calibrate_array(
         Of the covariance matrix, s.
     fusion
         Method and memory that `array fuse` and `export` take from the record; robust and growing where not given.
+    noise
+        Noise record of the same gyros, for the uncertainties of the biases; that of `still` itself where not given.
 
     Raises
     ------
@@ -105,9 +94,10 @@ def calibrate_array(
     warnings += [type(note)(f"{still.name}: {note}") for note in left_out.notes()]
     still, cut = _still_part(left_out, elements)
     warnings += cut
-    rest = _at_rest(still, elements)
-    _, notes = sampling_rate(still)
-    warnings += notes
+    _check_readings(still, elements)
+    rate, timing = sampling_rate(still)
+    rest, notes = at_rest(_si(still, elements), rate, elements, noise, still.metadata)
+    warnings += [*(f"{still.name}: {line}" for line in notes), *timing]
     aligned = None
     if moving is not None:
         aligned, more = _in_motion(moving, elements, rest)
@@ -126,7 +116,8 @@ def calibrate_array(
         )
     noises = {elements.names[a][i]: found for a, row in enumerate(rest.noise) for i, found in enumerate(row)}
     warnings += [type(line)(f"{still.name}: {line}") for line in noise_lines(noises)]
-    warnings += [f"{still.name}: {line}" for line in _unseen(noises, rest.duration)]
+    if noise is None:
+        warnings += [Note(f"{still.name}: {line}") for line in unseen(noises, rest)]
     if fusion is not None and fusion.method == "feedback":
         warnings += [type(line)(f"{still.name}: {line}") for line in feedback_notes(elements.count, rest.rate)]
     record = _record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
@@ -189,31 +180,7 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
     ]
 
 
-def _at_rest(still: Recording, elements: Elements) -> _AtRest:
-    rate, _ = sampling_rate(still)
-    _check_readings(still, elements)
-    readings = _si(still, elements)
-    n = elements.count
-    columns = [readings[:, a, i] for a in range(len(elements.axes)) for i in range(n)]
-    each = columns_noise(columns, rate, candidates=_CANDIDATES)
-    noise = tuple(tuple(each[k : k + n]) for k in range(0, len(each), n))
-    curves = tuple(tuple(one.curve for one in row) for row in noise)
-    white = np.array([[curve.deviation[0] for curve in row] for row in curves])
-    return _AtRest(readings.mean(axis=0), curves, noise, white, len(still) / rate, rate)
-
-
-def _unseen(noises: Mapping[str, ColumnNoise], duration: float) -> list[str]:
-    """Say by how much slower noise than a stretch shows could raise the uncertainties of the biases."""
-    most = max((each.unseen(duration) for each in noises.values()), default=1.0)
-    if most == 1:
-        return []
-    return [
-        f"the uncertainties of the biases hold the noise that {duration:.4g} s show; slower noise, which so short a "
-        f"stretch cannot show, would make them up to {most:.2g} times as large"
-    ]
-
-
-def _in_motion(moving: Recording, elements: Elements, rest: _AtRest) -> tuple[Alignment, list[str]]:
+def _in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tuple[Alignment, list[str]]:
     moving = on_one_clock(moving)
     its = find_elements(moving)
     if its.names != elements.names:
@@ -280,11 +247,11 @@ def _with_unit(value: Any, uncertainty: Any, unit: str) -> dict[str, Any]:
 
 
 def _elements(
-    elements: Elements, rest: _AtRest, aligned: Alignment | None
+    elements: Elements, rest: AtRest, aligned: Alignment | None
 ) -> tuple[list[dict[str, Any]], dict[str, Parameter]]:
     """The record's entry for each element, and the parameters in them."""
     axes = len(elements.axes)
-    spread = np.array([[c.mean_uncertainty(rest.duration) for c in row] for row in rest.noise])
+    spread = rest.uncertainty
     one = axes == 1
 
     def scalar(values: Array) -> Any:
@@ -324,7 +291,7 @@ def _record(
     still: Recording,
     moving: Recording | None,
     elements: Elements,
-    rest: _AtRest,
+    rest: AtRest,
     aligned: Alignment | None,
     covariance: Array,
     averaging_time: float,

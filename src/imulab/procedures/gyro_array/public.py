@@ -36,6 +36,7 @@ def calibrate_array(
     serial: str | None = None,
     method: str | None = None,
     memory: str | float | None = None,
+    noise: Record | None = None,
     **reading: Unpack[Reading],
 ) -> ArrayFit:
     """Calibrate the elements of an array from data at rest and, if there are some, data in motion.
@@ -56,6 +57,9 @@ def calibrate_array(
         Of the array, for the record.
     method, memory
         What `fuse` and `export` take from the record; robust and growing where not given.
+    noise
+        Record of `fit_noise` of the same gyros, or its file, from a log that is longer than `still`: the uncertainties
+        of the biases are those of its model.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window` (of `still` alone).
@@ -70,6 +74,8 @@ def calibrate_array(
         The motion does not excite every axis.
     OptionError
         An option has a value that cannot be.
+    RecordError
+        `noise` is no noise record, or lacks a gyro.
 
     Examples
     --------
@@ -86,7 +92,10 @@ def calibrate_array(
     fusion = None
     if method is not None or memory is not None:
         fusion = fusion_text(method, None if memory is None else str(memory), _LABEL)
-    return fit.calibrate_array(at_rest, in_motion, averaging_time=averaging_time, serial=serial, fusion=fusion)
+    return fit.calibrate_array(
+        at_rest, in_motion, averaging_time=averaging_time, serial=serial, fusion=fusion,
+        noise=None if noise is None else as_record(noise, "calibrate_array: noise"),
+    )  # fmt: skip
 
 
 def fuse(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from imulab.device.methods import METHODS
 from imulab.errors import OptionError
-from imulab.procedures.options import READING, Option, measure, part_of, read_options, text_option
+from imulab.procedures.options import READING, Option, file_option, measure, part_of, read_options, text_option
 from imulab.procedures.procedure import Files, Task
 from imulab.quantities import interval
 
@@ -25,7 +25,10 @@ def _fit(
     part = values["part"]
     still = _between(access.recording(files[0], values["layout"], **part), values["interval"])
     moving = access.recording(files[1], values["layout"], **{**part, "window": None}) if len(files) > 1 else None
-    return calibrate_array(still, moving, averaging_time=values["averaging"], fusion=values["fusion"]).calibration
+    noise = None if values["noise"] is None else access.record(values["noise"])
+    return calibrate_array(
+        still, moving, averaging_time=values["averaging"], fusion=values["fusion"], noise=noise
+    ).calibration
 
 
 def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
@@ -58,6 +61,7 @@ OPTIONS = (
     measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
     METHOD,
     MEMORY,
+    file_option("noise", "Noise record of the same gyros, for the uncertainties of the biases.", "RECORD"),
     *READING,
 )
 

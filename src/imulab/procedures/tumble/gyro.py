@@ -13,7 +13,7 @@ Source: Tedaldi, Pretto, Menegatti, ICRA 2014, section IV; the change of a turn 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,7 +34,8 @@ from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
 from imulab.procedures.tumble.sections import fit_of, model_of
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.records.calibration import Calibration
-from imulab.units import STANDARD_GRAVITY, from_si
+from imulab.records.mean_noise import mean_uncertainties
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 from imulab.verdict import Note
 
 PAIRS = ("xy", "xz", "yx", "yz", "zx", "zy")
@@ -112,6 +113,7 @@ def fit_gyro(
     sensitivity: str = "auto",
     clock: float = CRYSTAL,
     clock_of: str = "gyro",
+    noise: Calibration | None = None,
 ) -> GyroFit:
     """Calibrate a gyroscope triad from the turns between static attitudes.
 
@@ -139,6 +141,9 @@ def fit_gyro(
             raise DataError(f"{recording.name}: the turns do not tell how the two clocks differ")
         time = comparison.on_other(time)
         found = solve_turns(case, time, sensitivity)
+    said_of_noise: list[str] = []
+    if noise is not None:
+        found, said_of_noise = _with_noise(found, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
     rest = np.zeros(len(time), dtype=np.bool_)
     for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
@@ -147,6 +152,7 @@ def fit_gyro(
     notes = [
         *(f"gyro: {note}" for note in left_out.notes(rest)),
         *said,
+        *said_of_noise,
         *found.notes,
         *_record_notes(record, attitudes, case.force),
         *known.notes(apart=apart),
@@ -180,6 +186,19 @@ def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, 
         raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
     if attitudes.trace is None:
         raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
+
+
+def _with_noise(
+    found: Solved, noise: Calibration, attitudes: Attitudes, recording: Recording
+) -> tuple[Solved, list[str]]:
+    """The zero with the uncertainty that a noise record tells of the time at rest, where the holds scatter by less."""
+    unit = recording.triad_unit("gyro")
+    rate = parse_unit(unit).quantity == "rate"
+    duration = float((attitudes.stop - attitudes.start).sum())
+    u, said = mean_uncertainties(noise, triad("gyro"), duration, "rad/s" if rate else unit, recording.metadata)
+    least = from_si(u, unit) if rate else u
+    rest = replace(found.rest, zero_uncertainty=np.maximum(found.rest.zero_uncertainty, least))
+    return replace(found, rest=rest), said
 
 
 def _with_even_stamps(case: Case, time: Array, sensitivity: str, found: Solved) -> tuple[Array, Solved, list[Note]]:

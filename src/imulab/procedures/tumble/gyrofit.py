@@ -33,6 +33,7 @@ def fit_gyro(
     sensitivity: str = "auto",
     clock: float = CRYSTAL,
     clock_of: str = "gyro",
+    noise: Calibration | str | PathLike[str] | None = None,
     **reading: Unpack[Reading],
 ) -> BothTriads:
     """Calibrate a gyroscope triad from the turns between static attitudes.
@@ -56,6 +57,9 @@ def fit_gyro(
         Relative standard uncertainty of the rate of the clock: common to the three scale factors.
     clock_of
         Whose time counts where the two triads have clocks of their own: ``gyro`` or ``accel``.
+    noise
+        Record of `fit_noise` of the same gyroscopes, or its file: the biases are no more certain than it says of a mean
+        over the time at rest.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.
@@ -63,7 +67,7 @@ def fit_gyro(
     Raises
     ------
     RecordError
-        The record is no tumble record.
+        The record is no tumble record, or `noise` no noise record of these gyroscopes.
     SegmentError
         Fewer than eight turns between attitudes.
     DataError
@@ -92,6 +96,6 @@ def fit_gyro(
         own = as_recording(accel_data, given, fit_gyro, name="accel_data")
     found = gyro.fit_gyro(
         known, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=sensitivity, clock=clock,
-        clock_of=clock_of,
+        clock_of=clock_of, noise=None if noise is None else as_record(noise, "fit_gyro: noise"),
     )  # fmt: skip
     return BothTriads(with_gyro(known, found, recording, own), found)
