@@ -101,6 +101,23 @@ unsigned il_gyro_apply(const il_gyro *settings, const il_real output[3], const i
 unsigned il_gyro_block(const il_gyro *settings, size_t n, const il_real *const output[3], const il_real *const force[3],
                        size_t stride, il_real *const rate[3], size_t rate_stride);
 
+/* ---- magnetometer triad: m = T^-1 s, s + k2 s^2 = M / S - b ------------------------------------------------------- */
+
+typedef struct {
+    int32_t order;       /* 1, or 2 with k2 */
+    il_real gain[3];     /* 1 / S of each output, T (or 1) per output */
+    il_real bias[3];     /* b, T (or 1): hard iron, as each output has it */
+    il_real turn[3][3];  /* T^-1, and which output is which axis, 1 */
+    il_real quadratic[3]; /* k2, 1/T (or 1) */
+} il_mag;
+
+/* Outputs to field [T, or parts of the local field], in the body frame; field may be output. */
+unsigned il_mag_apply(const il_mag *settings, const il_real output[3], il_real field[3]);
+
+/* The same for n samples. */
+unsigned il_mag_block(const il_mag *settings, size_t n, const il_real *const output[3], size_t stride,
+                      il_real *const field[3], size_t field_stride);
+
 /* ---- flexible gyroscope: drift K(a) (ax cos theta + ay sin theta), K(a) = K0 (1 + c1 a + c2 a^2) ------------------ */
 
 typedef struct {
@@ -248,7 +265,7 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
 
 /* ---- all that one unit has, from a table ("blob") ----------------------------------------------------------------- */
 
-enum { IL_HAS_TUMBLE = 1, IL_HAS_GYRO = 2, IL_HAS_CENTRIFUGE = 4, IL_HAS_WARMUP = 8, IL_HAS_ARRAY = 16 };
+enum { IL_HAS_TUMBLE = 1, IL_HAS_GYRO = 2, IL_HAS_CENTRIFUGE = 4, IL_HAS_WARMUP = 8, IL_HAS_ARRAY = 16, IL_HAS_MAG = 32 };
 
 typedef struct {
     uint32_t has; /* IL_HAS_TUMBLE ... or-ed */
@@ -257,6 +274,7 @@ typedef struct {
     il_centrifuge centrifuge;
     il_warmup warmup;
     il_array array;
+    il_mag mag;
 } il_unit;
 
 /* Check a table and unpack it; arrays go to the caller's memory, which must outlive the unit; the bytes need not. On

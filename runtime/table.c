@@ -12,7 +12,7 @@
 
 enum { HEAD = 16, TAIL = 4, SECTION_HEAD = 8, MANY = 65536 };
 enum { CROSSED = 256 }; /* on top of a tumble's order: cross terms follow the polynomial */
-enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5 };
+enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5, MAG = 6 };
 
 static const uint8_t MAGIC[8] = {0x89, 0x49, 0x4D, 0x55, 0x4C, 0x41, 0x42, 0x0A};
 
@@ -157,6 +157,14 @@ static void read_gyro(cursor *c, il_gyro *g) {
     for (int i = 0; i < 3 && g->has_sensitivity; i++) numbers(c, g->sensitivity[i], 3);
 }
 
+static void read_mag(cursor *c, il_mag *m) {
+    m->order = count(c, 1, 2);
+    numbers(c, m->gain, 3);
+    numbers(c, m->bias, 3);
+    for (int i = 0; i < 3; i++) numbers(c, m->turn[i], 3);
+    if (m->order > 1) numbers(c, m->quadratic, 3);
+}
+
 static void read_centrifuge(cursor *c, il_centrifuge *k) {
     k->has[0] = count(c, 0, 1);
     k->has[1] = count(c, 0, 1);
@@ -237,6 +245,7 @@ static void read_section(cursor *c, il_unit *unit, uint32_t kind) {
         case CENTRIFUGE: read_centrifuge(c, &unit->centrifuge); break;
         case WARMUP: read_warmup(c, &unit->warmup); break;
         case ARRAY: read_array(c, &unit->array); break;
+        case MAG: read_mag(c, &unit->mag); break;
         default: c->at = c->end; break;
     }
     if (c->at != c->end) fail(c, IL_TABLE_CONTENT);
@@ -258,7 +267,7 @@ static il_status load(il_unit *unit, const uint8_t *bytes, size_t size, il_real 
         if (end - c.at < SECTION_HEAD) return IL_TABLE_CONTENT;
         uint32_t kind = u32(c.at), length = u32(c.at + 4);
         c.at += SECTION_HEAD;
-        if (kind > ARRAY || length > (size_t)(end - c.at)) return IL_TABLE_CONTENT;
+        if (kind > MAG || length > (size_t)(end - c.at)) return IL_TABLE_CONTENT;
         c.end = c.at + length;
         read_section(&c, unit, kind);
     }

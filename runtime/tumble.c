@@ -1,4 +1,4 @@
-/* Accelerometer and gyroscope triads: outputs to specific force and angular rate. */
+/* Accelerometer, gyroscope and magnetometer triads: outputs to specific force, angular rate and field. */
 #include "real.h"
 
 /* Newton's method doubles the correct digits: at MEMS size three or four steps reach the last bit of a double; twelve get
@@ -151,6 +151,35 @@ unsigned il_gyro_block(const il_gyro *settings, size_t n, const il_real *const o
         }
         flags |= il_gyro_apply(settings, m, force != NULL ? f : NULL, w);
         for (int a = 0; a < 3; a++) rate[a][k * rate_stride] = w[a];
+    }
+    return flags;
+}
+
+unsigned il_mag_apply(const il_mag *settings, const il_real output[3], il_real field[3]) {
+    il_real s[3], slope[3];
+    unsigned flags = 0;
+    for (int i = 0; i < 3; i++) s[i] = output[i] * settings->gain[i] - settings->bias[i];
+    const int finite = il_finite(s[0] + s[1] + s[2]);
+    if (settings->order > 1) {
+        const il_real a[3] = {s[0], s[1], s[2]};
+        il_tumble_solve(2, &settings->quadratic, a, s, slope);
+    }
+    if (!finite) flags = IL_NOT_FINITE;
+    else if (!il_finite(s[0] + s[1] + s[2])) flags = IL_BEYOND;
+    for (int i = 0; i < 3; i++) {
+        field[i] = settings->turn[i][0] * s[0] + settings->turn[i][1] * s[1] + settings->turn[i][2] * s[2];
+    }
+    return flags;
+}
+
+unsigned il_mag_block(const il_mag *settings, size_t n, const il_real *const output[3], size_t stride,
+                      il_real *const field[3], size_t field_stride) {
+    unsigned flags = 0;
+    for (size_t k = 0; k < n; k++) {
+        const il_real m[3] = {output[0][k * stride], output[1][k * stride], output[2][k * stride]};
+        il_real b[3];
+        flags |= il_mag_apply(settings, m, b);
+        for (int a = 0; a < 3; a++) field[a][k * field_stride] = b[a];
     }
     return flags;
 }

@@ -25,6 +25,7 @@ FUNCTIONS = {
     "tumble simulate": il.simulate_tumble,
     "tumble fit": il.fit_tumble,
     "tumble gyro": il.fit_gyro,
+    "tumble mag": il.fit_mag,
     "tumble check": il.check_tumble,
     "array simulate": il.simulate_array,
     "array merge": il.merge_array,
@@ -54,6 +55,7 @@ OTHERWISE = {
     "show": {"formats"},  # a list for people
     "tumble fit": {"latitude", "height"},  # gravity=il.normal_gravity(...)
     "tumble check": {"latitude", "height"},
+    "tumble mag": {"latitude", "height"},
     "tumble gyro": {"accel", "accel_file", "g_sensitivity", "clock"},
     "array calibrate": {"interval", "averaging"},
     "array fuse": {"rate"},  # of arrays and files, a keyword of reading

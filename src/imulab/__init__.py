@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from imulab.procedures.tumble.fit import TumbleFit as TumbleFit
     from imulab.procedures.tumble.fit import fit_tumble as fit_tumble
     from imulab.procedures.tumble.gyrofit import fit_gyro as fit_gyro
+    from imulab.procedures.tumble.mag.fit import MagFit as MagFit
+    from imulab.procedures.tumble.mag.fit import fit_mag as fit_mag
     from imulab.procedures.tumble.planning import plan_tumble as plan_tumble
     from imulab.procedures.tumble.segment import find_attitudes as find_attitudes
     from imulab.procedures.tumble.simulate import simulate_tumble as simulate_tumble
@@ -103,6 +105,7 @@ _HOME = {
     "find_attitudes": "procedures.tumble.segment",
     "find_power_cycle": "procedures.warmup.cycles",
     "fit_gyro": "procedures.tumble.gyrofit",
+    "fit_mag": "procedures.tumble.mag.fit",
     "NoiseFit": "procedures.noise.fit",
     "fit_noise": "procedures.noise.fit",
     "fit_centrifuge": "procedures.centrifuge.fit",

@@ -25,13 +25,23 @@ from imulab.cli.options import (
 )
 from imulab.cli.result import finish
 from imulab.procedures.options import FLAG
-from imulab.procedures.tumble.choices import CLOCKS, CRITERIA, METHODS, SENSITIVITIES, STARTS
+from imulab.procedures.tumble.choices import (
+    CLOCKS,
+    CRITERIA,
+    HEMISPHERES,
+    LOSSES,
+    MAG_ORDERS,
+    METHODS,
+    SENSITIVITIES,
+    STARTS,
+)
 from imulab.procedures.tumble.task import GRAVITY, OPTIONS
 
 if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 _OF_THE_RECORD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the file's head, else of the record.")
+_OF_THE_TRIAD = replace(GRAVITY[0], help="Local gravity, m/s^2; else of the accelerometers' record, else of the head.")
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
@@ -41,6 +51,7 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
     group.command("simulate")(simulate)
     group.command("fit")(fit)
     group.command("gyro")(gyro)
+    group.command("mag")(mag)
     group.command("check")(check)
     return group
 
@@ -98,6 +109,10 @@ def simulate(
     unit: Annotated[str, typer.Option(help="Unit of the outputs: m/s^2 g mg count V.")] = "m/s^2",
     gravity: Annotated[str, typer.Option(help="Local gravity.")] = "9.80665 m/s^2",
     knock: Annotated[str | None, typer.Option(help="Number of an attitude that is knocked.")] = None,
+    field: Annotated[
+        str | None, typer.Option(metavar="48uT", help="Magnitude of the magnetic field, uT, for columns mag_*.")
+    ] = None,
+    dip: Annotated[str, typer.Option(help="Its dip, positive where it points down.")] = "67 deg",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate a tumble recording of a random MEMS triad, with its truth in the head of the file."""
@@ -107,7 +122,7 @@ def simulate(
     check_writable(output)
     recording = call(
         simulate_tumble, attitudes=attitudes, order=order, rate=rate, hold=hold, move=move, noise=noise, unit=unit,
-        gravity=gravity, knock=knock, seed=seed,
+        gravity=gravity, knock=knock, field=field, dip=dip, seed=seed,
     )  # fmt: skip
     write(recording, output)
     print(f"{output}: {len(recording)} samples, {attitudes} attitudes, serial {recording.metadata['serial']}")
@@ -211,6 +226,53 @@ def _of_gyroscopes(record: Calibration, accelerometers: str) -> str:
             *aligned(table.columns, rows),
         ]
     )
+
+
+@with_options((_OF_THE_TRIAD, *GRAVITY[1:], *READ))
+def mag(
+    file: RecordingFile,
+    *,
+    accel: Annotated[
+        str | None,
+        typer.Option(
+            "--accel", metavar="RECORD", help="Tumble record of the accelerometers; of another test: a prior."
+        ),
+    ] = None,
+    same_direction: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--same-direction", metavar="A-B", help="Attitudes in which one axis points the same way; repeatable."
+        ),
+    ] = None,
+    field: Annotated[
+        str | None, typer.Option(metavar="48.2uT", help="Magnitude of the local field, uT; without it the field is 1.")
+    ] = None,
+    loss: Annotated[
+        str, one_of(LOSSES, "auto: set disturbed attitudes aside and name them; square: keep all; huber: limit them.")
+    ] = "auto",
+    mag_order: Annotated[str, one_of(MAG_ORDERS, "2: quadratic terms too; auto: where they predict.")] = "1",
+    drop: Annotated[list[str] | None, typer.Option(metavar="N", help="Attitude to leave out; repeatable.")] = None,
+    hemisphere: Annotated[str | None, one_of(HEMISPHERES, "To check the sign of the dip.")] = None,
+    order: Annotated[str, typer.Option(help="Order of the accelerometers' model, auto or 1 to 5.")] = "auto",
+    options: dict[str, str | None],
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Calibrate a magnetometer triad in the accelerometers' frame from the same attitudes, into one record of both."""
+    from imulab.gravity import gravity_option
+    from imulab.procedures.loading import load
+    from imulab.procedures.tumble.mag.fit import fit_mag
+
+    check_outputs([output, report], [name for name in (file, accel, options["layout"]) if name])
+    known = None if accel is None else load(accel)
+    local = gravity_option(options["gravity"], options["latitude"], options["height"], FLAG)
+    found = call(
+        fit_mag, read_recording(file, **reading(options)), accel=known, same_direction=tuple(same_direction or ()),
+        field=field, loss=loss, mag_order=mag_order, drop=tuple(drop or ()), hemisphere=hemisphere, gravity=local,
+        order=order,
+    )  # fmt: skip
+    finish(found.calibration, output, report, json=json)
 
 
 @with_options((_OF_THE_RECORD, *GRAVITY[1:], *READ))

@@ -160,6 +160,25 @@ static PyObject *gyro(PyObject *self, PyObject *args) {
     return result;
 }
 
+static PyObject *mag(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *capsule, *outputs, *fields, *result = NULL;
+    buffers b = {.count = 0};
+    il_real *in[3], *out[3];
+    Py_ssize_t n = -1;
+    if (!PyArg_ParseTuple(args, "OOO", &capsule, &outputs, &fields)) return NULL;
+    il_unit *unit = unit_of(capsule, IL_HAS_MAG);
+    if (unit != NULL && columns_of(&b, outputs, 3, &n, 0, 0, in) && columns_of(&b, fields, 3, &n, 1, 0, out)) {
+        unsigned flags;
+        Py_BEGIN_ALLOW_THREADS
+        flags = il_mag_block(&unit->mag, (size_t)n, READ(in), 1, out, 1);
+        Py_END_ALLOW_THREADS
+        result = PyLong_FromUnsignedLong(flags);
+    }
+    release(&b);
+    return result;
+}
+
 static PyObject *centrifuge(PyObject *self, PyObject *args) {
     (void)self;
     PyObject *capsule, *forces, *rates, *result = NULL;
@@ -267,6 +286,7 @@ MODULE(_runtime, "The C core of imulab.",
        {"has", has, METH_O, "has(unit): bits of the sections that a table holds."},
        {"tumble", tumble, METH_VARARGS, "tumble(unit, outputs, forces): flags; tuples of three float64 columns."},
        {"gyro", gyro, METH_VARARGS, "gyro(unit, outputs, forces or None, rates): flags."},
+       {"mag", mag, METH_VARARGS, "mag(unit, outputs, fields): flags."},
        {"centrifuge", centrifuge, METH_VARARGS, "centrifuge(unit, forces, rates): flags; rates are changed in place."},
        {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, inputs, factors, outputs): whether the table covers it."},
        {"array_start", array_start, METH_O, "array_start(unit): the state of a stream, as a bytearray."},

@@ -57,6 +57,7 @@ class _Array(Part):
 _COLUMNS: dict[str, type[Part]] = {
     "tumble": _Triad,
     "gyro": _Triad,
+    "mag": _Triad,
     "centrifuge": _Centrifuge,
     "warmup": _Warmup,
     "array": _Array,

@@ -62,6 +62,11 @@ class DeviceUnit:
         under = None if force is None else _columns(force)
         return rate, _runtime.gyro(self._unit, _columns(output), under, tuple(rate))
 
+    def mag(self, output: Sequence[Array]) -> tuple[list[Array], int]:
+        """Return the field, T or parts of the local one, of three columns of outputs, each (n,), and the flags met."""
+        field = [np.empty(len(output[0])) for _ in range(3)]
+        return field, _runtime.mag(self._unit, _columns(output), tuple(field))
+
     def centrifuge(self, force: Sequence[Array], rate: Sequence[Array | None]) -> tuple[list[Array | None], int]:
         """Return the rates of the x and y input axes, rad/s, less their drift under the level specific force, m/s^2."""
         out = [None if column is None else np.array(column, dtype=np.float64) for column in rate]

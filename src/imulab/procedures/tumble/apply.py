@@ -20,6 +20,7 @@ from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_uni
 _FAR = 2.0
 _ACCEL = triad("accel")
 _GYRO = triad("gyro")
+_MAG = triad("mag")
 
 
 def apply_tumble(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -65,6 +66,23 @@ def apply_gyro(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recordin
     return recording.with_columns(
         {name: from_si(values, kept_unit) for name, values in zip(_GYRO, rate, strict=True)},
         dict.fromkeys(_GYRO, kept_unit),
+    )
+
+
+def apply_mag(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+    """Return the recording with mag_* as the field in the body frame: uT, or parts of the local field (unit 1).
+
+    Raises
+    ------
+    UnitError
+        The columns' unit cannot be converted to the record's.
+    DataError
+        The recording has no magnetometer triad.
+    """
+    field, _ = unit.mag(_outputs(recording, "mag", str(columns["output_unit"])))
+    known = "uT" if columns["field_unit"] == "T" else "1"
+    return recording.with_columns(
+        {name: from_si(values, known) for name, values in zip(_MAG, field, strict=True)}, dict.fromkeys(_MAG, known)
     )
 
 

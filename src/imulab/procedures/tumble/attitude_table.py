@@ -20,7 +20,7 @@ def attitude_table(
     recording: Recording, sensor: str, names: list[str], unit: str, temperature: float | None
 ) -> Attitudes:
     """Return the rows of a table as attitudes; a row that repeats an earlier one exactly is not measured again."""
-    mean, covariance = recording.triad(sensor), _stated_covariance(recording, names, unit)
+    mean, covariance = recording.triad(sensor), stated_covariance(recording, names, unit)
     kept = np.sort(np.unique(mean, axis=0, return_index=True)[1])
     row = (kept + recording.first_row).astype(np.float64)
     notes = [_NO_TIME.format(len(recording))] if len(recording) > _LONG_TABLE else []
@@ -44,7 +44,7 @@ def attitude_table(
     )
 
 
-def _stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:
+def stated_covariance(recording: Recording, names: list[str], unit: str) -> Array | None:
     """Covariances from the ``std_*`` columns of a table, in the unit of the means, or None."""
     long, short = [f"std_{name}" for name in names], [f"std_{name[-1]}" for name in names]
     stated = short if any(name in recording for name in short) else long

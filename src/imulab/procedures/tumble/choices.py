@@ -12,3 +12,5 @@ STARTS = ("sphere", "fixture:15", "head:15")
 """Where attitudes may lie, with steps of any number of degrees."""
 SENSITIVITIES = ("auto", "yes", "no")
 CLOCKS = ("gyro", "accel")
+MAG_ORDERS = ("1", "2", "auto")
+HEMISPHERES = ("north", "south")

@@ -22,7 +22,7 @@ _VECTORS = 64
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
-    """Return the tables of a tumble record: accelerometers, and gyroscopes where it has them.
+    """Return the tables of a tumble record: accelerometers, and gyroscopes and magnetometers where it has them.
 
     Raises
     ------
@@ -57,7 +57,11 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
         ),
         {"output_unit": output},
     )
-    return (table, *_gyro(record)) if "gyro_bias_x" in record.parameters else (table,)
+    return (
+        table,
+        *(_gyro(record) if "gyro_bias_x" in record.parameters else ()),
+        *(_mag(record) if "mag_bias_x" in record.parameters else ()),
+    )
 
 
 def _gyro(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -76,6 +80,46 @@ def _gyro(record: Calibration) -> tuple[DeviceTable, ...]:
         g = [[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES]
         fields.append(Field("sensitivity", np.array(g)))
     return (DeviceTable("gyro", tuple(fields), {"output_unit": model_of(record).gyro_output_unit}),)
+
+
+def _mag(record: Calibration) -> tuple[DeviceTable, ...]:
+    """Magnetometers: ``m = T^-1 s`` with s of each output, whose signs and places are in ``T^-1 P``."""
+    model = model_of(record)
+    if model.mag_order not in (1, 2):
+        raise RecordError(f"the record has mag_order {model.mag_order!r}, expected 1 or 2")
+    axes = mag_axes(model.mag_axes)
+    scale = np.array([record.value(f"mag_scale_factor_{axis}") for axis in _AXES])
+    bias = np.array([record.value(f"mag_bias_{axis}") for axis in _AXES])
+    misalignment = np.eye(3)
+    for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
+        misalignment[i, j] = record.value(f"mag_misalignment_{_AXES[i]}{_AXES[j]}")
+    fields = [
+        Field("order", whole(model.mag_order)),
+        Field("gain", np.abs(axes).T @ (1.0 / nonzero(scale))),
+        Field("bias", axes.T @ bias),
+        Field("turn", np.linalg.inv(misalignment) @ axes),
+    ]
+    if model.mag_order == 2:
+        fields.append(Field("quadratic", axes.T @ np.array([record.value(f"mag_k2_{axis}") for axis in _AXES])))
+    unit = "T" if model.field is not None and model.field.unit == "T" else "1"
+    return (DeviceTable("mag", tuple(fields), {"output_unit": model.mag_output_unit, "field_unit": unit}),)
+
+
+def mag_axes(text: str) -> Array:
+    """Return the signed permutation of ``"+y -x +z"``, shape (3, 3): row k names the output that becomes axis k.
+
+    Raises
+    ------
+    RecordError
+        It names no axis, or one twice.
+    """
+    named = np.zeros((3, 3))
+    for axis, word in enumerate(text.split()[:3]):
+        if len(word) == 2 and word[0] in "+-" and word[1] in _AXES:
+            named[axis, _AXES.index(word[1])] = 1.0 if word[0] == "+" else -1.0
+    if len(text.split()) != 3 or (np.abs(named).sum(axis=0) != 1).any() or (np.abs(named).sum(axis=1) != 1).any():
+        raise RecordError(f"the record has mag_axes {text!r}, expected three such as '+y -x +z'")
+    return named
 
 
 def monotone_range(nonlinearity: Array) -> tuple[float, float]:
@@ -109,3 +153,12 @@ def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str,
     output[1, 2] = np.nan
     rate, _ = DeviceUnit.of(table).gyro(list(output.T), list(force.T))
     return {"": _VECTORS, "scale": 5.0, "output": output, "force": force, "rate": np.column_stack(rate)}
+
+
+def golden_magnetometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
+    """Return outputs of fields up to twice the local one, and those fields."""
+    size = 1e-4 if table.columns["field_unit"] == "T" else 2.0
+    output = (rng.uniform(-size, size, (_VECTORS, 3)) + field_of(table, "bias")) / field_of(table, "gain")
+    output[1, 0] = np.nan
+    field, _ = DeviceUnit.of(table).mag(list(output.T))
+    return {"": _VECTORS, "scale": size, "output": output, "field": np.column_stack(field)}

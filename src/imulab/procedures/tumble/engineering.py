@@ -22,9 +22,11 @@ class EngineeringRow(Row):
     """One parameter as people read it.
 
     `given_order` is the standard uncertainty if the order chosen from the data is right, None where none was chosen.
+    `interval` is the 95 % interval where the parameter has one of its own.
     """
 
     given_order: float | None = None
+    interval: tuple[float, float] | None = None
 
     def text(self) -> tuple[str, str]:
         """Return value and uncertainty as text."""
@@ -87,6 +89,7 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
                 _scaled(parameter.standard_uncertainty, factor),
                 unit,
                 _scaled(parameter.standard_uncertainty_given_order, factor),
+                _interval(parameter.interval_95, factor, offset),
             )
         )
         if stem == "bias" and axis == "z":
@@ -96,6 +99,13 @@ def engineering_rows(record: Calibration) -> list[EngineeringRow]:
     return rows
 
 
+def _interval(ends: tuple[float, float] | None, factor: float, offset: float) -> tuple[float, float] | None:
+    if ends is None:
+        return None
+    low, high = sorted(end * factor + offset for end in ends)
+    return low, high
+
+
 def _scaled(uncertainty: float | None, factor: float) -> float | None:
     return None if uncertainty is None else uncertainty * abs(factor)
 
@@ -103,6 +113,8 @@ def _scaled(uncertainty: float | None, factor: float) -> float | None:
 def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float, float, str]:
     """Factor, offset and unit that turn a parameter of either triad into engineering units."""
     stem = name.rpartition("_")[0]
+    if stem.startswith("mag_") or name == "dip":
+        return _of_field(stem or name, unit)
     if not stem.startswith("gyro_"):
         return _engineering(stem, output, physical)
     if stem == "gyro_bias":
@@ -115,6 +127,20 @@ def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float
     if stem == "gyro_misalignment":
         return 1e3, 0.0, "mrad"
     return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
+
+
+def _of_field(stem: str, unit: str) -> tuple[float, float, str]:
+    """Factor, offset and unit of a magnetometers' parameter, or of the dip."""
+    if stem in ("dip", "mag_misalignment"):
+        return (from_si(1.0, "deg"), 0.0, "deg") if stem == "dip" else (1e3, 0.0, "mrad")
+    if stem == "mag_bias":
+        return (1e6, 0.0, "uT") if unit == "T" else (1.0, 0.0, "of the field")
+    if stem == "mag_scale_factor" and unit.endswith("/T"):
+        sensed = unit.removesuffix("/T")
+        if parse_unit(sensed).quantity == "magnetic field":
+            return 1e6 / from_si(1.0, sensed), -1e6, _OFF_NOMINAL
+        return 1e-6, 0.0, f"{sensed}/uT"
+    return 1.0, 0.0, unit
 
 
 def _engineering(stem: str, output: str, physical: bool) -> tuple[float, float, str]:

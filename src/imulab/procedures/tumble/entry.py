@@ -29,6 +29,12 @@ ENTRY = Procedure(
             apply=deferred(f"{_HERE}.apply:apply_gyro"),
             triad="gyro",
         ),
+        Section(
+            "mag",
+            golden=deferred(f"{_HERE}.device:golden_magnetometers"),
+            apply=deferred(f"{_HERE}.apply:apply_mag"),
+            triad="mag",
+        ),
     ),
     rows=deferred(f"{_HERE}.engineering:engineering_rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),

@@ -8,6 +8,7 @@ import numpy as np
 
 from imulab.estimation.ranked import median
 from imulab.procedures.tumble.engineering import micro_g, small_g
+from imulab.procedures.tumble.mag.figures import mag_facts, mag_figures, mag_headline
 from imulab.procedures.tumble.model import AXES
 from imulab.procedures.tumble.sections import (
     HeldAttitudes,
@@ -59,9 +60,14 @@ def exhibits(record: Calibration) -> Exhibits:
         items.append(_turns(held.gyro, gyro_of(record).set_aside))
     if record.covariance.names:
         items.append(_correlation(record))
+    if held.mag is not None:
+        items[1:1] = mag_figures(record)
+        facts += mag_facts(record)
     aside = f"; {bad} more {'was' if bad == 1 else 'were'} {_held_back(record)}" if bad else ""
     if fit.gyro is not None:
         aside += f"; {gyro_headline(record)}"
+    if fit.mag is not None:
+        aside += f"; {mag_headline(record)}"
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
         f"{small_g(_rms(used))} rms (before: {small_g(_rms(data.residual_before))}){aside}.",

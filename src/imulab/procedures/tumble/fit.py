@@ -163,7 +163,7 @@ def fit_tumble(
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(gravity, attitudes.recording)
     check_attitudes(attitudes, local.value)
-    scaling = _scaling(attitudes, local.value)
+    scaling = nominal_scaling(attitudes, local.value)
     known = None if prior is None else as_record(prior, "fit_tumble: prior")
     if known is not None:
         order = _prior_order(known, order, attitudes)
@@ -172,7 +172,7 @@ def fit_tumble(
         rest = SOURCE_THRESHOLD
         if threshold is not None:
             rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
-    estimate = _estimate(
+    estimate = estimate_triad(
         attitudes, local, scaling, order, loss, rest,
         nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross,
     )  # fmt: skip
@@ -202,18 +202,18 @@ def fit_tumble(
     )
 
 
-def _estimate(
+def estimate_triad(
     attitudes: Attitudes,
     gravity: Gravity,
     scaling: Scaling,
     order: int | str,
-    loss: str,
-    rest: Threshold | None,
+    loss: str = "auto",
+    rest: Threshold | None = None,
     *,
-    nonlinearity: tuple[float, float] | None,
-    prior: Calibration | None,
-    ageing: Sequence[float],
-    cross: bool,
+    nonlinearity: tuple[float, float] | None = None,
+    prior: Calibration | None = None,
+    ageing: Sequence[float] = (),
+    cross: bool = False,
 ) -> Estimate:
     """Set attitudes aside, choose the order, solve, and state the uncertainty; `rest` is that of method linearised."""
     every = _problem(attitudes, scaling, robust=loss == "huber")
@@ -322,7 +322,7 @@ def _scaled_ageing(ageing: Sequence[float], gravity: float) -> tuple[float | Non
     return (*known, *[None] * (len(GROUPS) - len(known)))
 
 
-def _scaling(attitudes: Attitudes, gravity: float) -> Scaling:
+def nominal_scaling(attitudes: Attitudes, gravity: float) -> Scaling:
     """Nominal sensor: by its unit, or for counts and volts from the span of each axis."""
     unit = parse_unit(attitudes.unit)
     if unit.quantity == "acceleration":

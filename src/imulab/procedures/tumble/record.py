@@ -116,7 +116,7 @@ def _parameters(
     """Return the parameters in SI, their covariance, (p, p), and what of it they share through gravity, (p,)."""
     g, order, cross, stated = gravity.value, estimate.problem.order, estimate.problem.cross, estimate.stated
     names, units = parameter_names(order, cross), parameter_units(order, estimate.attitudes.unit, cross)
-    values, derivative = _to_si(estimate.solution.theta[0], scaling, g, order)
+    values, derivative = si_parameters(estimate.solution.theta[0], scaling, g, order)
     shared = (not estimate.with_gravity) * gravity.standard_uncertainty / g * gravity_slope(values, order)
     matrix = None if stated is None else derivative @ stated.covariance @ derivative.T + np.outer(shared, shared)
     uncertainty: list[float | None] = [None] * len(names)
@@ -228,10 +228,10 @@ def scaled_parameters(values: Array, scaling: Scaling, g: float) -> Array:
 
 def si_derivative(theta: Array, scaling: Scaling, g: float) -> Array:
     """Return the derivatives of the parameters in SI by the scaled ones, shape (p, p)."""
-    return _to_si(theta, scaling, g, len(theta) // 3 - 2)[1]
+    return si_parameters(theta, scaling, g, len(theta) // 3 - 2)[1]
 
 
-def _to_si(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
+def si_parameters(theta: Array, scaling: Scaling, g: float, order: int) -> tuple[Array, Array]:
     """Return the parameter vector in SI and its derivative with respect to theta, shape (p, p)."""
     values = _si_values(theta[None], scaling, g, order)[0]
     bias, scale_factor, sigma = values[:3], values[3:6], theta[3:6]

@@ -13,6 +13,7 @@ T = TypeVar("T")
 PerAttitude = Annotated[list[T], "attitudes"]
 PerSample = Annotated[list[T], "trace"]
 PerTurn = Annotated[list[T], "turns"]
+PerField = Annotated[list[T], "fields"]
 Three = Annotated[list[T], 3]
 
 
@@ -31,6 +32,10 @@ class Model(Part):
     order: int
     output_unit: str
     gyro_output_unit: str
+    mag_output_unit: str
+    mag_order: int = 1
+    mag_axes: str = "+x +y +z"
+    field: Quantity | None = None
     gravity: StatedGravity
     gauge: str
     cross: bool = False
@@ -97,6 +102,35 @@ class GyroFit(Part):
     set_aside: list[TurnAside] = field(default_factory=list)
 
 
+class Agreement(Part):
+    """How well |m| (as a part of the field) or the dip (rad) agree over the attitudes."""
+
+    rms: Size
+    leave_one_out: Size
+
+
+class Heading(Part):
+    """``fit.mag.heading``: standard uncertainty from the parameters, and of one reading, rad."""
+
+    standard_uncertainty: Length
+    of_one_reading: Length
+
+
+class MagFit(Part):
+    """``fit.mag``."""
+
+    attitudes: int
+    magnitude: Agreement
+    dip: Agreement
+    noise: str
+    sigma_magnitude: Size
+    sigma_dip: Length
+    condition_number: float
+    set_aside: list[int] = field(default_factory=list)
+    heading: Heading
+    moved: dict[str, float]
+
+
 class Fit(Part):
     """``fit``."""
 
@@ -119,6 +153,7 @@ class Fit(Part):
     monte_carlo: Trials | None = None
     prior: Prior | None = None
     gyro: GyroFit | None = None
+    mag: MagFit | None = None
 
     @property
     def freedom(self) -> float | None:
@@ -168,12 +203,29 @@ class Turns(Part):
     residual: PerTurn[float]
 
 
+class Fields(Part):
+    """``data.mag``: of each attitude its number, output, field and specific force (of length 1), and what is left.
+
+    `magnitude` is |m| less that of the field, as a part of it; `dip` is in rad.
+    """
+
+    number: PerField[int]
+    label: PerField[str]
+    mean: PerField[Three[float]]
+    field: PerField[Three[float]]
+    force: PerField[Three[float]]
+    magnitude: PerField[float]
+    dip: PerField[float]
+    used: PerField[bool]
+
+
 class Data(Part):
     """``data``."""
 
     attitudes: HeldAttitudes | None = None
     trace: Trace | None = None
     gyro: Turns | None = None
+    mag: Fields | None = None
 
 
 class Tumble(Part):

@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.errors import OptionError
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
+from imulab.procedures.tumble.mag.simulate import Turns, rotate, simulate_field
 from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
@@ -28,13 +29,14 @@ _PER_G = {"V": 1.0, "mV": 1000.0, "A": 0.001, "mA": 1.0}
 
 @dataclass(frozen=True)
 class _Path:
-    """Attitude over time: the upward direction and the rate in the body frame, shape (n, 3), and the hold."""
+    """Attitude over time: the upward direction and the rate in the body frame, shape (n, 3), hold and turns."""
 
     time: Array
     upward: Array
     rate: Array
     hold: np.ndarray
     since_hold: Array
+    turns: Turns
 
 
 def simulate_tumble(
@@ -52,6 +54,8 @@ def simulate_tumble(
     knock: int | str | None = None,
     knock_shift: float = 5e-3 * STANDARD_GRAVITY,
     gyro: bool = True,
+    field: float | str | None = None,
+    dip: float | str = "67 deg",
     temperature: float = 24.0,
     seed: int | str = 1,
 ) -> Recording:
@@ -86,6 +90,8 @@ def simulate_tumble(
         That shift, along the vertical, m/s^2.
     gyro
         Whether the recording has gyroscope columns.
+    field, dip
+        Magnitude of the magnetic field, T, and its dip, rad, for columns mag_*; none without a field.
     temperature
         degC.
     seed
@@ -138,6 +144,12 @@ def simulate_tumble(
         sensor |= gyro_truth
         columns |= {f"gyro_{a}": rates[:, i].copy() for i, a in enumerate("xyz")}
         units |= {f"gyro_{a}": "deg/s" for a in "xyz"}
+    if field is not None:
+        magnitude, sloped = in_si(field, "field", "magnetic field", "uT"), in_si(dip, "dip", "angle", "deg")
+        outputs, mag_truth = simulate_field(path.turns, directions[0], magnitude, sloped, seed)
+        sensor |= mag_truth
+        columns |= {f"mag_{a}": outputs[:, i].copy() for i, a in enumerate("xyz")}
+        units |= {f"mag_{a}": "uT" for a in "xyz"}
     columns["temperature"] = np.round(temperature + 0.05 * rng.standard_normal(len(path.time)), 2)
     columns |= {f"truth_accel_{a}": force[:, i].copy() for i, a in enumerate("xyz")}
     units |= {"temperature": "degC"} | {f"truth_accel_{a}": "m/s^2" for a in "xyz"}
@@ -220,15 +232,17 @@ def _path(directions: Array, sample_rate: float, hold: float, move: float, rng: 
     angle = tau**3 * (10 - 15 * tau + 6 * tau**2)
     speed = 30 * tau**2 * (1 - tau) ** 2 * sample_rate / (moving + 1)
     axis, full = _turns(directions, rng)
-    axis, full = np.vstack([axis, axis[-1:]])[number], np.append(full, 0.0)[number]
+    turns = Turns(np.vstack([axis, axis[-1:]]), np.append(full, 0.0), number, angle)
+    axis, full = turns.axis[number], turns.full[number]
     # The body turns by +angle about the axis, so that the upward direction turns by -angle in its frame.
-    turned = _rotate(directions[number], axis, -full * angle)
+    turned = rotate(directions[number], axis, -full * angle)
     return _Path(
         time=index / sample_rate,
         upward=turned,
         rate=axis * (full * speed)[:, None],
         hold=np.where(phase < resting, number, -1),
         since_hold=phase / sample_rate,
+        turns=turns,
     )
 
 
@@ -249,14 +263,6 @@ def _unit(vectors: Array, instead: list[float]) -> Array:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     unit: Array = np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), instead)
     return unit
-
-
-def _rotate(vectors: Array, axis: Array, angle: Array) -> Array:
-    """Rodrigues' rotation of each vector about its axis."""
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    along = axis * np.einsum("ni,ni->n", axis, vectors)[:, None]
-    turned: Array = vectors * cosine + np.cross(axis, vectors) * sine + along * (1 - cosine)
-    return turned
 
 
 def _disturbances(path: _Path, hold: float, knock: int | None, rng: np.random.Generator) -> Array:

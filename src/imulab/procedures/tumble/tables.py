@@ -36,7 +36,9 @@ def parameters_table(record: Calibration) -> ReportTable:
         factor = factors[row.name.startswith("gyro_")]
         value, uncertainty = row.text()
         interval = "not stated"
-        if row.standard_uncertainty is not None and factor is not None:
+        if row.interval is not None and row.standard_uncertainty is not None:
+            interval = " to ".join(format_uncertain(end, row.standard_uncertainty)[0] for end in row.interval)
+        elif row.standard_uncertainty is not None and factor is not None:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
         given = [] if fit.blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]

@@ -1,0 +1,156 @@
+"""The magnetometers in the attitudes that the accelerometers found: means, and how certain they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.columns import triad
+from imulab.errors import DataError
+from imulab.estimation.rows import leave_out
+from imulab.procedures.tumble.attitude_table import stated_covariance
+from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes
+from imulab.recording import Array, Recording, check_finite
+from imulab.units import parse_unit
+
+FEWEST = 10
+_BATCHES = 8
+_DEAD = 1e-3
+_CLIPPED = 0.3
+"""Share of the attitudes at one extreme of an axis from which it is taken for saturated."""
+_FLAT = 0.05
+_FIELDS = (5e-6, 2e-4)
+"""Magnitudes that the field can have near the Earth's surface, T: from a quarter of the least to thrice the most."""
+
+
+@dataclass(frozen=True)
+class FieldMeans:
+    """Outputs of the magnetometers in each attitude.
+
+    `mean` has shape (n, 3), `covariance` (n, 3, 3), or None for a table that does not state it; `unit` is that of the
+    columns, `notes` what was left out.
+    """
+
+    mean: Array
+    covariance: Array | None
+    unit: str
+    notes: tuple[str, ...] = ()
+
+
+def field_means(attitudes: Attitudes) -> FieldMeans:
+    """Return the magnetometers' outputs in attitudes of a recording that has them.
+
+    Raises
+    ------
+    DataError
+        No such columns, a constant or saturated axis, outputs in one plane, too few attitudes.
+    UnitError
+        The columns have different units.
+    """
+    recording = attitudes.recording
+    names = triad("mag")
+    missing = [name for name in names if name not in recording]
+    if missing:
+        raise DataError(
+            f"{recording.name}: no column {' '.join(missing)}; expected mag_x mag_y mag_z beside accel_x accel_y "
+            "accel_z, in the same attitudes"
+        )
+    unit = recording.triad_unit("mag")
+    if parse_unit(unit).quantity not in ("magnetic field", "output", "number"):
+        raise DataError(
+            f"{recording.name}: columns {' '.join(names)}: expected a unit of field or output such as uT, mgauss or "
+            f"count, found {unit!r}"
+        )
+    check_finite(recording, names)
+    if attitudes.pieces is None and attitudes.trace is None:
+        found = _of_table(attitudes, recording, names, unit)
+    else:
+        found = _of_stretches(attitudes, recording, names, unit)
+    _check(found, attitudes, names)
+    return found
+
+
+def _of_table(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
+    rows = attitudes.start.astype(np.int64) - recording.first_row
+    covariance = stated_covariance(recording, names, unit)
+    return FieldMeans(recording.triad("mag")[rows], None if covariance is None else covariance[rows], unit)
+
+
+def _of_stretches(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
+    """Means over the stretches at rest, and their covariance from batches, shrunk towards what all have in common."""
+    left_out = leave_out(recording, names)
+    samples = left_out.recording.triad("mag")
+    pieces = attitudes.pieces
+    assert pieces is not None
+    mean, own = np.empty((len(attitudes), 3)), np.empty((len(attitudes), 3, 3))
+    rest = np.zeros(len(samples), dtype=np.bool_)
+    for number in range(len(attitudes)):
+        index = np.concatenate([np.arange(a, b) for a, b, at in pieces.tolist() if at == number])
+        rest[index] = True
+        mean[number] = samples[index].mean(axis=0)
+        batches = np.array([samples[part].mean(axis=0) for part in np.array_split(index, min(_BATCHES, len(index)))])
+        own[number] = np.cov(batches.T) / len(batches)
+    freedom = _BATCHES - 1.0
+    level = np.trace(own, axis1=1, axis2=2)
+    usual = level <= 3 * np.median(level)
+    covariance = (freedom * own + POOL_DEGREES * own[usual].mean(axis=0)) / (freedom + POOL_DEGREES)
+    step = np.array([_step(samples[rest, axis]) for axis in range(3)])
+    covariance[:, range(3), range(3)] += np.where(
+        covariance[:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
+    )
+    return FieldMeans(mean, covariance, unit, tuple(left_out.notes(rest)))
+
+
+def _step(values: Array) -> float:
+    """Smallest step between the values of a channel, 0 for one value."""
+    different = np.unique(values)
+    return float(np.diff(different).min()) if len(different) > 1 else 0.0
+
+
+def _check(found: FieldMeans, attitudes: Attitudes, names: list[str]) -> None:
+    name, n = attitudes.recording.name, len(attitudes)
+    if n < FEWEST:
+        raise DataError(f"{name}: {n} attitudes; a magnetometer needs {FEWEST} or more, better 16, at several headings")
+    span = np.ptp(found.mean, axis=0)
+    for axis, column in enumerate(names):
+        values = found.mean[:, axis]
+        if span[axis] <= _DEAD * span.max():
+            raise DataError(
+                f"{name}: column {column}: the output changes by {span[axis]:.3g} {found.unit} over the {n} attitudes, "
+                f"other axes by {span.max():.3g} {found.unit}: a dead axis?"
+            )
+        for extreme, word in ((values.max(), "largest"), (values.min(), "smallest")):
+            at = np.isclose(values, extreme, rtol=0, atol=1e-6 * span[axis])
+            if at.sum() > max(2, _CLIPPED * n):
+                raise DataError(
+                    f"{name}: column {column}: {int(at.sum())} of {n} attitudes have the {word} output, "
+                    f"{extreme:.6g} {found.unit}: the axis is saturated; expected a wider range, or less iron near"
+                )
+    flat = np.linalg.svd(found.mean - found.mean.mean(axis=0), compute_uv=False)
+    if flat[2] < _FLAT * flat[0]:
+        raise DataError(
+            f"{name}: the outputs of {' '.join(names)} lie in one plane over the {n} attitudes (spread across it "
+            f"{100 * flat[2] / flat[0]:.1f} % of that along it); turn the unit about two axes"
+        )
+
+
+def check_magnitude(length: float, unit: str, name: str, field: float | None) -> None:
+    """Check that the magnitude that the outputs turn through, in the columns' unit, can be that of the field, T.
+
+    Raises
+    ------
+    DataError
+        The unit is one of field, and the magnitude is off by a factor of 2 of what was stated, or nowhere on Earth.
+    """
+    known = parse_unit(unit)
+    if known.quantity != "magnetic field":
+        return
+    found = length * known.factor
+    low, high = (field / 2, 2 * field) if field is not None else _FIELDS
+    if not low <= found <= high:
+        expected = f"{1e6 * field:.4g} uT" if field is not None else "25 to 65 uT on Earth"
+        raise DataError(
+            f"{name}: columns mag_x mag_y mag_z: the field turns through {length:.4g} {unit} ({1e6 * found:.4g} uT), "
+            f"expected {expected}: is the unit wrong?"
+        )

@@ -1,0 +1,122 @@
+"""The figures of a magnetometer triad, from the record alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from imulab.procedures.tumble.sections import Fields, MagFit, data_of, fit_of, model_of
+from imulab.records.calibration import Calibration
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Figure, plain_number
+from imulab.report.traces import axis, rounded, scatter
+
+_LABEL = "%{text}<extra></extra>"
+_PLANES = (("x", "y"), ("y", "z"), ("z", "x"))
+
+
+def mag_headline(record: Calibration) -> str:
+    """Return the result for the magnetometer triad, without a point."""
+    fit = _fit(record)
+    heading = np.degrees(fit.heading.standard_uncertainty.value)
+    return (
+        f"the field of {fit.attitudes} attitudes has one magnitude within {100 * fit.magnitude.rms:.2g} % rms and one "
+        f"dip within {np.degrees(fit.dip.rms):.2g} deg rms: magnetic heading is known to {heading:.2g} deg"
+    )
+
+
+def mag_facts(record: Calibration) -> list[tuple[str, str]]:
+    """Return what the report says of the magnetometers first."""
+    fit = _fit(record)
+    return [
+        ("dip", f"{plain_number(float(np.degrees(record.value('dip'))), 4)} deg"),
+        ("|m|, leave-one-out", f"{plain_number(100 * fit.magnitude.leave_one_out, 2)} %"),
+        ("u(heading)", f"{plain_number(float(np.degrees(fit.heading.standard_uncertainty.value)), 2)} deg"),
+    ]
+
+
+def mag_figures(record: Calibration) -> list[Figure]:
+    """Return residuals of |m| and dip, and the sphere before and after."""
+    data = data_of(record).mag
+    assert data is not None
+    return [_residuals(record, data), _sphere(record, data)]
+
+
+def _fit(record: Calibration) -> MagFit:
+    fit = fit_of(record).mag
+    assert fit is not None
+    return fit
+
+
+def _residuals(record: Calibration, data: Fields) -> Figure:
+    magnitude, dip = 100 * np.array(data.magnitude), np.degrees(data.dip)
+    used = np.array(data.used)
+    colours = [GOOD if one else BAD for one in data.used]
+    shapes = ["circle" if one else "diamond" for one in data.used]
+    worst = int(np.argmax(np.where(used, np.abs(dip), -1.0)))
+    fit = _fit(record)
+    aside = f" Red diamonds were set aside: {', '.join(map(str, fit.set_aside))}." if fit.set_aside else ""
+    marker = {"color": colours, "symbol": shapes, "size": 8}
+    texts = [f"{label}" for label in data.label]
+    return Figure(
+        title="Residual magnitude and dip of each attitude",
+        message=f"The dip of attitude {data.number[worst]} is off most: {dip[worst]:+.2g} deg; rms "
+        f"{_rms(dip[used]):.2g} deg, and {_rms(magnitude[used]):.2g} % of the field.",
+        caption="Above: |m| less the field's magnitude, in per cent. Below: dip of each attitude less the common dip. "
+        f"A disturbance such as iron near shows in both, a unit that moved in the dip alone.{aside}",
+        traces=[
+            scatter(data.number, rounded(magnitude), "markers", marker=marker, text=texts, xaxis="x", yaxis="y2",
+                    hovertemplate="%{text}<br>%{y:+.2f} %<extra></extra>", name="|m|"),
+            scatter(data.number, rounded(dip), "markers", marker=marker, text=texts, xaxis="x", yaxis="y",
+                    hovertemplate="%{text}<br>%{y:+.2f} deg<extra></extra>", name="dip"),
+        ],
+        layout={
+            "xaxis": axis("attitude", dtick=max(1, round(len(data.number) / 20)), anchor="y"),
+            "yaxis": axis("dip, deg", domain=[0, 0.46], zeroline=True),
+            "yaxis2": axis("|m|, %", domain=[0.54, 1], zeroline=True),
+            "showlegend": False,
+        },
+        height=460,
+    )  # fmt: skip
+
+
+def _sphere(record: Calibration, data: Fields) -> Figure:
+    """Return outputs, scaled and renamed only, and the field after calibration, in three planes."""
+    from imulab.procedures.tumble.device import mag_axes
+
+    output = np.array(data.mean) @ mag_axes(model_of(record).mag_axes).T
+    scale = abs(np.array([record.value(f"mag_scale_factor_{a}") for a in "xyz"])).mean()
+    length = record.model["field"]["value"]
+    before, after = output / scale / length, np.array(data.field)
+    circle = np.linspace(0, 2 * np.pi, 91)
+    reach = 1.08 * max(1.0, float(np.abs(before).max()))
+    traces, layout = [], {}
+    for place, (first, second) in enumerate(_PLANES):
+        number = "" if place == 0 else str(place + 1)
+        axes = {"xaxis": f"x{number}", "yaxis": f"y{number}"}
+        i, j = "xyz".index(first), "xyz".index(second)
+        shown = place == 0
+        traces += [
+            scatter(rounded(np.cos(circle)), rounded(np.sin(circle)), "lines", line={"color": INK, "width": 1},
+                    hoverinfo="skip", name="the field's magnitude", showlegend=shown, **axes),
+            scatter(rounded(before[:, i]), rounded(before[:, j]), "markers", name="as measured", showlegend=shown,
+                    marker={"color": QUIET, "symbol": "x", "size": 7}, text=data.label, hovertemplate=_LABEL, **axes),
+            scatter(rounded(after[:, i]), rounded(after[:, j]), "markers", name="calibrated", showlegend=shown,
+                    marker={"color": GOOD, "size": 7}, text=data.label, hovertemplate=_LABEL, **axes),
+        ]  # fmt: skip
+        span = [0.345 * place, 0.345 * place + 0.31]
+        layout[f"xaxis{number}"] = axis(first, domain=span, range=[-reach, reach], anchor=f"y{number}")
+        layout[f"yaxis{number}"] = axis(second, range=[-reach, reach], anchor=f"x{number}", scaleanchor=f"x{number}")
+    offset = float(np.linalg.norm([record.value(f"mag_bias_{a}") for a in "xyz"]) / length)
+    return Figure(
+        title="The field before and after",
+        message=f"Hard iron moves the outputs by {offset:.2g} times the field; calibrated, all lie on a sphere.",
+        caption="Outputs of the attitudes in three planes, in units of the field: as measured (scaled alone), and "
+        "calibrated in the accelerometers' frame. Points within the circle lie nearer to its axis, not nearer to its "
+        "centre.",
+        traces=traces,
+        layout={**layout, "legend": LEGEND},
+        height=430,
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

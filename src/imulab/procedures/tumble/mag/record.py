@@ -1,0 +1,221 @@
+"""A tumble record with the magnetometer triad added, both triads as their joint fit found them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from imulab.estimation.least_squares import coverage_factor
+from imulab.procedures.tumble.mag.judge import Disturbed, Seen, heading_uncertainty, leave_one_out
+from imulab.procedures.tumble.mag.model import mag_names
+from imulab.procedures.tumble.mag.scaling import Ready
+from imulab.procedures.tumble.mag.solve import Joint
+from imulab.procedures.tumble.model import gravity_slope, parameter_names, parameter_units
+from imulab.procedures.tumble.record import make_record, si_parameters
+from imulab.recording import Array
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.units import parse_unit
+from imulab.verdict import UNJUDGED, Bad, Note
+
+_FEW = 16
+_MOVED = 3.0
+"""Standard uncertainties of an accelerometer parameter beyond which the joint fit moves it too far."""
+_ONE_WAY = 6.0
+"""Condition number from which turning the heading would halve the uncertainty, or better."""
+_LARGE_RMS = 0.1
+
+
+def with_mag(
+    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], options: Mapping[str, Any]
+) -> Calibration:
+    """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
+    accel = make_record(
+        ready.estimate, ready.gravity, ready.scaling,
+        {"order": ready.estimate.problem.order, "method": "norm", "loss": "auto", "gravity": ready.gravity.value},
+    )  # fmt: skip
+    names, values, matrix, units = _values(ready, joint)
+    parameters = _parameters(names, values, matrix, units, joint.freedom[: len(names)])
+    own = accel.parameters
+    moved = {
+        name: (parameters[name].value - own[name].value) / u
+        for name in parameter_names(ready.estimate.problem.order)
+        if (u := own[name].standard_uncertainty)
+    }
+    kept = {
+        name: replace(parameters[name], standard_uncertainty_given_order=of_own.standard_uncertainty_given_order)
+        for name, of_own in own.items()
+    }
+    return replace(
+        accel,
+        parameters=kept | {name: parameters[name] for name in mag_names(joint.pair.mag_order)},
+        covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
+        model={**accel.model, **_model(ready, joint)},
+        fit={**accel.fit, "mag": _fit(ready, joint, seen, aside, moved)},
+        options={
+            **accel.options,
+            **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
+        },
+        data={**accel.data, "mag": _data(ready, joint, aside)},
+        warnings=(*accel.warnings, *ready.means.notes, *ready.notes, *_warnings(ready, joint, seen, aside, moved)),
+        verdict=UNJUDGED,
+    )
+
+
+def _values(ready: Ready, joint: Joint) -> tuple[list[str], Array, Array, list[str]]:
+    """Names, values, covariance and units of all parameters, the magnetometers' first."""
+    layout, order = joint.pair.layout, ready.estimate.problem.order
+    g = ready.gravity.value
+    of_mag, mag_slope = ready.mag.in_si(joint.theta[: layout.mag])
+    of_accel, accel_slope = si_parameters(joint.theta[layout.of_accel], ready.scaling, g, order)
+    size = layout.mag + 1 + layout.accel
+    slope = np.eye(size)
+    slope[: layout.mag, : layout.mag] = mag_slope
+    slope[layout.of_accel, layout.of_accel] = accel_slope
+    covariance = joint.covariance[:size, :size].copy()
+    covariance[layout.of_accel, layout.of_accel] += _whatever_the_order(ready)
+    matrix = slope @ covariance @ slope.T
+    shared = np.zeros(size)
+    shared[layout.of_accel] = ready.gravity.standard_uncertainty / g * gravity_slope(of_accel, order)
+    known = "1" if ready.mag.field is None else "T"
+    output = ready.means.unit
+    per = output if known == "1" else f"{output}/T"
+    names = [*mag_names(joint.pair.mag_order), *parameter_names(order)]
+    units = [known] * 3 + [per] * 3 + ["rad"] * 6 + ["1" if known == "1" else "1/T"] * (layout.mag - 12) + ["rad"]
+    units += parameter_units(order, ready.estimate.attitudes.unit)
+    values = np.concatenate([of_mag, [joint.theta[layout.dip_at]], of_accel])
+    return names, values, matrix + np.outer(shared, shared), units
+
+
+def _whatever_the_order(ready: Ready) -> Array:
+    """What the accelerometers' covariance gains where their order was chosen from the data, shape (p, p)."""
+    stated = ready.estimate.stated
+    size = ready.estimate.solution.theta.shape[1]
+    if stated is None or stated.given_order is None:
+        return np.zeros((size, size))
+    values, vectors = np.linalg.eigh(stated.covariance - stated.given_order)
+    gained: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return gained
+
+
+def _parameters(
+    names: list[str], values: Array, matrix: Array, units: list[str], freedom: Array
+) -> dict[str, Parameter]:
+    """Parameters with intervals of Student's t, of the degrees of freedom that each variance has."""
+    found = {}
+    for name, value, u, unit, nu in zip(
+        names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, freedom.tolist(), strict=True
+    ):
+        half = coverage_factor(nu if np.isfinite(nu) else None) * u
+        found[name] = Parameter(value, u, unit, interval_95=(value - half, value + half))
+    return found
+
+
+def _model(ready: Ready, joint: Joint) -> dict[str, Any]:
+    """Law of the magnetometers, and which output became which axis."""
+    axes = " ".join(
+        f"{'+' if row[output] > 0 else '-'}{'xyz'[output]}"
+        for row, output in zip(ready.mag.axes, np.abs(ready.mag.axes).argmax(axis=1).tolist(), strict=True)
+    )
+    field = ready.mag.field
+    return {
+        "mag_order": joint.pair.mag_order,
+        "mag_output_unit": ready.means.unit,
+        "mag_axes": axes,
+        "field": {"value": 1.0, "unit": "1"} if field is None else {"value": field, "unit": "T"},
+    }
+
+
+def _fit(
+    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], moved: Mapping[str, float]
+) -> dict[str, Any]:
+    predicted, residuals = leave_one_out(joint), joint.found.residuals
+    heading, reading = heading_uncertainty(joint)
+    return {
+        "attitudes": len(residuals),
+        "magnitude": {"rms": _rms(residuals[:, 1]), "leave_one_out": predicted.rms(1)},
+        "dip": {"rms": _rms(residuals[:, 2]), "leave_one_out": predicted.rms(2)},
+        "noise": "estimated from the residuals" if joint.pair.noise is None else "known",
+        "sigma_magnitude": float(joint.sigma[0]),
+        "sigma_dip": {"value": float(joint.sigma[1]), "unit": "rad"},
+        "condition_number": seen.condition,
+        "set_aside": [int(ready.kept[one.index]) + 1 for one in aside],
+        "heading": {
+            "standard_uncertainty": {"value": heading, "unit": "rad"},
+            "of_one_reading": {"value": reading, "unit": "rad"},
+        },
+        "moved": dict(moved),
+    }
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, Any]:
+    """Of each attitude that was used: its number, mean output, field in the body frame (of length 1), residuals."""
+    used = ready.pair.mag
+    layout = joint.pair.layout
+    every = ready.pair if layout.mag == ready.pair.layout.mag else replace(ready.pair, mag_order=joint.pair.mag_order)
+    found = every.evaluate(joint.theta)
+    return {
+        "number": (ready.kept + 1).tolist(),
+        "label": [ready.estimate.attitudes.label(i) for i in range(len(used))],
+        "mean": ready.means.mean[ready.kept].tolist(),
+        "field": found.field.vector.tolist(),
+        "force": found.force.vector.tolist(),
+        "magnitude": found.residuals[:, 1].tolist(),
+        "dip": found.residuals[:, 2].tolist(),
+        "used": np.isin(np.arange(len(used)), [one.index for one in aside], invert=True).tolist(),
+    }
+
+
+def _warnings(
+    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], moved: Mapping[str, float]
+) -> list[str]:
+    attitudes, found = ready.estimate.attitudes, list[str]()
+    for one in aside:
+        found.append(
+            f"mag: {attitudes.label(one.index)} set aside: |m| {100 * abs(one.magnitude):.2g} % "
+            f"{'high' if one.magnitude > 0 else 'low'}, dip {np.degrees(abs(one.dip)):.2g} deg "
+            f"{'high' if one.dip > 0 else 'low'} against the others (p {one.probability:.1g}): iron or a vehicle near?"
+        )
+    n = len(joint.pair.mag)
+    if n < _FEW:
+        found.append(f"mag: {n} attitudes leave little to tell the noise from; {_FEW} or more are asked for")
+    if not joint.converged:
+        found.append(
+            "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help"
+        )
+    if seen.condition > _ONE_WAY:
+        heading = np.degrees(heading_uncertainty(joint)[0])
+        which = " ".join(str(int(ready.kept[i]) + 1) for i in sorted(seen.heading))
+        found.append(
+            f"mag: the attitudes face nearly one way (condition {seen.condition:.0f}): heading is known to "
+            f"{heading:.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help most"
+        )
+    far = {name: value for name, value in moved.items() if abs(value) > _MOVED}
+    if far:
+        name, value = max(far.items(), key=lambda item: abs(item[1]))
+        found.append(
+            f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
+            "gravity contradict each other; was iron near, or did the unit move?"
+        )
+    rms = _rms(joint.found.residuals[:, 1])
+    if rms > _LARGE_RMS:
+        found.append(
+            Bad(
+                f"mag: the calibrated magnitudes scatter by {100 * rms:.2g} % of the field: these are no attitudes in "
+                "one field"
+            )
+        )
+    if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":
+        found.append(
+            Note(
+                "mag: the field's magnitude was not stated: the field is in units of the local one; give --field, such "
+                f"as --field {1e6 * ready.mag.size * parse_unit(ready.means.unit).factor:.3g}uT, for uT"
+            )
+        )
+    return found

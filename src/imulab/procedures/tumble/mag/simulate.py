@@ -1,0 +1,91 @@
+"""Simulated magnetometers on a unit that is turned by hand, written apart from the model that they are fitted with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import OptionError
+from imulab.recording import Array
+
+_SOFT_IRON = 0.05
+_HARD_IRON = 0.5  # of the field
+_MOUNTING = np.radians(3.0)
+_NOISE = 3e-3  # of the field, one sample
+_RESOLUTION = 0.02e-6  # T
+_STRONGEST = 1e-3  # T
+
+
+@dataclass(frozen=True)
+class Turns:
+    """How a unit is turned from attitude to attitude.
+
+    Attributes
+    ----------
+    axis, full
+        Axis and angle, rad, of the body's turn to the next attitude, shapes (k, 3) and (k,).
+    number, progress
+        Attitude that each sample is in or leaves, and the part of the turn that is done, shape (n,).
+    """
+
+    axis: Array
+    full: Array
+    number: NDArray[np.int64]
+    progress: Array
+
+
+def simulate_field(turns: Turns, up: Array, field: float, dip: float, seed: int) -> tuple[Array, dict[str, float]]:
+    """Return outputs in uT, ``M = D m + h`` with soft iron of 5 %, a mounting within degrees and hard iron, and truth.
+
+    Parameters
+    ----------
+    turns
+        Of the unit.
+    up
+        Upward direction in the body frame in the first attitude, shape (3,).
+    field, dip
+        T and rad.
+    seed
+        Of the random numbers.
+
+    Raises
+    ------
+    OptionError
+        Field or dip cannot be.
+    """
+    if not 0 < field < _STRONGEST:
+        raise OptionError(f"field {field:g}: expected its magnitude in T, such as 48e-6 (25e-6 to 65e-6 on Earth)")
+    if not abs(dip) < np.pi / 2:
+        raise OptionError(f"dip {dip:g}: expected an angle within 90 deg, positive where the field points down")
+    rng = np.random.default_rng([seed, 1])
+    direction = np.empty((len(turns.full), 3))
+    north = np.cross(up, rng.standard_normal(3))
+    direction[0] = np.cos(dip) * north / np.linalg.norm(north) - np.sin(dip) * up
+    for k in range(len(direction) - 1):
+        direction[k + 1] = rotate(direction[k : k + 1], turns.axis[k : k + 1], -turns.full[k : k + 1])[0]
+    number = turns.number
+    m = field * rotate(direction[number], turns.axis[number], -turns.full[number] * turns.progress)
+    matrix = (
+        np.eye(3) + _SOFT_IRON * rng.uniform(-1, 1, (3, 3)) + _MOUNTING * np.cross(np.eye(3), rng.uniform(-1, 1, 3))
+    )
+    hard_iron = _HARD_IRON * field * rng.uniform(-1, 1, 3)
+    output = m @ matrix.T + hard_iron + _NOISE * field * rng.standard_normal(m.shape)
+    truth = {"dip": dip} | {f"mag_bias_{a}": float(hard_iron[i] / matrix[i, i]) for i, a in enumerate("xyz")}
+    truth |= {f"mag_scale_factor_{a}": float(1e6 * matrix[i, i]) for i, a in enumerate("xyz")}
+    truth |= {
+        f"mag_misalignment_{'xyz'[i]}{'xyz'[j]}": float(matrix[i, j] / matrix[i, i])
+        for i in range(3)
+        for j in range(3)
+        if i != j
+    }
+    return 1e6 * _RESOLUTION * np.round(output / _RESOLUTION), truth
+
+
+def rotate(vectors: Array, axis: Array, angle: Array) -> Array:
+    """Rodrigues' rotation of each vector about its axis."""
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    along = axis * np.einsum("ni,ni->n", axis, vectors)[:, None]
+    turned: Array = vectors * cosine + np.cross(axis, vectors) * sine + along * (1 - cosine)
+    return turned
