@@ -139,6 +139,21 @@ static void residuals(const il_array *a, const il_array_axis *s, const il_sample
     for (int32_t i = 0; i < a->elements; i++) e[i] -= p->learns[i] ? mean : IL_C(0.0);
 }
 
+/* Whether somebody has never taught. */
+static int has_newcomer(const il_array *a, const il_array_axis *s) {
+    int any = 0;
+    for (int32_t i = 0; i < a->elements; i++) any |= s->seen[i] == 0;
+    return any;
+}
+
+/* Two residuals, e and -e, tell the mean of two variances, 2 e^2: without it a third gyro would find a gate of no width. */
+static void learn_as_pair(const il_array *a, il_array_axis *s, const il_sample *p, const il_real *e) {
+    for (int32_t i = 0; i < a->elements; i++) {
+        if (!p->learns[i]) continue;
+        s->variance[i] = (IL_C(1.0) - p->gain[i]) * (s->variance[i] + p->gain[i] * IL_C(2.0) * e[i] * e[i]);
+    }
+}
+
 /* Biases, variances and means of a second take in the sample; learns[] says whose. */
 static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s, il_sample *p, int32_t learners) {
     il_real m = (il_real)learners, squares = IL_C(0.0), gain = IL_C(0.0);
@@ -170,7 +185,10 @@ static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s,
         const il_real drift = (il_sum(a->elements, s->bias) - before) / m;
         for (int32_t i = 0; i < a->elements; i++) s->bias[i] -= p->learns[i] ? drift : IL_C(0.0);
     }
-    if (learners < 3) return;
+    if (learners < 3) {
+        if (has_newcomer(a, s)) learn_as_pair(a, s, p, e);
+        return;
+    }
     squares /= m * (m - IL_C(1.0));
     il_real hat = m / (m - IL_C(2.0));
     for (int32_t i = 0; i < a->elements; i++) {

@@ -195,6 +195,25 @@ def test_one_gyro_saturates_in_every_period(seed, limit, elements):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("lost", [1, 40, 200])
+def test_one_of_three_that_starts_late_is_used_a_second_later(seed, lost):
+    readings = dynamic(seed, 1000, elements=3)[0]
+    fused = run(put(readings, slice(0, lost), np.nan))
+    used = ~(fused.flags[:, 0, FAULTY] & EXCLUDED).astype(bool)
+    assert not used[:lost].any()
+    assert used[lost + RATE + 5 :].all()
+
+
+@pytest.mark.parametrize("start", range(8))
+def test_three_gyros_whose_first_readings_coincide_are_all_used(start):
+    # Steps of the output as large as its noise: two of three agree exactly in one first sample of five.
+    readings = 0.05 * np.random.default_rng(start).standard_normal((500, 3))
+    readings[:2] = [[0.0, 0.12, 0.0], [0.06, -0.06, 0.06]]
+    fused = run(np.round(readings / 0.06) * 0.06)
+    assert not (fused.flags[2 * RATE :] & EXCLUDED).any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("limit", [4.0, 8.0, 10.0])
 def test_two_of_six_saturate_in_every_period(seed, limit):
     # Equal readings at the end of the range, on both sides and from the first sample on, are told from the rate.

@@ -160,6 +160,20 @@ static void three_gyros_are_enough(void) {
     }
 }
 
+/* While two of three are alone they learn how noisy they are, so that the third, whose first readings are lost, is let in. */
+static void two_let_the_third_in(void) {
+    il_array a = settings_of(IL_ROBUST);
+    a.elements = 3;
+    il_array_state state;
+    il_real out = REAL(0);
+    CHECK(il_array_start(&a, &state) == IL_OK);
+    for (int k = 0; k < V_SAMPLES; k++) {
+        const il_real reading[3] = {v_array_base[k][0], v_array_base[k][1], k < 150 ? NAN_REAL : v_array_base[k][2]};
+        (void)il_array_step(&a, &state, reading, &out);
+        CHECK(k > 205 ? state.axis[0].flags[2] == 0 : k > 195 || (state.axis[0].flags[2] & IL_EXCLUDED) != 0);
+    }
+}
+
 /* Run n healthy samples, so that biases and variances are known. */
 static void warm(const il_array *a, il_array_state *state, int n) {
     il_real out;
@@ -363,6 +377,7 @@ void test_robust(void) {
     faults_are_named_and_bounded();
     weights_are_capped();
     three_gyros_are_enough();
+    two_let_the_third_in();
     a_scale_factor_is_no_jump();
     the_most_central_gyro_serves_where_all_are_gated();
     what_moves_with_the_rate_is_no_bias();
