@@ -53,14 +53,10 @@ READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "
 APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
 OTHERWISE = {
     "show": {"formats"},  # a list for people
-    "tumble fit": {"latitude", "height"},  # gravity=il.normal_gravity(...)
-    "tumble check": {"latitude", "height"},
-    "tumble mag": {"latitude", "height"},
-    "tumble gyro": {"accel", "accel_file", "g_sensitivity", "clock"},
-    "array calibrate": {"interval", "averaging"},
+    "tumble gyro": {"accel", "accel_file"},  # the first argument; accel_data, which may be no file
+    "array calibrate": {"interval"},  # window
     "array fuse": {"rate"},  # of arrays and files, a keyword of reading
     "array compare": {"experiment", "seeds"},
-    "warmup fit": {"settling_limit", "exit", "latest_start", "temperature_column"},
     "noise fit": {"for_", "rate", "step", "regress", "steps"},  # NoiseFit.wants; None is what the words no and say mean
 }
 """Options that functions have by another name, or say in another way."""
@@ -140,7 +136,9 @@ def folder(tmp_path_factory):
     still = il.simulate_array(experiment="static", duration=30.0)
     il.calibrate_array(still).save(place / "array.json")
     cycles = il.simulate_warmup([-40, 0, 60], cycles=2, duration="400 s", rate="2 Hz")
-    il.write(replace(cycles[0], metadata={}), place / "cycle.csv")
+    for number, cycle in enumerate(cycles):
+        head = {key: text for key, text in cycle.metadata.items() if key != "power_on_temperature"}
+        il.write(replace(cycle, metadata=head), place / f"cycle{number}.csv")
     il.fit_warmup(cycles, temperatures=(-40, 0, 60), model="knot-cubic").save(place / "warm.json")
     il.plan_centrifuge("1,10", cycles=1).save(place / "plan.toml")
     return place
@@ -165,6 +163,7 @@ def same(one, other):
     return texts[0] == texts[1]
 
 
+CYCLES = [f"cycle{number}.csv" for number in range(6)]
 MADE = {
     "tumble plan": (
         ["--attitudes", "12", "--noise", "20ug", "--order", "1", "--add", "tumble.csv", "-o", "one.csv"],
@@ -239,6 +238,41 @@ MADE = {
         ["--to", "c", "array.json", "--method", "mean", "-o", "one"],
         lambda out: il.export("c", ["array.json"], out, method="mean"),
     ),
+    "tumble fit of a place": (
+        ["tumble.csv", "--order", "1", "--latitude", "47.4", "--height", "400", "-o", "one.json"],
+        lambda out: il.fit_tumble("tumble.csv", order=1, latitude="47.4 deg", height="400 m").save(out),
+    ),
+    "tumble gyro": (
+        ["tumble.csv", "--accel", "unit1.json", "--g-sensitivity", "no", "--clock", "20 ppm", "-o", "one.json"],
+        lambda out: il.fit_gyro("unit1.json", "tumble.csv", g_sensitivity="no", clock="20 ppm").save(out),
+    ),
+    "warmup fit": (
+        [
+            *CYCLES,
+            "--temperatures",
+            "-40,0,60",
+            "--model",
+            "knot-cubic",
+            "--settling-limit",
+            "9 %",
+            "--exit",
+            "hold",
+            "--temperature-column",
+            "--tolerance",
+            "5",
+            "-o",
+            "one.json",
+        ],
+        lambda out: il.fit_warmup(
+            CYCLES,
+            temperatures=(-40, 0, 60),
+            model="knot-cubic",
+            settling_limit="9 %",
+            exit="hold",
+            temperature_column=True,
+            tolerance=5.0,
+        ).save(out),
+    ),
     "report": (["unit1.json", "-o", "one.html"], lambda out: il.write_report("unit1.json", out)),
     "convert": (["tumble.csv", "-o", "one.csv"], lambda out: il.write(il.read("tumble.csv"), out)),
     "apply": (
@@ -246,8 +280,8 @@ MADE = {
         lambda out: il.write(il.apply("unit1.json", "tumble.csv"), out),
     ),
     "apply of a warm-up table": (
-        ["warm.json", "cycle.csv", "--temperature-column", "--latest-start", "9 s", "-o", "one.csv"],
-        lambda out: il.write(il.apply("warm.json", "cycle.csv", temperature_column=True, latest_start=9.0), out),
+        ["warm.json", "cycle0.csv", "--temperature-column", "--latest-start", "9 s", "-o", "one.csv"],
+        lambda out: il.write(il.apply("warm.json", "cycle0.csv", temperature_column=True, latest_start=9.0), out),
     ),
     "tumble fit": (
         ["tumble.csv", "--order", "1", "--loss", "square", "-o", "one.json"],

@@ -106,7 +106,7 @@ def test_a_unit_that_cannot_be_is_asked_about():
         ([-20, 0, 20], {"temperatures": [20.0, 0]}, OptionError, "two or more, ascending"),
         ([-20, 0, 20], {"tolerance": 11}, OptionError, "tolerance 11 K"),
         ([-20, 0, 20], {"model": "quartic"}, OptionError, "expected one of interval-cubic knot-cubic"),
-        ([-20, 0, 20], {"exit_rule": "fade"}, OptionError, "expected one of zero hold taper"),
+        ([-20, 0, 20], {"exit": "fade"}, OptionError, "expected one of zero hold taper"),
         ([-20, 0, 20], {"pool": "all"}, OptionError, "expected one of unit type"),
         ([-20, 0, 20], {"pool": "type"}, DataError, "no serial in the head"),
         ([-20, 0, 20], {"settling_time": -5}, OptionError, "settling time"),

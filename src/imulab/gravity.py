@@ -10,10 +10,10 @@ import math
 import numbers
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from imulab.errors import OptionError, quoted
-from imulab.quantities import quantity
+from imulab.quantities import in_si, quantity
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.verdict import Note
 
@@ -67,6 +67,9 @@ class Gravity:
             "standard_uncertainty": self.standard_uncertainty,
             "from": self.origin,
         }
+
+
+Given = TypeVar("Given")
 
 
 def local_gravity(given: float | str | Gravity | None, recording: Recording) -> Gravity:
@@ -129,21 +132,30 @@ def gravity_option(gravity: str | None, latitude: str | None, height: str | None
     OptionError
         An option is no quantity of its kind, is out of range, or does not go with another.
     """
+    found = at_place(gravity, latitude, height, label)
+    return stated_gravity(found, label.format("gravity")) if isinstance(found, str) else found
+
+
+def at_place(
+    gravity: Given, latitude: float | str | None, height: float | str | None, label: str = "{}"
+) -> Given | Gravity:
+    """Return normal gravity at a place where one is given, else `gravity`; errors as for `gravity_option`.
+
+    Latitude in rad and height in m, or texts; the last digit of a text counts as rounded.
+    """
     names = {name: label.format(name) for name in ("gravity", "latitude", "height")}
-    if gravity is not None:
-        if latitude is not None or height is not None:
-            raise OptionError(
-                f"{names['gravity']} together with {names['latitude']} or {names['height']}: expected one or the other"
-            )
-        return stated_gravity(gravity, names["gravity"])
+    if gravity is not None and (latitude is not None or height is not None):
+        raise OptionError(
+            f"{names['gravity']} together with {names['latitude']} or {names['height']}: expected one or the other"
+        )
     if latitude is None:
         if height is not None:
             raise OptionError(f"{names['height']} without {names['latitude']}: expected both")
-        return None
-    angle = quantity(latitude, names["latitude"], "angle", "deg")
-    above = quantity(height, names["height"], "length", "m") if height is not None else 0.0
+        return gravity
+    angle = in_si(latitude, names["latitude"], "angle", "deg")
+    above = in_si(height, names["height"], "length", "m") if height is not None else 0.0
     value = normal_gravity(angle, above)
-    half = min(_half_digit(latitude, "angle", "deg"), math.pi / 2 - abs(angle))
+    half = min(_half_digit(latitude, "angle", "deg") if isinstance(latitude, str) else 0.0, math.pi / 2 - abs(angle))
     rounding = abs(normal_gravity(angle + half) - normal_gravity(angle - half)) / math.sqrt(12)
     unknown = 0.0 if height is not None else _UNKNOWN_HEIGHT * _FREE_AIR
     uncertainty = math.hypot(ANOMALY, rounding, unknown)
@@ -155,8 +167,8 @@ def gravity_option(gravity: str | None, latitude: str | None, height: str | None
         Note(
             f"gravity {value:.6g} m/s^2 is normal gravity, from which that of a place differs: "
             f"{from_si(uncertainty, 'ug'):.3g} µg"
-            + (f" (the height was not given; {names['height']} lowers it)" if unknown else "")
-            + f" are part of every scale factor's uncertainty; a surveyed value ({names['gravity']} "
+            + (" (the height was not given; --height lowers it)" if unknown else "")
+            + " are part of every scale factor's uncertainty; a surveyed value (--gravity "
             "9.81362+-0.00002) does without"
         ),
     )

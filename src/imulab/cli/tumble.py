@@ -179,9 +179,7 @@ def gyro(
 ) -> None:
     """Calibrate a gyroscope triad on top of the accelerometers' record; writes one record with both triads."""
     from imulab.procedures.loading import load
-    from imulab.procedures.tumble.gyro import fit_gyro
-    from imulab.procedures.tumble.gyrorecord import with_gyro
-    from imulab.procedures.tumble.segment import find_attitudes
+    from imulab.procedures.tumble.gyrofit import fit_gyro
 
     inputs = [name for name in (file, accel, accel_file, options["layout"], accel_layout, noise) if name]
     check_outputs([output, report], inputs)
@@ -191,13 +189,12 @@ def gyro(
     own = recording
     if accel_file is not None:
         own = read_recording(accel_file, layout=accel_layout or how["layout"], element=how["element"])
-    result = fit_gyro(
-        record, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
-        clock=quantity(clock, "--clock", "number", "ppm"), clock_of=clock_of,
-        noise=None if noise is None else load(noise),
+    both = call(
+        fit_gyro, record, recording, accel_data=own, fit_bias=fit_bias, g_sensitivity=g_sensitivity, clock=clock,
+        clock_of=clock_of, noise=noise,
     )  # fmt: skip
     finish(
-        with_gyro(record, result, recording, own),
+        both.calibration,
         output,
         report,
         json=json,

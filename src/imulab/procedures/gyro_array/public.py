@@ -21,6 +21,7 @@ from imulab.procedures.gyro_array.kalman import RATE_WALK
 from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
 from imulab.procedures.inputs import Data, Reading, as_record, as_recording
+from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 
@@ -32,7 +33,7 @@ def calibrate_array(
     still: Data,
     moving: Data | None = None,
     *,
-    averaging_time: float = 1.0,
+    averaging: float | str = "1 s",
     serial: str | None = None,
     method: str | None = None,
     memory: str | float | None = None,
@@ -43,7 +44,7 @@ def calibrate_array(
 
     At rest, in the longest stretch that is: each element's bias is its plain mean, the common part included; N, B, K
     come from the model of its noise, and so does the bias's uncertainty (`ColumnNoise.mean_uncertainty`); the
-    covariance matrix at `averaging_time` is half the mean of the products of successive differences of means (the Allan
+    covariance matrix at `averaging` is half the mean of the products of successive differences of means (the Allan
     covariance; Vaccaro and Zaki 2017). In motion: scale factors, or a 3 x 3 alignment of each element.
 
     Parameters
@@ -51,8 +52,8 @@ def calibrate_array(
     still, moving
         A file, recording, data frame or arrays with the columns gyro_1 .. (or gyro_x_1 ..) in rad/s, deg/s or deg/h; or
         the readings of n gyros, shape (m, n) or (m, n, 3).
-    averaging_time
-        Of the covariance matrix, s.
+    averaging
+        Averaging time of the covariance matrix, s.
     serial
         Of the array, for the record.
     method, memory
@@ -93,7 +94,7 @@ def calibrate_array(
     if method is not None or memory is not None:
         fusion = fusion_text(method, None if memory is None else str(memory), _LABEL)
     return fit.calibrate_array(
-        at_rest, in_motion, averaging_time=averaging_time, serial=serial, fusion=fusion,
+        at_rest, in_motion, averaging_time=in_si(averaging, "averaging", "time", "s"), serial=serial, fusion=fusion,
         noise=None if noise is None else as_record(noise, "calibrate_array: noise"),
     )  # fmt: skip
 

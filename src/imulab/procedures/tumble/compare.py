@@ -11,7 +11,7 @@ import numpy as np
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.ranked import median
-from imulab.gravity import Gravity, local_gravity
+from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Reading, as_record
 from imulab.procedures.result import Drawn
 from imulab.procedures.tumble.apply import output_factor
@@ -97,6 +97,8 @@ def check_tumble(
     *,
     limit: float | None = None,
     gravity: float | str | Gravity | None = None,
+    latitude: float | str | None = None,
+    height: float | str | None = None,
     **reading: Unpack[Reading],
 ) -> Check:
     """Test whether fresh attitudes contradict an existing record, without refitting.
@@ -115,6 +117,8 @@ def check_tumble(
         Largest ``| |f| - g |`` that passes, m/s^2, beside the test.
     gravity
         Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
+    latitude, height
+        Instead of gravity, as for `fit_tumble`.
     reading
         How arrays and files are to be understood, as for `fit_tumble`.
 
@@ -148,7 +152,7 @@ def check_tumble(
         raise OptionError(f"limit {limit:g} m/s^2: expected more than 0")
     if limit is None and not record.covariance.names:
         raise RecordError("the record states no uncertainties to test against; expected a fixed limit (--limit 1mg)")
-    local = _gravity(record, gravity, attitudes)
+    local = _gravity(record, at_place(gravity, latitude, height), attitudes)
     attitudes = _in_unit_of(record, attitudes)
     g, order = local.value, model_of(record).order
     scale = g * np.array([record.value(f"scale_factor_{axis}") for axis in "xyz"])

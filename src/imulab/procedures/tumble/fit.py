@@ -17,7 +17,7 @@ from imulab.estimation.least_squares import (
     huber_inflation,
     observability,
 )
-from imulab.gravity import Gravity, local_gravity
+from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Reading, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.advice import helpful_attitudes
@@ -74,6 +74,8 @@ def fit_tumble(
     *,
     order: int | str = "auto",
     gravity: float | str | Gravity | None = None,
+    latitude: float | str | None = None,
+    height: float | str | None = None,
     method: str = "norm",
     loss: str = "auto",
     nonlinearity: tuple[float, float] | None = None,
@@ -102,6 +104,9 @@ def fit_tumble(
     gravity
         Local gravity, m/s^2, or a text such as ``"9.81362+-0.00002"``, whose standard uncertainty enters that of the
         scale factors. Without it that of the recording's head is used, or standard gravity, with a warning.
+    latitude, height
+        Instead of gravity: where that is normal gravity, as texts (``"47.4 deg"``, ``"400 m"``) or in rad and m; what a
+        place differs by is part of the uncertainty.
     method
         ``"norm"`` or ``"linearised"``.
     loss
@@ -161,7 +166,7 @@ def fit_tumble(
         nonlinearity=nonlinearity, cross=cross, threshold=threshold,
     )  # fmt: skip
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
-    local = local_gravity(gravity, attitudes.recording)
+    local = local_gravity(at_place(gravity, latitude, height), attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = nominal_scaling(attitudes, local.value)
     known = None if prior is None else as_record(prior, "fit_tumble: prior")

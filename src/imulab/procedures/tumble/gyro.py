@@ -179,9 +179,9 @@ def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, 
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record holds no accelerometers; expected a tumble record")
     if sensitivity not in SENSITIVITIES:
-        raise OptionError(f"g-sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
+        raise OptionError(f"g_sensitivity {sensitivity!r}: expected one of {listed(SENSITIVITIES, sensitivity)}")
     if clock_of not in CLOCKS:
-        raise OptionError(f"clock of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
+        raise OptionError(f"clock_of {clock_of!r}: expected one of {listed(CLOCKS, clock_of)}")
     if not 0 <= clock < 1:
         raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
     if attitudes.trace is None:

@@ -20,7 +20,7 @@ from imulab.procedures.tumble.rotation import frame_rotations
 from imulab.recording import Array
 from imulab.verdict import Note
 
-CRYSTAL = 50e-6
+CRYSTAL = 50 * 1e-6  # as '50 ppm' is read, so that the two compare equal
 """Standard uncertainty of the rate of a clock that nothing is known of but that a crystal drives it."""
 _KNOT = 0.05  # s
 _LAGS = np.linspace(-2.0, 2.0, 21)  # s

@@ -10,9 +10,9 @@ from imulab.procedures.inputs import Data, Reading, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.tumble import gyro
 from imulab.procedures.tumble.gyro import GyroFit
-from imulab.procedures.tumble.gyroclock import CRYSTAL
 from imulab.procedures.tumble.gyrorecord import with_gyro
 from imulab.procedures.tumble.segment import find_attitudes
+from imulab.quantities import in_si
 from imulab.records.calibration import Calibration
 
 
@@ -30,8 +30,8 @@ def fit_gyro(
     *,
     accel_data: Data | None = None,
     fit_bias: bool = False,
-    sensitivity: str = "auto",
-    clock: float = CRYSTAL,
+    g_sensitivity: str = "auto",
+    clock: float | str = "50 ppm",
     clock_of: str = "gyro",
     noise: Calibration | str | PathLike[str] | None = None,
     **reading: Unpack[Reading],
@@ -51,7 +51,7 @@ def fit_gyro(
         The same of the accelerometers, on the same clock, where they are not in `data`.
     fit_bias
         Fit the biases to the turns too, instead of taking them from the outputs at rest.
-    sensitivity
+    g_sensitivity
         Whether the zero changes with specific force: ``yes``, ``no``, or ``auto`` where the data show it.
     clock
         Relative standard uncertainty of the rate of the clock: common to the three scale factors.
@@ -75,7 +75,7 @@ def fit_gyro(
     ObservabilityError
         The turns cannot separate the parameters.
     OptionError
-        `sensitivity`, `clock` or `clock_of` has a value that cannot be.
+        `g_sensitivity`, `clock` or `clock_of` has a value that cannot be.
 
     Examples
     --------
@@ -95,7 +95,8 @@ def fit_gyro(
         given: dict[str, Any] = {key: reading.get(key) for key in ("layout", "element") if named}
         own = as_recording(accel_data, given, fit_gyro, name="accel_data")
     found = gyro.fit_gyro(
-        known, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=sensitivity, clock=clock,
-        clock_of=clock_of, noise=None if noise is None else as_record(noise, "fit_gyro: noise"),
+        known, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
+        clock=in_si(clock, "clock", "number", "ppm"), clock_of=clock_of,
+        noise=None if noise is None else as_record(noise, "fit_gyro: noise"),
     )  # fmt: skip
     return BothTriads(with_gyro(known, found, recording, own), found)

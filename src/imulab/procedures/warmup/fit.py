@@ -13,7 +13,7 @@ from imulab.errors import DataError, OptionError, listed
 from imulab.frames import is_frame
 from imulab.procedures.inputs import Data, Reading, as_blocks
 from imulab.procedures.result import Result
-from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS
+from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, settling_size
 from imulab.procedures.warmup.curves import Curves, make_curves
 from imulab.procedures.warmup.cycles import Cycle, common_axes, find_power_cycle, with_axes
 from imulab.procedures.warmup.judge import (
@@ -30,6 +30,7 @@ from imulab.procedures.warmup.judge import (
 from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
+from imulab.quantities import in_si
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 
@@ -71,12 +72,14 @@ def fit_warmup(
     temperatures: Sequence[float] = SOURCE_TEMPERATURES,
     tolerance: float = TOLERANCE,
     settling_time: float | None = None,
-    settling_limit: Mapping[str, float] | None = None,
-    exit_rule: str = "zero",
+    settling_limit: Mapping[str, float] | str = "5 %",
+    exit: str = "zero",  # noqa: A002
     taper_time: float = 60.0,
     pool: str = "unit",
     axes: Sequence[str] | None = None,
     beyond: str = "zero",
+    latest_start: float | str = "5 s",
+    temperature_column: bool = False,
     **reading: Unpack[Reading],
 ) -> WarmupFit:
     """Fit the curve of an output's zero after power-on, ``Z(t; T)``, to power cycles at several temperatures.
@@ -98,8 +101,9 @@ def fit_warmup(
     settling_time
         T_M, s; chosen from the data if not given.
     settling_limit
-        Kind (``gyro``, ``accel``) to the size of Z, SI, that counts as settled; 5 % of the largest if not given.
-    exit_rule, taper_time
+        The size of Z that counts as settled: a share of the largest, a rate or an acceleration as a text; or kind
+        (``gyro``, ``accel``) to size in SI, 5 % of the largest for one that is not named.
+    exit, taper_time
         What the unit does from T_M on, and how long a taper takes, s.
     pool
         ``unit``: all cycles are of one unit. ``type``: several units share a table, with a random effect per unit.
@@ -107,6 +111,11 @@ def fit_warmup(
         Columns to fit; all gyro_* and accel_* if not given.
     beyond
         What the unit does at power-on temperatures beyond the outer ones: ``zero``, nothing; ``hold``, as there.
+    latest_start
+        A cycle whose first sample is later after power-on, s, is refused.
+    temperature_column
+        Whether a power-on temperature that is missing is taken from the first reading of the column temperature. Both
+        are of cycles that `find_power_cycle` has not averaged before.
     reading
         How arrays and files are to be understood, of all cycles alike: `units`, `layout`, `window` ...
 
@@ -122,20 +131,25 @@ def fit_warmup(
     Source: start-up zero error compensation of MEMS inertial instruments (patent record 38161583), and
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
     """
-    at = check_options(model, temperatures, tolerance, settling_time, exit_rule, taper_time, pool, beyond)
+    at = check_options(model, temperatures, tolerance, settling_time, exit, taper_time, pool, beyond)
     single = isinstance(cycles, str | PathLike | Recording | Mapping | np.ndarray) or is_frame(cycles)
     if single or not isinstance(cycles, Iterable):
         raise DataError("fit_warmup: expected a list of power cycles, one for each test, found a single one")
     given = list(cycles)
     if not given:
         raise DataError("no power cycles: expected at least one file for each calibration temperature")
-    found = [item if isinstance(item, Cycle) else _averaged(item, reading) for item in given]
+    start = in_si(latest_start, "latest_start", "time", "s")
+    found = [
+        item if isinstance(item, Cycle) else _averaged(item, reading, start, from_column=temperature_column)
+        for item in given
+    ]
     if axes is not None:
         found = [with_axes(cycle, tuple(axes)) for cycle in found]
     order = common_axes(found)
     found = [with_axes(cycle, order) for cycle in found]
     _check_units(found, pool)
-    limit = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE) | dict(settling_limit or {})
+    named = settling_size(settling_limit, "settling_limit") if isinstance(settling_limit, str) else settling_limit
+    limit = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE) | dict(named)
     curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limit)
     spread = repeatability(curves)
     by_unit = pool == "type" and np.unique(curves.unit).size > 1
@@ -145,7 +159,7 @@ def fit_warmup(
     ]
     chosen = choose(curves, rows)
     covariance = _covariance(curves, chosen, by_unit)
-    table = chosen.table.with_rules(exit_rule, taper_time, beyond, tolerance)
+    table = chosen.table.with_rules(exit, taper_time, beyond, tolerance)
     record = make_record(
         curves=curves,
         rows=rows,
@@ -161,7 +175,7 @@ def fit_warmup(
             "temperatures": at.tolist(),
             "tolerance": tolerance,
             "settling_time": settling_time,
-            "exit": exit_rule,
+            "exit": exit,
             "pool": pool,
             "beyond": beyond,
         },
@@ -169,10 +183,10 @@ def fit_warmup(
     return WarmupFit(record, table, tuple(rows), spread, curves)
 
 
-def _averaged(data: Data, reading: Mapping[str, Any]) -> Cycle:
+def _averaged(data: Data, reading: Mapping[str, Any], latest_start: float, *, from_column: bool) -> Cycle:
     """Return one power cycle, averaged over bins of a second."""
     blocks, source = as_blocks(data, reading, fit_warmup, name="cycles")
-    return find_power_cycle(blocks, source=source)
+    return find_power_cycle(blocks, source=source, latest_start=latest_start, temperature_from_column=from_column)
 
 
 def _covariance(curves: Curves, chosen: Judged, by_unit: bool) -> Array | None:
@@ -190,7 +204,7 @@ def check_options(
     temperatures: Sequence[float],
     tolerance: float,
     settling_time: float | None,
-    exit_rule: str,
+    exit: str,  # noqa: A002
     taper_time: float,
     pool: str,
     beyond: str = "zero",
@@ -204,7 +218,7 @@ def check_options(
     """
     for name, value, known in (
         ("model", model, (*MODELS, "auto")),
-        ("exit", exit_rule, EXITS),
+        ("exit", exit, EXITS),
         ("pool", pool, POOLS),
         ("beyond", beyond, BEYOND),
     ):

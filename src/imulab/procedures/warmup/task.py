@@ -18,8 +18,8 @@ from imulab.procedures.options import (
     switch,
 )
 from imulab.procedures.procedure import Files, Task, source_of
-from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, TEMPERATURES
-from imulab.quantities import number, quantity, temperature_list
+from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, TEMPERATURES, settling_size
+from imulab.quantities import temperature_list
 
 if TYPE_CHECKING:
     from imulab.procedures.warmup.cycles import Cycle
@@ -50,29 +50,12 @@ def _names(text: str, option: str) -> list[str]:
     return names
 
 
-def _limit(text: str, option: str) -> dict[str, float]:
-    """Kind to the |Z| that counts as settled; a share of the peak is negative."""
-    if text.rstrip().endswith("%"):
-        share = number(text.rstrip()[:-1], option) / 100
-        if not 0 < share < 1:
-            raise OptionError(f"{option} {text!r}: expected more than 0 and less than 100 %")
-        return {"gyro": -share, "accel": -share}
-    for kind, what, unit in (("gyro", "rate", "deg/h"), ("accel", "acceleration", "mg")):
-        try:
-            value = quantity(text, option, what, unit)
-        except OptionError:
-            continue
-        if any(symbol in text for symbol in ("deg", "rad")) == (kind == "gyro") and value > 0:
-            return {kind: value}
-    raise OptionError(f"{option} {text!r}: expected a percentage such as '5 %', a rate or an acceleration")
-
-
 OPTIONS = (
     choice("model", "How the bias goes with time; auto compares them.", ("auto", *MODELS), "auto"),
     Option("temperatures", "Calibration temperatures, degC, ascending.", temperature_list, TEMPERATURES, "T,T,..."),
     finite("tolerance", "A power-on temperature within this fits, K.", "1", "K"),
     measure("settling_time", "T_M, s; chosen from the data if not given.", "time", "s", shows="TIME"),
-    Option("settling_limit", "Settled below this: percent of the peak, or deg/h, mg ...", _limit, "5 %", "LIMIT"),
+    Option("settling_limit", "Settled below this: percent of the peak, or deg/h, mg ..", settling_size, "5 %", "LIMIT"),
     choice("exit", "What the table gives from T_M on.", EXITS, "zero"),
     measure("taper_time", "How long a taper takes, s.", "time", "s", "60 s", shows="TIME"),
     choice("pool", "unit, or type: several units share one table.", POOLS, "unit"),
@@ -91,7 +74,7 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
 
     values = read_options(OPTIONS, texts, label)
     fit = {name: values[name] for name in _OF_THE_FIT}
-    fit |= {"settling_limit": values["settling_limit"], "exit_rule": values["exit"]}
+    fit |= {"settling_limit": values["settling_limit"], "exit": values["exit"]}
     check_options(**{name: value for name, value in fit.items() if name not in ("axes", "settling_limit")})
     return {**values, "fit": fit, "part": part_of(values)}
 

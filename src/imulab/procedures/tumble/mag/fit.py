@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, listed, quoted
 from imulab.estimation.least_squares import chi_square_probability, f_test
-from imulab.gravity import Gravity, local_gravity
+from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Reading, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -81,6 +81,8 @@ def fit_mag(
     drop: Sequence[int | str] = (),
     hemisphere: str | None = None,
     gravity: float | str | Gravity | None = None,
+    latitude: float | str | None = None,
+    height: float | str | None = None,
     order: int | str = "auto",
     **reading: Unpack[Reading],
 ) -> MagFit:
@@ -111,7 +113,7 @@ def fit_mag(
         Attitudes to leave out, numbers from 1.
     hemisphere
         ``north`` or ``south``, to check the sign of the dip.
-    gravity, order
+    gravity, latitude, height, order
         As for `fit_tumble`.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
@@ -143,7 +145,13 @@ def fit_mag(
     attitudes = as_attitudes(data, reading, fit_mag)
     known = None if accel is None else as_record(accel, "fit_mag: accel")
     ready = prepare(
-        attitudes, known, gravity=gravity, order=order, field=magnitude, same_direction=same_direction, drop=drop
+        attitudes,
+        known,
+        gravity=at_place(gravity, latitude, height),
+        order=order,
+        field=magnitude,
+        same_direction=same_direction,
+        drop=drop,
     )
     robust = loss == "huber"
     joint, aside = solve(ready.pair, ready.start, robust=robust), tuple[Disturbed, ...]()
