@@ -90,8 +90,8 @@ def _edge(column: ColumnModel) -> str:
     level = float(edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])[0][0])
     return (
         f"the white noise, {plain_number(level * factor, 3)} {unit} at low frequencies, falls to "
-        f"{plain_number(float(analysis.values[0]) * factor, 3)} at the end of the band: the sensor's filter, no slow "
-        "noise; filters get the white noise of low frequencies"
+        f"{plain_number(float(analysis.values[0]) * factor, 3)} at the end of the band, as behind a filter or beside "
+        "vibration: no slow noise; filters get the white noise of low frequencies"
     )
 
 
