@@ -1,6 +1,7 @@
 """Magnetometers on the attitudes of a tumble test: exact data, the bound, coverage, disturbances, and refusals."""
 
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -340,3 +341,15 @@ def test_a_record_of_another_test_is_prior_knowledge_unless_it_disagrees():
     other = il.fit_tumble(table(*simulated(22)[2]), gravity=G, order=2).calibration
     wrong = il.fit_mag(table(*again, name="other.csv"), gravity=G, accel=other).calibration
     assert any("contradict their record" in w for w in wrong.warnings)
+
+
+def test_an_exported_unit_runs_the_magnetometers_too(tmp_path):
+    _, _, data = simulated(31)
+    record = il.fit_mag(table(*data), gravity=G, order=2, mag_order=2).calibration
+    il.export("blob", record, tmp_path / "fw")
+    on_unit = il.apply(tmp_path / "fw" / "unit.blob", table(*data))
+    assert np.abs(on_unit.triad("mag") - il.apply(record, table(*data)).triad("mag")).max() < 2e-6
+    il.export("c", record, tmp_path / "c")
+    subprocess.run(["make", "-C", str(tmp_path / "c")], check=True, capture_output=True, timeout=120)
+    said = subprocess.run([str(tmp_path / "c" / "selftest")], check=True, capture_output=True, text=True, timeout=60)
+    assert "pass" in said.stdout

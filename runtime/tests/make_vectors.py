@@ -171,6 +171,30 @@ def gyro():
         emit(f"v_gyro_{name}", rates)
 
 
+def mag():
+    """Field of outputs by the exact equations, order 1 and 2, in decimal arithmetic."""
+    rng = random.Random(4)
+    gain, bias = [rng.uniform(0.9e-2, 1.1e-2) for _ in range(3)], [rng.uniform(-0.8, 0.8) for _ in range(3)]
+    turn = [[rng.uniform(-0.2, 0.2) for _ in range(3)] for _ in range(3)]
+    for i in range(3):
+        turn[i][(i + 1) % 3] += 1  # outputs are renamed
+    k2 = [0.02, -0.015, 0.01]
+    output = [[rng.uniform(-200, 200) for _ in range(3)] for _ in range(10)]
+    emit("v_mag_gain", gain)
+    emit("v_mag_bias", bias)
+    emit("v_mag_turn", turn)
+    emit("v_mag_quadratic", k2)
+    emit("v_mag_output", output)
+    for name, share in (("plain", 0), ("field", 1)):
+        fields = []
+        for m in output:
+            s = [d(m[i]) * d(gain[i]) - d(bias[i]) for i in range(3)]
+            if share:
+                s = [2 * a / (1 + (1 + 4 * d(k) * a).sqrt()) for a, k in zip(s, k2)]
+            fields.append([sum(d(turn[i][j]) * s[j] for j in range(3)) for i in range(3)])
+        emit(f"v_mag_{name}", fields)
+
+
 def centrifuge():
     rng = random.Random(3)
     k0, c1, c2 = [2.3e-7, -1.9e-7], [1.5e-3, -2e-3], [4e-6, 1e-6]
@@ -472,8 +496,9 @@ def make_blobs(w):
     tumble_of, gyro_of, drift, warm, sensors = make_sections(w)
     text = section(0, b'{"format": "imulab.blob"}')
     made = [blob(w), blob(w, text), blob(w, text, tumble_of[1], gyro_of[1], drift, warm[3], sensors[4])]
+    field = [section(6, words(1), counted(w, 15, 3)), section(6, words(2), counted(w, 18, 3))]
     crossed = section(1, words(256 + 2), counted(w, 15, 2), counted(w, 6, 50))  # with cross terms
-    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors)]
+    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field)]
 
 
 def blobs():
@@ -485,7 +510,9 @@ def blobs():
         LINES.append(f"static const uint8_t *const v_blob{w}[] = {{{names}}};")
         LINES.append(f"static const size_t v_blob{w}_size[] = {{{', '.join(str(len(b)) for b in made)}}};")
     LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
-    LINES.append("enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16 };")
+    LINES.append(
+        "enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16, V_BLOB_MAG = 23 };"
+    )
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)
     LINES.append(f"static const uint32_t v_crc = {zlib.crc32(letters)}u;")
@@ -504,7 +531,7 @@ def main():
     if sys.argv[1:2] == ["--seeds"]:
         write_seeds(Path(sys.argv[2]))
         return
-    for part in (tumble, gyro, centrifuge, warmup, array, blobs):
+    for part in (tumble, gyro, mag, centrifuge, warmup, array, blobs):
         part()
     head = [
         "/* Written by make_vectors.py; do not edit. */",

@@ -46,7 +46,7 @@ static void crc_is_that_of_ieee_802_3(void) {
 }
 
 static void whole_tables_load(void) {
-    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16};
+    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32};
     for (int b = 0; b < V_BLOBS; b++) {
         uint32_t found = 99;
         CHECK(load_exactly(v_blob4[b], v_blob4_size[b], &found) == IL_OK && found == has[b]);
@@ -93,6 +93,16 @@ static void contents_arrive(void) {
             counted(&unit.gyro.turn[0][0], 9, REAL(1), 6);
             if (sensitive) counted(&unit.gyro.sensitivity[0][0], 9, REAL(1), 15);
             else CHECK(unit.gyro.sensitivity[2][2] == REAL(0));
+        }
+        for (int order = 1; order <= 2; order++) {
+            const int b = V_BLOB_MAG + order - 1;
+            CHECK(il_table_load(&unit, blobs[b], sizes[b], NULL, 0) == IL_OK);
+            CHECK(unit.mag.order == order);
+            counted(unit.mag.gain, 3, REAL(3), 0);
+            counted(unit.mag.bias, 3, REAL(3), 3);
+            counted(&unit.mag.turn[0][0], 9, REAL(3), 6);
+            if (order > 1) counted(unit.mag.quadratic, 3, REAL(3), 15);
+            else CHECK(unit.mag.quadratic[2] == REAL(0));
         }
         CHECK(il_table_load(&unit, blobs[V_BLOB_DRIFT], sizes[V_BLOB_DRIFT], NULL, 0) == IL_OK);
         CHECK(unit.centrifuge.has[0] == 1 && unit.centrifuge.has[1] == 0 && unit.centrifuge.highest == REAL(2));
@@ -216,7 +226,7 @@ static void contents_that_cannot_be_are_refused(void) {
     EXPECT(0, 2, 0x00020001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00000001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00080001u, IS_FLOAT ? IL_TABLE_WIDTH : IL_OK); /* no numbers in it */
-    EXPECT(V_BLOB_TUMBLE, KIND, 6, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_TUMBLE, KIND, 7, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, KIND, 0xFFFFFFFFu, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, LENGTH_WORD, 0xFFFFFFFFu, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, LENGTH_WORD, 3, IL_TABLE_CONTENT);
@@ -233,6 +243,9 @@ static void contents_that_cannot_be_are_refused(void) {
     EXPECT(V_BLOB_GYRO, BODY, 2, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_GYRO, BODY, 1, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_GYRO + 1, BODY + 24, nan_bits, IL_TABLE_NOT_FINITE);
+    EXPECT(V_BLOB_MAG, BODY, 3, IL_TABLE_CONTENT); /* order */
+    EXPECT(V_BLOB_MAG, BODY, 0, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_MAG + 1, BODY + 18, nan_bits, IL_TABLE_NOT_FINITE);
     EXPECT(V_BLOB_DRIFT, BODY, 2, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_DRIFT, BODY + 1, 2, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_DRIFT, BODY + 2, zero, IL_TABLE_CONTENT); /* highest level */
@@ -307,7 +320,7 @@ static void a_section_may_come_once(void) {
 }
 
 static void memory_is_checked(void) {
-    for (int b = V_BLOB_WARMUP; b < V_BLOBS; b++) {
+    for (int b = V_BLOB_WARMUP; b < V_BLOB_MAG; b++) {
         il_real memory[200];
         il_unit unit;
         size_t needed = 0;

@@ -1,4 +1,4 @@
-/* Accelerometer and gyroscope triads, and the flexible gyroscope's drift. */
+/* Accelerometer, gyroscope and magnetometer triads, and the flexible gyroscope's drift. */
 #include "check.h"
 #include "vectors.h"
 
@@ -324,6 +324,46 @@ static void centrifuge_corners(void) {
     CHECK(il_centrifuge_block(&c, 1, under, both) == IL_NOT_FINITE);
 }
 
+static il_mag golden_mag(int order) {
+    il_mag m;
+    m.order = order;
+    memcpy(m.gain, v_mag_gain, sizeof m.gain);
+    memcpy(m.bias, v_mag_bias, sizeof m.bias);
+    memcpy(m.turn, v_mag_turn, sizeof m.turn);
+    memcpy(m.quadratic, v_mag_quadratic, sizeof m.quadratic);
+    return m;
+}
+
+static void mag_equals_the_equations(void) {
+    const il_mag plain = golden_mag(1), bent = golden_mag(2);
+    il_real single[RATES][3], rows[RATES][3];
+    for (int k = 0; k < RATES; k++) {
+        il_real field[3];
+        CHECK(il_mag_apply(&plain, v_mag_output[k], field) == 0);
+        for (int i = 0; i < 3; i++) CHECK_CLOSE(field[i], v_mag_plain[k][i], ROUNDING_LIMIT * REAL(4));
+        CHECK(il_mag_apply(&bent, v_mag_output[k], single[k]) == 0);
+        for (int i = 0; i < 3; i++) CHECK_CLOSE(single[k][i], v_mag_field[k][i], ROUNDING_LIMIT * REAL(4));
+    }
+    memcpy(rows, v_mag_output, sizeof rows);
+    const il_real *const from[3] = {&rows[0][0], &rows[0][1], &rows[0][2]};
+    il_real *const to[3] = {&rows[0][0], &rows[0][1], &rows[0][2]};
+    CHECK(il_mag_block(&bent, RATES, from, 3, to, 3) == 0);
+    CHECK_SAME(&rows[0][0], &single[0][0], RATES * 3);
+}
+
+static void mag_corners(void) {
+    il_mag m = golden_mag(2);
+    il_real field[3];
+    for (int i = 0; i < 3; i++) {
+        il_real output[3] = {REAL(1), REAL(2), REAL(3)};
+        output[i] = i == 1 ? INF_REAL : NAN_REAL;
+        CHECK(il_mag_apply(&m, output, field) == IL_NOT_FINITE);
+        CHECK(!isfinite(field[0]) && !isfinite(field[1]) && !isfinite(field[2]));
+    }
+    const il_real far[3] = {REAL(0), REAL(1e5), REAL(0)}; /* beyond the turning point of 1 - 0.06 s */
+    CHECK(il_mag_apply(&m, far, field) == IL_BEYOND && isnan(field[0]));
+}
+
 void test_triads(void) {
     tumble_equals_the_equations();
     cross_terms_are_solved();
@@ -333,6 +373,8 @@ void test_triads(void) {
     second_order_is_solved_in_closed_form();
     gyro_equals_the_equations();
     gyro_corners();
+    mag_equals_the_equations();
+    mag_corners();
     centrifuge_equals_the_equations();
     centrifuge_corners();
 }

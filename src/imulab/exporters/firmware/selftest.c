@@ -41,6 +41,16 @@ static void run_gyro(void) {
 }
 #endif
 
+#if UNIT_HAS_MAG
+static void run_mag(void) {
+    for (int k = 0; k < GOLDEN_MAG; k++) {
+        il_real field[3];
+        (void)il_mag_apply(&unit_mag, golden_mag_output[k], field);
+        for (int i = 0; i < 3; i++) compare(field[i], golden_mag_field[k][i], golden_mag_scale);
+    }
+}
+#endif
+
 #if UNIT_HAS_CENTRIFUGE
 static void run_centrifuge(void) {
     for (int k = 0; k < GOLDEN_CENTRIFUGE; k++) {
@@ -101,6 +111,9 @@ int main(void) {
 #endif
 #if UNIT_HAS_GYRO
     run_gyro();
+#endif
+#if UNIT_HAS_MAG
+    run_mag();
 #endif
 #if UNIT_HAS_CENTRIFUGE
     run_centrifuge();
