@@ -44,8 +44,9 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+# All of it, quick parts first, into RESULTS.md; BENCH="tumble fleet" measures these parts alone and only prints.
 bench: $(STAMP) $(VENV)/.bench
-	$(BIN)/python benchmarks/run.py
+	$(BIN)/python benchmarks/run.py $(BENCH)
 
 # Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md.
 truth: $(STAMP)

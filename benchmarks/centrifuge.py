@@ -111,7 +111,7 @@ def _coverage(encoder: bool, trials: int) -> dict[str, float]:
     return coverage_of(trials, encoder=encoder)
 
 
-def coverage(trials: int = 2000) -> list[tuple[str, str, str]]:
+def coverage(trials: int = 400) -> list[tuple[str, str, str]]:
     """Coverage of the 95 % intervals on a shortened test (see tests/centrifuge_trials.py)."""
     found = []
     with ProcessPoolExecutor(2) as pool:  # no time is measured here

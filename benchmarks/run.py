@@ -10,6 +10,7 @@ import importlib
 import multiprocessing
 import platform
 import sys
+import time
 from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,16 +19,17 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 PARTS = {
     "house": "Starting",
-    "recordings": "Recordings",
-    "runtime": "The C core",
-    "tumble": "Tumble",
     "gyro_array": "Gyro array and Allan deviation",
+    "tumble": "Tumble",
+    "runtime": "The C core",
+    "growth": "Growth",
+    "recordings": "Recordings",
     "warmup": "Warm-up",
-    "centrifuge": "Centrifuge",
     "fleet": "Fleet",
     "accuracy": "Accuracy and real recordings",
-    "growth": "Growth",
+    "centrifuge": "Centrifuge",
 }
+"""From the quickest to the slowest."""
 PEERS = ("numpy", "scipy", "polars", "allantools", "filterpy", "imucal", "rosbags", "joblib", "dask")
 
 
@@ -38,9 +40,11 @@ def main(chosen: list[str]) -> None:
     lines = ["# Measurements", "", f"Made by `make bench`; medians of interleaved runs. {_versions()}."]
     for name in chosen or PARTS:
         lines += ["", f"## {PARTS[name]}", "", "| what | found | asked |", "|---|---|---|"]
+        begin = time.perf_counter()
         for what, found, asked in _rows(name):
             print(f"{what}: {found}" + (f" (asked: {asked})" if asked else ""), flush=True)
             lines.append(f"| {what} | {found} | {asked} |")
+        print(f"-- {PARTS[name]}: {time.perf_counter() - begin:.0f} s", flush=True)
     if not chosen:
         (HERE / "RESULTS.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 

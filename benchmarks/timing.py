@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -24,9 +26,21 @@ def seconds(*functions: Callable[[], object], repeats: int = 5) -> list[float]:
     return [statistics.median(collected) for collected in times]
 
 
-def process(*arguments: str) -> Callable[[], object]:
-    """A Python process with these arguments, as a function to time."""
-    return lambda: subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+def compiled() -> dict[str, str]:
+    """The environment, in which Python keeps what it compiles, as it does for those who install a package."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+
+
+def processor_seconds(*commands: list[str], repeats: int = 7) -> list[float]:
+    """Median processor time of each command, started in turn, after a first time that does not count."""
+    times: list[list[float]] = [[] for _ in commands]
+    for _ in range(repeats + 1):
+        for collected, command in zip(times, commands, strict=True):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            subprocess.run([sys.executable, *command], check=True, capture_output=True, env=compiled())
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            collected.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
+    return [statistics.median(collected[1:]) for collected in times]
 
 
 _MEASURER = """
@@ -46,8 +60,9 @@ def measured(*arguments: str, folder: str | Path = ".") -> tuple[float, float]:
     A small process stands between, because a child begins with the memory of the process that starts it.
     """
     done = subprocess.run(
-        [sys.executable, "-c", _MEASURER, sys.executable, *arguments], cwd=folder, capture_output=True, text=True
-    )
+        [sys.executable, "-c", _MEASURER, sys.executable, *arguments], cwd=folder, capture_output=True, text=True,
+        env=compiled(),
+    )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{' '.join(arguments)}: {done.stderr}")
     took, peak = map(float, done.stdout.split())
