@@ -419,7 +419,9 @@ def test_records_are_compared_from_their_files_as_by_the_command(tmp_path, capsy
     printed = json.loads(capsys.readouterr().out)
     assert [each["difference"] for each in printed["changes"]] == [each.difference for each in found.changes]
     assert set(printed) == {"changes", "probability", "left_out", "models"}
-    with pytest.raises(OptionError, match="compare_records: expected a record or the name of its file, found int 3"):
+    with pytest.raises(
+        OptionError, match="compare_records: second: expected a record or the name of its file, found 3"
+    ):
         il.compare_records(tmp_path / "1.json", 3)
 
 

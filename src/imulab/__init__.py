@@ -143,6 +143,11 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'imulab' has no attribute {name!r}")
     value = getattr(import_module(f"imulab.{_HOME[name]}"), name)
+    if not isinstance(value, type):
+        from imulab.arguments import checked
+
+        value = checked(value)
+        value.__module__ = __name__  # where pickle finds it
     globals()[name] = value
     return value
 

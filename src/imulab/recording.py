@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imulab.arguments import checked, described
 from imulab.columns import check_unit, element_number, expected_quantities, triad
-from imulab.errors import DataError, UnitError, quoted
+from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
@@ -71,7 +72,11 @@ class Recording:
     def __post_init__(self) -> None:
         for what in ("columns", "units", "metadata"):
             if not isinstance(getattr(self, what), Mapping):
-                raise DataError(f"{what}: expected a mapping from names, found {quoted(getattr(self, what))}")
+                raise DataError(f"{what}: expected a mapping from names, found {described(getattr(self, what))}")
+            for key, value in getattr(self, what).items():
+                if not (isinstance(key, str) and _is_column(value) if what == "columns" else isinstance(value, str)):
+                    expected = "an array of numbers, shape (n,)" if what == "columns" else "a text"
+                    raise DataError(f"{what}[{key!r}]: expected {expected}, found {described(value)}")
         lengths = {len(column) for column in self.columns.values()}
         if len(lengths) > 1:
             raise DataError(f"{self.name}: columns of different length: {sorted(lengths)}")
@@ -93,7 +98,12 @@ class Recording:
 
         return front.recording_html(self)
 
-    def plot(self, name: str | None = None) -> Plots | Plot:
+    @overload
+    def plot(self, name: None = None) -> Plots: ...
+    @overload
+    def plot(self, name: str | int) -> Plot: ...
+    @checked
+    def plot(self, name: str | int | None = None) -> Plots | Plot:
         """Return the columns over time, a figure for each sensor, or that of one sensor, such as ``"accel"``.
 
         Raises
@@ -194,11 +204,13 @@ class Recording:
                 return to_si(value, unit.symbol)
         return None
 
+    @checked
     def with_columns(self, columns: Mapping[str, Array], units: Mapping[str, str]) -> Recording:
         """Return a copy in which some columns are replaced (or added at the end)."""
         return replace(self, columns={**self.columns, **columns}, units={**self.units, **units})
 
     @classmethod
+    @checked
     def from_arrays(
         cls,
         *,
@@ -256,6 +268,7 @@ class Recording:
         return cls(found, symbols, metadata or {}, name)
 
     @classmethod
+    @checked
     def from_frame(
         cls,
         frame: Frame,
@@ -298,6 +311,7 @@ class Recording:
         found, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
         return cls(found, symbols, metadata or {}, name)
 
+    @checked
     def to_frame(self, library: str | None = None) -> Any:
         """Return a data frame with columns named ``name [unit]``: of pandas, or of the `library` ``"polars"``.
 
@@ -310,6 +324,10 @@ class Recording:
         """
         titled = {f"{name} [{self.units[name]}]": values for name, values in self.columns.items()}
         return data_frame(titled, library)
+
+
+def _is_column(values: object) -> bool:
+    return isinstance(values, np.ndarray) and values.ndim == 1 and values.dtype.kind in "iufb"
 
 
 def check_finite(recording: Recording, names: list[str]) -> None:

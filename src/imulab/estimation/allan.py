@@ -103,7 +103,10 @@ def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
         else:
             raise OptionError(f"taus {taus!r}: expected {' or '.join(TAUS)}")
     else:
-        counts = distinct(np.round(np.asarray(taus, dtype=np.float64) * rate).astype(np.int64))
+        times = np.asarray(taus, dtype=np.float64)
+        if not np.isfinite(times).all():
+            raise OptionError("taus: expected finite averaging times")
+        counts = distinct(np.round(times * rate).astype(np.int64))
     counts = counts[(counts >= 1) & (counts <= most)]
     if not counts.size:
         raise OptionError(f"taus: expected averaging times from {1 / rate:g} s to {most / rate:g} s")

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
 
+from imulab.arguments import Folder
 from imulab.atomic_write import write_text
 from imulab.errors import OptionError, first_of
 from imulab.fleet import figures, reporttables
@@ -34,7 +35,7 @@ _FEWEST_TO_DRAW = 4
 
 
 def write_fleet_report(
-    folder: str | PathLike[str],
+    folder: Folder,
     output: str | PathLike[str],
     *,
     limits: str | PathLike[str] | None = None,

@@ -12,6 +12,7 @@ from os import PathLike
 from pathlib import Path
 
 from imulab._version import VERSION
+from imulab.arguments import Folder
 from imulab.atomic_write import real_path, write_text
 from imulab.errors import OptionError, first_of
 from imulab.fleet.engine import Engine, open_engine
@@ -83,7 +84,7 @@ def default_history(folder: str | Path) -> str:
 
 def run_fleet(
     manifest: str | PathLike[str] | FleetManifest,
-    folder: str | PathLike[str],
+    folder: Folder,
     *,
     engine: str = "local",
     scheduler: str | None = None,
@@ -332,7 +333,7 @@ def _take(outcomes: Iterator[Outcome], keeper: _Keeper) -> None:
             keeper.take(outcome)
 
 
-def fleet_status(folder: str | PathLike[str]) -> FleetState:
+def fleet_status(folder: Folder) -> FleetState:
     """Return where a fleet stands, from its records alone.
 
     Parameters

@@ -123,6 +123,9 @@ def allan_deviation(
     if not isinstance(data, str | PathLike | Recording | Mapping) and not is_frame(data) and _is_line(data):
         if rate is None:
             raise OptionError("allan_deviation: samples without a time: expected rate=, in Hz")
+        for name, value in {**reading, "column": column, "window": window}.items():
+            if value is not None:
+                raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
         return _curve(allan.allan_deviation(np.asarray(data, dtype=np.float64), rate, taus))
     given: dict[str, Any] = {**reading, "rate": rate, "window": window}
     recording = as_recording(data, given, allan_deviation)

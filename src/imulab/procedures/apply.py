@@ -13,9 +13,9 @@ from typing import Any, Unpack
 from imulab.columns import KINDS, triad
 from imulab.device.blob import Blob
 from imulab.device.unit import DeviceUnit
-from imulab.errors import DataError, OptionError, RecordError
+from imulab.errors import DataError, RecordError
 from imulab.power_on import with_power_on_temperature
-from imulab.procedures.inputs import Data, Reading, as_recording, described
+from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.loading import load_any
 from imulab.procedures.procedure import Section
 from imulab.procedures.registry import procedure_of, section
@@ -95,7 +95,7 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
 
 
 def apply(
-    record: Calibration | Blob | Loaded | str | PathLike[str],
+    record: Record | Blob | Loaded,
     data: Data,
     *,
     again: bool = False,
@@ -146,8 +146,8 @@ def apply(
     if isinstance(record, str | PathLike):
         name = Path(record).name
         record = load_any(fspath(record))
-    if not isinstance(record, Calibration | Blob | Loaded):
-        raise OptionError(f"apply: expected a record or the name of its file, found {described(record)}")
+    if not isinstance(record, Blob | Loaded):
+        record = as_record(record, "apply")
     recording = as_recording(data, reading, apply)
     if isinstance(record, Loaded):
         ready = record

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from os import PathLike
 from typing import ClassVar
 
-from imulab.procedures.inputs import as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.registry import procedure_of
 from imulab.procedures.reports import change_unit
 from imulab.procedures.result import Drawn
@@ -51,7 +50,7 @@ TITLES = ["parameter", "change", "u", "change / u", "unit", ""]
 """Of `change_rows`."""
 
 
-def compare_records(first: Calibration | str | PathLike[str], second: Calibration | str | PathLike[str]) -> Changes:
+def compare_records(first: Record, second: Record) -> Changes:
     """Compare two records of one unit by one procedure, in units of their combined uncertainty.
 
     ``d = p_2 - p_1``, ``u^2(d) = u_1^2 + u_2^2`` less what both have in common; a change counts as significant where

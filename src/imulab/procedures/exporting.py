@@ -7,13 +7,14 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from imulab import exporters
+from imulab.arguments import Folder
 from imulab.device.array_settings import Fusion
 from imulab.errors import ImulabError, OptionError, listed
 from imulab.exporters import EXPORTERS, ExportOptions
-from imulab.procedures.inputs import as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.loading import load
 from imulab.procedures.registry import procedure_of
 from imulab.procedures.unit_tables import tables_of
@@ -21,7 +22,6 @@ from imulab.quantities import whole
 from imulab.records.calibration import Calibration
 from imulab.verdict import SENTENCES
 
-Record: TypeAlias = Calibration | str | PathLike[str]
 _FIRMWARE = ("c", "blob")
 _DEVICE_IDS = 2**32
 
@@ -33,7 +33,7 @@ def _nothing(message: str) -> None:
 def export(
     to: str,
     records: Record | Sequence[Record],
-    folder: str | PathLike[str],
+    folder: Folder,
     *,
     lossy: bool = False,
     device_id: int | str = 0,
@@ -89,7 +89,9 @@ def export(
         raise OptionError(f"device_id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
     if Path(folder).exists() and not Path(folder).is_dir():
         raise OptionError(f"{os.fspath(folder)}: expected a folder to write to, found a file")
-    given = [records] if isinstance(records, Calibration | str | PathLike) else list(records)
+    given = list(records) if isinstance(records, Sequence) and not isinstance(records, str) else [records]
+    if not given:
+        raise OptionError("export: records: expected one or more, found none")
     loaded = [load(os.fspath(one)) if isinstance(one, str | PathLike) else as_record(one, "export") for one in given]
     names = [os.fspath(one) if isinstance(one, str | PathLike) else "the record" for one in given]
     fusion = None if method is None and memory is None else _fusion(to, method, memory, loaded)

@@ -65,7 +65,7 @@ def html(record: Calibration) -> str:
     )
 
 
-def plots(record: Calibration, name: str | None) -> Plots | Plot:
+def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
     """Return the figures of a record's report, or the one of this name."""
     found = Plots(exhibits_of(record).figures, _title(record))
     return found if name is None else found[name]
@@ -102,7 +102,7 @@ def recording_html(recording: Recording) -> str:
     )
 
 
-def recording_plots(recording: Recording, name: str | None) -> Plots | Plot:
+def recording_plots(recording: Recording, name: str | int | None) -> Plots | Plot:
     """Return a recording's channels over time, a figure for each sensor, or the one of this name."""
     found = Plots(channel_figures(recording), recording.name)
     return found if name is None else found[name]

@@ -8,22 +8,25 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imulab.errors import DataError, OptionError, listed, quoted
+from imulab.arguments import check, described
+from imulab.errors import DataError, OptionError, listed
 from imulab.frames import Frame, columns_of_arrays, is_frame
-from imulab.quantities import span
+from imulab.procedures.result import Result
 from imulab.readers import Layout, read, read_blocks
-from imulab.readers.selection import Selection, of_element, windowed
+from imulab.readers.selection import Selection
+from imulab.readers.selection import Window as Window
 from imulab.recording import Recording, Source
 from imulab.records.calibration import Calibration
 
 Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mapping[str, ArrayLike]
 """A file, a recording, a data frame of pandas or polars, an array of samples, or arrays by name."""
-Window: TypeAlias = str | tuple[float | None, float | None]
+Record: TypeAlias = Calibration | Result | str | os.PathLike[str]
+"""A record, a fit that holds it, or its file."""
 
 
 class Part(TypedDict, total=False):
@@ -64,8 +67,10 @@ class Reading(Sampling, total=False):
     window: Window | None
 
 
+_HINTS = get_type_hints(Reading, include_extras=True)
 _OF_ARRAYS = ("rate", "time", "unit", "units")
 _OF_FILES = ("layout", "topic", "instance")
+_PART = ("window", "element")
 _TITLED = "a file says itself, by its titles or a layout"
 _EXPECTED = "a file name, a Recording, a data frame of pandas or polars, or arrays"
 
@@ -102,7 +107,7 @@ def as_recording(
     called = function.__name__
     check_keywords(reading, function)
     given = {key: value for key, value in reading.items() if value is not None}
-    part = _part(given, called)
+    part: dict[str, Any] = {key: given.get(key) for key in _PART}
     if isinstance(data, str | os.PathLike):
         _refuse(given, _OF_ARRAYS, called, _TITLED)
         return read(os.fspath(data), **_of(given, _OF_FILES), **part)
@@ -134,7 +139,7 @@ def as_blocks(
     check_keywords(reading, function)
     given = {key: value for key, value in reading.items() if value is not None}
     _refuse(given, _OF_ARRAYS, function.__name__, _TITLED)
-    part = _part(given, function.__name__)
+    part = _of(given, _PART)
     path, source = Path(data), None
     if path.is_file():
         with path.open("rb") as stream:
@@ -142,8 +147,8 @@ def as_blocks(
     return read_blocks(path, **_of(given, _OF_FILES), **part), source
 
 
-def as_record(record: Calibration | str | os.PathLike[str], called: str) -> Calibration:
-    """Return a record, read where its file is named.
+def as_record(record: Record, called: str) -> Calibration:
+    """Return a record: that of a fit, or read where its file is named.
 
     Raises
     ------
@@ -154,33 +159,28 @@ def as_record(record: Calibration | str | os.PathLike[str], called: str) -> Cali
     """
     if isinstance(record, Calibration):
         return record
+    if isinstance(record, Result):
+        return record.calibration
     if isinstance(record, str | os.PathLike):
         return Calibration.load(record)
     raise OptionError(f"{called}: expected a record or the name of its file, found {described(record)}")
 
 
-def check_keywords(given: Iterable[str], function: Callable[..., Any]) -> None:
+def check_keywords(given: Mapping[str, Any], function: Callable[..., Any]) -> None:
     """Refuse keywords that a function does not have.
 
     Raises
     ------
     OptionError
-        There is one; the message says which was meant.
+        There is one; the message says which was meant. Or one that says how data are to be read has another type.
     """
     own = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
     known = dict.fromkeys([*own, *Sampling.__annotations__, *Reading.__annotations__])
     for key in given:
         if key not in known:
             raise OptionError(f"{function.__name__}: unknown option {key!r}; known: {listed(known, key)}")
-
-
-def described(found: object) -> str:
-    """Return what was found in place of something else, for a message."""
-    if isinstance(found, Calibration):
-        return f"a {found.procedure} record (arguments in the wrong order?)"
-    if isinstance(found, Recording):
-        return f"the recording {found.name} (arguments in the wrong order?)"
-    return f"{type(found).__name__} {quoted(found)}"
+        if (hint := _HINTS.get(key)) is not None and given[key] is not None:
+            check(given[key], hint, f"{function.__name__}: {key}")
 
 
 def _array(data: object, called: str, name: str) -> NDArray[Any]:
@@ -197,24 +197,9 @@ def _array(data: object, called: str, name: str) -> NDArray[Any]:
     raise DataError(f"{called}: {name}: expected {_EXPECTED}, found {described(data)}")
 
 
-def _part(given: Mapping[str, Any], called: str) -> dict[str, Any]:
-    """Return window and element as `read` takes them."""
-    window, element = given.get("window"), given.get("element")
-    if isinstance(window, str):
-        window = span(window, f"{called}: window")
-    if window is not None and not (isinstance(window, tuple | list) and len(window) == 2):
-        raise OptionError(f"{called}: window {quoted(window)}: expected (FROM, TO) in s, such as (10, 60) or '10:60'")
-    for key in ("element", "instance"):
-        if (value := given.get(key)) is not None and (isinstance(value, bool) or not isinstance(value, int)):
-            raise OptionError(f"{called}: {key} {quoted(value)}: expected a whole number")
-    return {"window": None if window is None else tuple(window), "element": element}
-
-
-def _cut(recording: Recording, window: tuple[float | None, float | None] | None, element: int | None) -> Recording:
+def _cut(recording: Recording, window: Window | None, element: int | None) -> Recording:
     """Return one IMU of several, and what lies within a window of time."""
-    Selection(window=window, element=element)
-    name = recording.name
-    parts = list(windowed(of_element(iter([recording]), element, name), window, name))
+    parts = list(Selection(window=window, element=element).of(iter([recording]), recording.name))
     if len(parts) == 1:
         return parts[0]
     joined = {key: np.concatenate([part.columns[key] for part in parts]) for key in parts[0].columns}

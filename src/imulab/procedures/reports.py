@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
 
 from imulab import report
 from imulab.atomic_write import write_text
-from imulab.procedures.inputs import as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.procedure import Row
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
@@ -17,7 +15,6 @@ from imulab.records.comparison import Change
 from imulab.report.elements import Exhibits
 from imulab.units import STANDARD_GRAVITY, from_si
 
-Record: TypeAlias = Calibration | str | PathLike[str]
 _READ = {
     "rad/s": (from_si(1.0, "deg/h"), "deg/h"),
     "m/s^2": (from_si(1.0, "ug"), "µg"),

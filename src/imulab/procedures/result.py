@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, overload
 
+from imulab.arguments import checked
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits, Figure, ReportTable
 from imulab.shown import Shown
@@ -28,18 +29,26 @@ class Result:
     def _repr_html_(self) -> str:
         return self.calibration._repr_html_()
 
+    @checked
     def save(self, path: str | Path) -> None:
         """Write the record; errors as for `Calibration.save`."""
         self.calibration.save(path)
 
+    @checked
     def report(self, path: str | Path) -> None:
         """Write the report; errors as for `Calibration.report`."""
         self.calibration.report(path)
 
-    def plot(self, name: str | None = None) -> Plots | Plot:
+    @overload
+    def plot(self, name: None = None) -> Plots: ...
+    @overload
+    def plot(self, name: str | int) -> Plot: ...
+    @checked
+    def plot(self, name: str | int | None = None) -> Plots | Plot:
         """Return the report's figures, or one of them; see `Calibration.plot`."""
         return self.calibration.plot(name)
 
+    @checked
     def to_frame(self, library: str | None = None) -> Any:
         """Return the parameters as a data frame; see `Calibration.to_frame`."""
         return self.calibration.to_frame(library)
@@ -48,10 +57,12 @@ class Result:
         """Return the covariance; see `Calibration.cov`."""
         return self.calibration.cov(*names)
 
+    @checked
     def apply(self, data: Data, *, again: bool = False, **reading: Unpack[Reading]) -> Recording:
         """Return data corrected by the record; see `Calibration.apply`."""
         return self.calibration.apply(data, again=again, **reading)
 
+    @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
         """Write the record in the form of firmware or another program; see `Calibration.export`."""
         return self.calibration.export(target, folder, **options)
@@ -72,7 +83,12 @@ class Drawn(Shown):
         table = next((item for item in found.items if isinstance(item, ReportTable)), None)
         return found.headline, *(([], []) if table is None else (table.columns, table.rows))
 
-    def plot(self, name: str | None = None) -> Plots | Plot:
+    @overload
+    def plot(self, name: None = None) -> Plots: ...
+    @overload
+    def plot(self, name: str | int) -> Plot: ...
+    @checked
+    def plot(self, name: str | int | None = None) -> Plots | Plot:
         """Return the figures, which show themselves in a notebook, or the one whose title has these words.
 
         Raises

@@ -20,7 +20,7 @@ from imulab.columns import kind_of
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
 from imulab.readers.layout import IfNeeded, Layout, load_layout
-from imulab.readers.selection import Selection, of_element, windowed
+from imulab.readers.selection import Selection, Window
 from imulab.readers.text import TextFile
 from imulab.recording import Array, Recording, Source
 from imulab.verdict import Note
@@ -40,7 +40,7 @@ def read(
     *,
     topic: str | None = None,
     instance: int | None = None,
-    window: tuple[float | None, float | None] | None = None,
+    window: Window | None = None,
     element: int | None = None,
     name: str | None = None,
 ) -> Recording:
@@ -86,7 +86,7 @@ def read(
     selection = Selection(topic, instance, window, element)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
-    blocks = _told(windowed(of_element(_blocks(file, name, known, selection, hashed), element, name), window, name))
+    blocks = _told(selection.of(_blocks(file, name, known, selection, hashed), name))
     first, parts, notes = _gathered(blocks)
     source, units = Source(name, hashed.of(file)), first.units
     first = replace(first, columns={})
@@ -119,7 +119,7 @@ def read_blocks(
     *,
     topic: str | None = None,
     instance: int | None = None,
-    window: tuple[float | None, float | None] | None = None,
+    window: Window | None = None,
     element: int | None = None,
     name: str | None = None,
 ) -> Iterator[Recording]:
@@ -129,9 +129,7 @@ def read_blocks(
     """
     selection = Selection(topic, instance, window, element)
     name = name or _name(file)
-    yield from _told(
-        windowed(of_element(_blocks(file, name, _layout(layout), selection, None), element, name), window, name)
-    )
+    yield from _told(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
 
 
 def _told(blocks: Iterator[Recording]) -> Iterator[Recording]:

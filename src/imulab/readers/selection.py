@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
+from imulab.arguments import check_fields
 from imulab.columns import element_number
 from imulab.errors import OptionError
+from imulab.quantities import span
 from imulab.recording import Recording
+
+Ends: TypeAlias = tuple[float | None, float | None]
+Window: TypeAlias = Annotated[str | Ends, "(FROM, TO) in s, such as (10, 60) or '10:60'"]
+"""First and last time to read, s, each None for no bound; the bounds belong to the window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,24 +30,34 @@ class Selection:
     instance
         Number of the sensor in a flight log, from 0.
     window
-        First and last time to read, s, each None for no bound; the bounds belong to the window.
+        First and last time to read, s, each None for no bound; a text such as ``10:60`` is read.
     element
         Number of the IMU whose columns to read, from 1, in a file of several.
     """
 
     topic: str | None = None
     instance: int | None = None
-    window: tuple[float | None, float | None] | None = None
+    window: Window | None = None
     element: int | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.instance is not None and self.instance < 0:
             raise OptionError(f"instance {self.instance}: expected a number from 0")
         if self.element is not None and self.element < 1:
             raise OptionError(f"element {self.element}: expected a number from 1")
-        first, last = self.window or (None, None)
+        first, last = self.ends or (None, None)
         if first is not None and last is not None and not first < last:
             raise OptionError(f"window {first:g}:{last:g}: expected a start before its end")
+
+    @property
+    def ends(self) -> Ends | None:
+        """The window's first and last time, s; None where there is no window."""
+        return span(self.window, "window") if isinstance(self.window, str) else self.window
+
+    def of(self, blocks: Iterator[Recording], name: str) -> Iterator[Recording]:
+        """Pass on the rows of the element within the window; errors as for `of_element` and `windowed`."""
+        return windowed(of_element(blocks, self.element, name), self.ends, name)
 
     def refuse(self, name: str, kind: str, *, topic: bool = True, instance: bool = True) -> None:
         """Refuse choices that a kind of file cannot offer."""
@@ -50,9 +67,7 @@ class Selection:
             raise OptionError(f"{name}: {kind} has no instances to choose from; leave out the instance {self.instance}")
 
 
-def windowed(
-    blocks: Iterator[Recording], window: tuple[float | None, float | None] | None, name: str
-) -> Iterator[Recording]:
+def windowed(blocks: Iterator[Recording], window: Ends | None, name: str) -> Iterator[Recording]:
     """Pass on the rows within a time window, and stop reading behind it.
 
     Raises

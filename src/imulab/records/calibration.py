@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imulab._version import VERSION
+from imulab.arguments import checked
 from imulab.atomic_write import write_text
 from imulab.errors import RecordError
 from imulab.frames import data_frame
@@ -198,6 +199,7 @@ class Calibration:
         """Return the record as JSON text."""
         return self.sealed()[1]
 
+    @checked
     def save(self, path: str | Path) -> None:
         """Write the record, whole or not at all.
 
@@ -211,19 +213,26 @@ class Calibration:
         write_text(path, self.to_json())
 
     @classmethod
+    @checked
     def load(cls, path: str | PathLike[str]) -> Calibration:
         """Read a record; see `imulab.load`."""
         from imulab.procedures import front
 
         return front.load(Path(path))
 
+    @checked
     def report(self, path: str | Path) -> None:
         """Write the report as one HTML file; see `imulab.write_report`."""
         from imulab.procedures import front
 
         front.write_report(self, path)
 
-    def plot(self, name: str | None = None) -> Plots | Plot:
+    @overload
+    def plot(self, name: None = None) -> Plots: ...
+    @overload
+    def plot(self, name: str | int) -> Plot: ...
+    @checked
+    def plot(self, name: str | int | None = None) -> Plots | Plot:
         """Return the report's figures, which show themselves in a notebook, or the one whose title has these words.
 
         Raises
@@ -243,6 +252,7 @@ class Calibration:
 
         return front.plots(self, name)
 
+    @checked
     def to_frame(self, library: str | None = None) -> Any:
         """Return the parameters in SI as a data frame of pandas, or of the `library` ``"polars"``.
 
@@ -273,12 +283,14 @@ class Calibration:
         """
         return self.covariance.block(names) if names else self.covariance.array()
 
+    @checked
     def apply(self, data: Data, *, again: bool = False, **reading: Unpack[Reading]) -> Recording:
         """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`."""
         from imulab.procedures import front
 
         return front.apply_to(self, data, again, reading)
 
+    @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
         """Write the record in the form of firmware or another program; see `imulab.export` for targets and options."""
         from imulab.procedures import front

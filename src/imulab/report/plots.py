@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import sys
 from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -15,7 +15,7 @@ from typing import Any, overload
 from uuid import uuid4
 
 from imulab.atomic_write import replacing, write_text
-from imulab.errors import OptionError, file_name, listed
+from imulab.errors import OptionError, file_name, listed, quoted
 from imulab.report import json_for_script, render_page
 from imulab.report.elements import INK, Exhibits, Figure
 
@@ -111,18 +111,30 @@ class Plots(Sequence[Plot]):
     def __getitem__(self, which: int | str | slice) -> Plot | tuple[Plot, ...]:
         """Return a figure by its number, or by its title or words of it."""
         if not isinstance(which, str):
-            return self._plots[which]
+            try:
+                return self._plots[which]
+            except (IndexError, TypeError):
+                expected = f"a number from 0 to {len(self) - 1}, or one of {listed(map(repr, self.names), which)}"
+                raise OptionError(f"plot {quoted(which)}: expected {expected}") from None
         asked = which.lower()
         found = [plot for plot in self._plots if all(word in plot.name.lower() for word in asked.split())]
         first = [plot for plot in found if plot.name.lower().startswith(asked)]
         if len(first or found) == 1:
             return (first or found)[0]
-        names = [repr(plot.name) for plot in found or self._plots]
+        names = [repr(plot.name) for plot in found or self]
         problem = f"{len(found)} figures of that name" if found else "no such figure"
         raise OptionError(f"plot {which!r}: {problem}; expected one of {listed(names, which)}")
 
+    def __iter__(self) -> Iterator[Plot]:
+        return iter(self._plots)
+
     def __len__(self) -> int:
         return len(self._plots)
+
+    @property
+    def names(self) -> list[str]:
+        """Titles of the figures."""
+        return [plot.name for plot in self]
 
     def __repr__(self) -> str:
         shown = [f"  {number}  {plot.name}" for number, plot in enumerate(self._plots[:9])]

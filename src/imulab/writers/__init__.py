@@ -127,10 +127,13 @@ def _pyarrow() -> Any:
 
 
 def _several(blocks: Recording | Iterable[Recording]) -> Iterator[Recording]:
+    block = None
     for block in [blocks] if isinstance(blocks, Recording) else blocks:
         if not isinstance(block, Recording):
             raise DataError(f"expected a Recording to write, found {quoted(block)}")
         yield block
+    if not isinstance(blocks, Recording) and block is None:
+        raise DataError("expected a Recording to write, found none")
 
 
 def _title(name: str, unit: str) -> str:

@@ -183,6 +183,7 @@ def plan_centrifuge(
     for name, value in (
         ("DTG noise", dtg_noise), ("FOG noise", fog_noise),
         ("radius uncertainty", radius_uncertainty), ("rate uncertainty", rate_uncertainty),
+        ("static duration", static_duration),
     ):  # fmt: skip
         if value < 0:
             raise OptionError(f"{name} {value:.6g}: expected 0 or more")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from imulab.arguments import check_fields
 from imulab.device.array_settings import MOST_COUNT
 from imulab.device.blob import Blob
 from imulab.device.methods import METHODS, STARTS
@@ -74,6 +76,7 @@ class FuseOptions:
     still: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if self.method not in METHODS:
             raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
         if isinstance(self.memory, str):
@@ -102,6 +105,10 @@ class FuseOptions:
             )
         if self.rate is not None and not 0 < self.rate < 1e9:
             raise OptionError(f"rate {self.rate:g}: expected a positive number of Hz")
+        if not 0 <= self.rate_walk < math.inf:
+            raise OptionError(f"rate walk {self.rate_walk:g}: expected 0 or more")
+        if self.still is not None and not self.still[0] < self.still[1]:
+            raise OptionError(f"still {self.still[0]:g}:{self.still[1]:g}: expected a start before its end")
 
 
 @dataclass(frozen=True, repr=False)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
-from typing import Any, TypeAlias, Unpack, cast
+from typing import Annotated, Any, Unpack, cast
 
 from numpy.typing import NDArray
 
 from imulab.device.blob import Blob, is_blob, load_blob
 from imulab.device.methods import STARTS
-from imulab.errors import DataError, OptionError, quoted
+from imulab.errors import DataError, OptionError
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.fit import ArrayFit
@@ -20,12 +20,11 @@ from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.kalman import RATE_WALK
 from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
-from imulab.procedures.inputs import Data, Reading, as_record, as_recording
+from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording, check_keywords
 from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 
-Record: TypeAlias = Calibration | str | PathLike[str]
 _LABEL = "array: {}"
 
 
@@ -101,7 +100,7 @@ def calibrate_array(
 
 def fuse(
     data: Data,
-    options: FuseOptions | None = None,
+    options: Annotated[FuseOptions | None, "keywords, as in fuse(data, method='mean')"] = None,
     *,
     method: str | None = None,
     memory: str | float | None = None,
@@ -159,6 +158,7 @@ def fuse(
     True
     """
     given: dict[str, Any] = dict(reading)
+    check_keywords(given, fuse)
     nominal = given.pop("rate", None) if _has_time(data) else None
     recording = _timed(as_recording(data, given, fuse, gyros_of), "fuse")
     named = (method, memory, calibration, rate_walk, still, None if initial_bias == "first" else initial_bias, nominal)
@@ -167,8 +167,6 @@ def fuse(
         options = options if nominal is None else replace(options, rate=nominal)
     elif any(value is not None for value in named):
         raise OptionError("fuse: options together with other keywords: expected one or the other")
-    elif not isinstance(options, FuseOptions):
-        raise OptionError(f"fuse: options {quoted(options)}: expected keywords, as in fuse(data, method='mean')")
     return fuse_recording(recording, options, weights=weights, flags=flags)
 
 
@@ -218,11 +216,13 @@ def compare_methods(
     by = fusion_text(None, None if memory is None else str(memory), _LABEL, carried(record))
     gain: str | float = "growing" if by.memory is None else by.memory
     count = by.start if count_from is None else count_from
+    if count < 1:
+        raise OptionError(f"count_from {count}: expected 1 or more")
     return compare.compare_methods(recording, calibration=record, memory=gain, count_from=count)
 
 
 def merge_array(
-    recordings: Sequence[Data],
+    recordings: Annotated[Sequence[Data], "a list of recordings, one of each gyroscope"],
     *,
     axis: str | None = None,
     column: str | None = None,

@@ -218,6 +218,8 @@ def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[
     """
     names = [name for name in recording.columns if name != "time"]
     if columns is not None:
+        if not columns:
+            raise OptionError("columns: expected one or more, found none")
         for name in columns:
             if name not in names:
                 raise OptionError(f"{recording.name}: no column {name!r}; expected one of {listed(names, name)}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from imulab.errors import OptionError, listed
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
 from imulab.estimation.noise.terms import NAMES, SIGMA
 from imulab.estimation.noise.use import at_band_edge
-from imulab.procedures.inputs import as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.noise.coefficients import Markov, given_terms
 from imulab.procedures.noise.engineering import label, shown
 from imulab.procedures.noise.sections import fit_of
@@ -197,7 +196,7 @@ def _row(each: PlannedTerm) -> list[str]:
 
 def plan_noise(
     *,
-    from_: Calibration | str | PathLike[str] | None = None,
+    from_: Record | None = None,
     for_: float | str | Mapping[str, float | str] = WANTED,
     white: float | str | None = None,
     flicker: float | str | None = None,

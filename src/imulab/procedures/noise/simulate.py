@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
 
 import numpy as np
 
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.noise.simulate import simulated
-from imulab.procedures.inputs import as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.noise.coefficients import Markov, by_name, given_terms
 from imulab.procedures.noise.record import unit_of
 from imulab.procedures.noise.sections import fit_of
@@ -64,7 +63,7 @@ class NoiseLog:
 
 def noise_log(
     *,
-    from_: Calibration | str | PathLike[str] | None,
+    from_: Record | None,
     white: float | str | None,
     flicker: float | str | None,
     walk: float | str | None,
@@ -139,7 +138,7 @@ def simulate_noise(
     walk: float | str | None = None,
     quantisation: float | str | None = None,
     gm: Markov | Sequence[Markov] | None = None,
-    from_: Calibration | str | PathLike[str] | None = None,
+    from_: Record | None = None,
     rate: float | str | None = None,
     duration: float | str = DURATION,
     columns: str | Sequence[str] | None = None,

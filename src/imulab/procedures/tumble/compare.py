@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import ClassVar, Unpack
 
 import numpy as np
@@ -12,7 +11,7 @@ from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.ranked import median
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Reading, as_record
+from imulab.procedures.inputs import Reading, Record, as_record
 from imulab.procedures.result import Drawn
 from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -92,7 +91,7 @@ class Check(Drawn):
 
 
 def check_tumble(
-    record: Calibration | str | PathLike[str],
+    record: Record,
     data: TumbleData,
     *,
     limit: float | None = None,

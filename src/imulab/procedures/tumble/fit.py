@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Unpack
 
 import numpy as np
@@ -18,7 +17,7 @@ from imulab.estimation.least_squares import (
     observability,
 )
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Reading, as_record
+from imulab.procedures.inputs import Reading, Record, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.advice import helpful_attitudes
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -79,7 +78,7 @@ def fit_tumble(
     method: str = "norm",
     loss: str = "auto",
     nonlinearity: tuple[float, float] | None = None,
-    prior: Calibration | str | PathLike[str] | None = None,
+    prior: Record | None = None,
     ageing: Sequence[float] = (),
     monte_carlo: int | None = None,
     cross: bool = False,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any, Unpack
 
-from imulab.procedures.inputs import Data, Reading, as_record, as_recording
+from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.tumble import gyro
 from imulab.procedures.tumble.gyro import GyroFit
@@ -25,7 +25,7 @@ class BothTriads(Result):
 
 
 def fit_gyro(
-    record: Calibration | str | PathLike[str],
+    record: Record,
     data: Data,
     *,
     accel_data: Data | None = None,
@@ -33,7 +33,7 @@ def fit_gyro(
     g_sensitivity: str = "auto",
     clock: float | str = "50 ppm",
     clock_of: str = "gyro",
-    noise: Calibration | str | PathLike[str] | None = None,
+    noise: Record | None = None,
     **reading: Unpack[Reading],
 ) -> BothTriads:
     """Calibrate a gyroscope triad from the turns between static attitudes.

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.errors import SegmentError
+from imulab.errors import OptionError, SegmentError
 from imulab.estimation.ranked import median, quantile
 from imulab.estimation.rows import leave_out
 from imulab.procedures.inputs import Data, Sampling, as_recording
@@ -113,6 +113,9 @@ def find_attitudes(
     >>> il.find_attitudes(il.simulate_tumble(attitudes=24).triad("accel"), rate=100.0, unit="m/s^2")
     Attitudes(24 of arrays, in m/s^2)
     """
+    for name, value in (("window", window), ("settling", settling), ("shortest", shortest)):
+        if value < 0:
+            raise OptionError(f"{name} {value:g} s: expected 0 or more")
     recording = as_recording(data, reading, find_attitudes, lambda samples: {sensor: samples})
     unit = recording.triad_unit(sensor)
     names = triad(sensor)

@@ -121,10 +121,15 @@ def simulate_tumble(
         directions = _spread(whole(attitudes, "attitudes"), rng)
     else:
         directions = np.asarray(attitudes, dtype=np.float64)
+        if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():
+            raise OptionError(f"attitudes: expected upward directions, shape (n, 3), found shape {directions.shape}")
     if knock is not None and not 1 <= knock <= len(directions):
         raise OptionError(f"knock {knock}: expected the number of an attitude, 1 to {len(directions)}")
     nominal = _nominal_scale(unit, scale)
-    sensor = dict(truth) if truth is not None else _random_sensor(rng, order, nominal)
+    sensor = _random_sensor(rng, order, nominal) if truth is None else dict(truth)
+    for name in _random_sensor(np.random.default_rng(0), 1, nominal):
+        if name not in sensor:
+            raise OptionError(f"truth: no {name!r}; expected bias, scale factor and misalignment of each axis")
     samples = len(directions) * (hold + move) * sample_rate
     if samples > _MOST_SAMPLES:
         raise OptionError(f"{samples:.3g} samples of all attitudes together: expected at most {_MOST_SAMPLES:.0e}")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.arguments import Folder
 from imulab.atomic_write import write_text
 from imulab.errors import OptionError
 from imulab.procedures.tumble.simulate import simulate_tumble
@@ -26,7 +27,7 @@ LIMITS = """[tumble]
 """
 
 
-def simulate_fleet(folder: str | Path, *, units: int | str = 12, seed: int | str = 1) -> tuple[Path, Path]:
+def simulate_fleet(folder: Folder, *, units: int | str = 12, seed: int | str = 1) -> tuple[Path, Path]:
     """Write the recordings of a line's units, two manifests and limits; return the paths of the manifests.
 
     ``first.csv`` calibrates every unit, one a day; ``second.csv`` the same units half a year later. The zero of z

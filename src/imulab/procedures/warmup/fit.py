@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
-from imulab.frames import is_frame
 from imulab.procedures.inputs import Data, Reading, as_blocks
 from imulab.procedures.result import Result
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, settling_size
@@ -31,7 +29,7 @@ from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
 from imulab.quantities import in_si
-from imulab.recording import Array, Recording
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
 TOLERANCE = 1.0
@@ -66,7 +64,7 @@ class WarmupFit(Result):
 
 
 def fit_warmup(
-    cycles: Sequence[Cycle | Data],
+    cycles: Annotated[Sequence[Cycle | Data], "a list of power cycles, one for each test"],
     *,
     model: str = "auto",
     temperatures: Sequence[float] = SOURCE_TEMPERATURES,
@@ -132,9 +130,6 @@ def fit_warmup(
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
     """
     at = check_options(model, temperatures, tolerance, settling_time, exit, taper_time, pool, beyond)
-    single = isinstance(cycles, str | PathLike | Recording | Mapping | np.ndarray) or is_frame(cycles)
-    if single or not isinstance(cycles, Iterable):
-        raise DataError("fit_warmup: expected a list of power cycles, one for each test, found a single one")
     given = list(cycles)
     if not given:
         raise DataError("no power cycles: expected at least one file for each calibration temperature")
@@ -149,7 +144,11 @@ def fit_warmup(
     found = [with_axes(cycle, order) for cycle in found]
     _check_units(found, pool)
     named = settling_size(settling_limit, "settling_limit") if isinstance(settling_limit, str) else settling_limit
-    limit = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE) | dict(named)
+    limit = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE)
+    for kind in named:
+        if kind not in limit:
+            raise OptionError(f"settling_limit {kind!r}: expected limits for {listed(limit, kind)}")
+    limit |= named
     curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limit)
     spread = repeatability(curves)
     by_unit = pool == "type" and np.unique(curves.unit).size > 1

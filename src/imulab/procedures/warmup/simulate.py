@@ -137,6 +137,12 @@ def simulate_power_cycle(
     'SIM-0001'
     """
     _check(temperature, law, duration, sample_rate, repeatability, scatter)
+    for name, value in (
+        ("random_walk", random_walk), ("accel_random_walk", accel_random_walk), ("unit_spread", unit_spread),
+        ("seed", min(np.atleast_1d(seed).tolist(), default=0)),
+    ):  # fmt: skip
+        if value < 0:
+            raise OptionError(f"{name} {value:g}: expected 0 or more")
     rng = np.random.default_rng(seed)
     unit = np.random.default_rng(list(serial.encode()))
     power_on = temperature + float(np.clip(scatter * rng.standard_normal(), -1.0, 1.0))

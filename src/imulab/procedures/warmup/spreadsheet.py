@@ -16,6 +16,7 @@ import numpy as np
 from imulab.atomic_write import write_text
 from imulab.device.blob import is_blob
 from imulab.errors import OptionError, ReadError, RecordError, UnitError, listed
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.warmup.choices import MODELS
 from imulab.procedures.warmup.model import WarmupTable, check_table, record_table
 from imulab.procedures.warmup.solve import amplitude_slopes
@@ -67,7 +68,7 @@ class TableSheet(Shown):
             self.record.save(path)
 
 
-def warmup_table(data: Calibration | str | PathLike[str], *, per_second: bool = False) -> TableSheet:
+def warmup_table(data: Record, *, per_second: bool = False) -> TableSheet:
     """Return the table of a warm-up record as CSV, or a record made of such a table, which was edited.
 
     Parameters
@@ -97,8 +98,6 @@ def warmup_table(data: Calibration | str | PathLike[str], *, per_second: bool = 
     'warmup'
     """
     if not isinstance(data, Calibration):
-        from imulab.procedures.inputs import as_record
-
         file = os.fspath(data) if isinstance(data, str | PathLike) else None
         if file is not None and not (is_json(file) or is_blob(file)):  # a blob is refused as a record, with the reason
             made = record_of_table(read_table(file), file)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Unpack
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, listed, quoted
 from imulab.estimation.least_squares import chi_square_probability, f_test
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Reading, as_record
+from imulab.procedures.inputs import Reading, Record, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_from
@@ -73,7 +72,7 @@ class MagFit(Result):
 def fit_mag(
     data: TumbleData,
     *,
-    accel: Calibration | str | PathLike[str] | None = None,
+    accel: Record | None = None,
     same_direction: Sequence[str | Sequence[int]] = (),
     field: float | str | None = None,
     loss: str = "auto",

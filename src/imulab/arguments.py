@@ -1,0 +1,193 @@
+"""What a function is called with, held to its annotations: a wrong type or an unknown keyword ends in one sentence."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache, wraps
+from numbers import Integral, Real
+from os import PathLike
+from types import UnionType
+from typing import Annotated, Any, ParamSpec, TypeAlias, TypeVar, Union, get_args, get_origin
+
+from imulab.errors import OptionError, listed, quoted
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_WORDS = {float: "a number", int: "a whole number", bool: "True or False", str: "a text", Callable: "a function"}
+_NAMES = {"Calibration": "a record", "Result": "a record", "Loaded": "a record", "ndarray": "numbers"}
+Folder: TypeAlias = Annotated[str | PathLike[str], "the name of a folder"]
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a function that refuses, before it does anything, arguments of other types than its annotations have.
+
+    What may be a number or a text is left to the function, which knows its unit, and so is what is annotated with a
+    type that stands for anything. ``Annotated[TYPE, "a list of ..."]`` says what a message calls a type.
+
+    Raises
+    ------
+    OptionError
+        An argument has another type or is NaN, is missing, or is none of the function's.
+    """
+
+    @wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        _check_call(function, args, kwargs)
+        return function(*args, **kwargs)
+
+    return called
+
+
+def check(value: object, hint: Any, called: str) -> None:
+    """Refuse a value of another type; `called` is how the message names it; errors as for `checked`."""
+    members = set(_members(hint))
+    if (str in members and members & {float, int}) or _fits(value, hint):
+        return
+    for each in members:
+        if get_origin(each) is Mapping and isinstance(value, Mapping):
+            for key, item in value.items():
+                check(item, get_args(each)[1], f"{called}[{key!r}]")
+    raise OptionError(f"{called}: expected {_expected(hint)}, found {described(value)}")
+
+
+def check_fields(instance: Any) -> None:
+    """Refuse fields of a dataclass that have other types than its annotations; errors as for `checked`."""
+    kind: Any = type(instance)
+    for name, hint in hints(kind).items():
+        check(getattr(instance, name), hint, name)
+
+
+@cache
+def hints(owner: Any) -> dict[str, Any]:
+    """Return the types that the annotations of a function or class name, where they are known at run time."""
+    names = vars(sys.modules[owner.__module__])
+    found: dict[str, Any] = {}
+    for name, text in inspect.get_annotations(owner).items():
+        try:
+            found[name] = eval(text, names) if isinstance(text, str) else text
+        except NameError:  # imported for type checkers alone
+            continue
+    return found
+
+
+def described(found: object) -> str:
+    """Return what was found in place of something else, for a message."""
+    kind = type(found)
+    if kind.__name__ == "Calibration":
+        return f"a {getattr(found, 'procedure', '')} record (arguments in the wrong order?)"
+    if kind.__name__ == "Recording":
+        return f"the recording {getattr(found, 'name', '')} (arguments in the wrong order?)"
+    if kind.__module__.partition(".")[0] == "imulab":
+        return kind.__name__
+    shape = getattr(found, "shape", None)
+    return f"{kind.__name__} of shape {shape}" if isinstance(shape, tuple) and shape else quoted(found)
+
+
+def _check_call(function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+    name, signature = function.__qualname__, inspect.signature(function)
+    own = {key: p for key, p in signature.parameters.items() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    try:
+        given = signature.bind(*args, **kwargs).arguments
+    except TypeError as error:
+        for key in kwargs.keys() - own.keys():
+            raise OptionError(f"{name}: unknown option {key!r}; known: {listed(own, key)}") from None
+        shown = (f"{key}=" if p.kind is p.KEYWORD_ONLY else key for key, p in own.items() if key not in ("self", "cls"))
+        raise OptionError(f"{name}: {error}; expected {name}({', '.join(shown)})") from None
+    for key, hint in hints(function).items():
+        if key in own and key in given:
+            check(given[key], hint, f"{name}: {key}")
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Return whether a value has a type, as far as that can be told from the value."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind is Annotated:
+        return _fits(value, inner[0])
+    if kind in (Union, UnionType):
+        return any(_fits(value, each) for each in inner)
+    if kind in (None, Any):
+        return kind is Any or value is None
+    if kind in (float, int):
+        number = isinstance(value, Real if kind is float else Integral) and not isinstance(value, bool)
+        return number and value == value  # not NaN
+    if kind is bool:
+        return isinstance(value, bool) or type(value).__name__ in ("bool", "bool_")
+    if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
+        return True
+    if issubclass(kind, Mapping):
+        return isinstance(value, Mapping) and all(_fits(each, inner[1]) for each in value.values())
+    if issubclass(kind, PathLike):
+        return isinstance(value, PathLike)
+    if kind.__name__ == "ndarray":
+        return _is_numeric(value)
+    if issubclass(kind, Iterable) and inner:
+        return isinstance(value, Iterable) and _fits_list(value, inner)
+    return isinstance(value, kind)
+
+
+def _fits_list(value: Iterable[object], inner: tuple[Any, ...]) -> bool:
+    """Return whether what is iterated over is a list whose items have a type, or these types one after the other."""
+    if isinstance(value, str | bytes | Mapping):
+        return False
+    if hasattr(value, "__array__") and not {*_members(inner[0])} <= {float, int, str}:  # samples or a data frame
+        return False
+    if not hasattr(value, "__len__"):  # read as it is used
+        return True
+    items = list(value)
+    types = inner if len(inner) > 1 and inner[1] is not Ellipsis else inner[:1] * len(items)
+    return len(items) == len(types) and all(map(_fits, items, types))
+
+
+def _is_numeric(value: object) -> bool:
+    import numpy as np
+
+    try:
+        return np.asarray(value).dtype.kind in "iuf"
+    except ValueError:  # rows of different length
+        return False
+
+
+def _members(hint: Any) -> tuple[Any, ...]:
+    """Return the types of a union, without None."""
+    if get_origin(hint) is Annotated:
+        return _members(get_args(hint)[0])
+    found = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return tuple(each for each in found if each is not type(None))
+
+
+def _expected(hint: Any) -> str:
+    """Return a type in words."""
+    for each in (hint, *_members(hint)):
+        if get_origin(each) is Annotated:
+            return str(get_args(each)[1])
+    members = _members(hint)
+    words = [_word(each) for each in members]
+    if "" in words:  # a path
+        others = [word for word, each in zip(words, members, strict=True) if word and each is not str]
+        words = [*others, f"the name of {'its' if others else 'a'} file"]
+    return " or ".join(dict.fromkeys(words))
+
+
+def _word(hint: Any) -> str:
+    """Return one type in words, nothing for that of a path."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if isinstance(kind, type) and issubclass(kind, PathLike):
+        return ""
+    if kind is tuple and inner[-1] is not Ellipsis:
+        return f"{len(inner)} {'numbers' if {float, int} & set(_members(inner[0])) else 'items'}"
+    if isinstance(kind, type) and issubclass(kind, Mapping):
+        return "a mapping from names"
+    if inner and kind is not Callable:
+        words = {float: "numbers", int: "whole numbers", str: "a list of texts"}
+        return words.get(inner[0]) or (f"a list of {_named(inner[0])[2:]}s" if isinstance(inner[0], type) else "a list")
+    return _WORDS.get(kind) or _named(kind)
+
+
+def _named(kind: Any) -> str:
+    """Return what a message calls a class: ``a fused`` for Fused, ``a record`` for what is one."""
+    name = getattr(kind, "__name__", str(kind))
+    return _NAMES.get(name) or "a " + re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()
