@@ -40,6 +40,11 @@ class Device:
         self._pieces, self._rate, self._patient = pieces, rate, patient
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
+        if not patient:
+            self.begin()
+
+    def begin(self) -> None:
+        """Send; a patient one waits until it is told that somebody listens, since opening a port empties it."""
         self._thread.start()
 
     def _run(self) -> None:
@@ -84,7 +89,8 @@ class Device:
     def unplug(self) -> None:
         """Close the device's end: whoever reads or writes at the port gets an error."""
         self._stop.set()
-        self._thread.join(2.0)
+        if self._thread.ident is not None:
+            self._thread.join(2.0)
         with suppress(OSError):
             os.close(self.end)
 
@@ -118,6 +124,7 @@ class Process:
             text=True,
             **options,
         )
+        self.stdin = self._process.stdin
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -164,6 +171,9 @@ class Process:
         self._reader.join(5.0)
         if not self._reader.is_alive() and self._process.stdout is not None:
             self._process.stdout.close()
+        if self.stdin is not None:
+            with suppress(OSError):
+                self.stdin.close()
         return status
 
 

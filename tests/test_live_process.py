@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab.gravity import Gravity
+from imulab.live.runner import Runner
+from imulab.live.session import Session
+from imulab.live.sources import open_source
 from liveports import content, device, lines_of, live
 
 pytest.importorskip("serial", reason="pyserial is in the extra [live]")
@@ -116,3 +120,36 @@ def test_unplugged_in_the_middle(tmp_path):
     assert last.endswith(" attitudes: --resume goes on with it")
     assert not (tmp_path / "live.json").exists()
     assert len(il.find_attitudes(il.read(tmp_path / "rec.csv"))) >= 3
+
+
+def test_the_gyroscopes_follow_the_accelerometers(tmp_path):
+    recording = tumble(20, gyro=True)
+    with device(lines_of(recording), 100 * SPEED) as unit:
+        words = [f"serial:{unit.port}", "--plain", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "live.json"]
+        with live(words, tmp_path) as process:
+            assert process.ended(60) == 0, process.text
+    fitted(tmp_path, *FIT)
+    words = ["tumble", "gyro", "rec.csv", "--accel", "fit.json", "-o", "both.json"]
+    subprocess.run([sys.executable, "-m", "imulab", *words], cwd=tmp_path, capture_output=True, timeout=60, check=True)
+    assert content(tmp_path / "live.json") == content(tmp_path / "both.json")
+    assert "gyro_scale_factor_x" in content(tmp_path / "live.json")["parameters"]
+
+
+def test_the_view_has_the_gyroscopes_while_the_session_lasts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    recording = tumble(14, gyro=True)
+    il.write_csv(recording, "given.csv")
+    session = Session(1, Gravity(9.81, "test"), (), 14)
+    runner = Runner.open(lambda: open_source("replay:given.csv@40"), session, "rec.csv", None, resume=False)
+    end, said = time.monotonic() + 40, []
+    try:
+        while time.monotonic() < end and not said:
+            said += [event.text for event in runner.step(0.05) if event.kind == "gyro"]
+        rows = {row.name: row for row in session.view().parameters}
+    finally:
+        runner.close()
+    assert said == ["the gyroscopes are calibrated from the turns so far; each attitude makes them better"]
+    for axis in "xyz":
+        bias, truth = rows[f"gyro_bias_{axis}"], float(recording.metadata[f"truth_gyro_bias_{axis}"])
+        assert abs(bias.value - np.degrees(truth)) < 6 * bias.standard_uncertainty
+        assert rows[f"gyro_scale_factor_{axis}"].standard_uncertainty is not None

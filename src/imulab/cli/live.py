@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from imulab.live.formats import UnknownFormatError
     from imulab.live.runner import Runner
     from imulab.readers.layout import Layout
+    from imulab.records.calibration import Calibration
 
 _WAIT = 0.05
 _EVERY = 0.1
@@ -54,6 +55,7 @@ def live(
     """
     from imulab.cli.result import finish
     from imulab.live.formats import UnknownFormatError
+    from imulab.live.gyros import with_gyroscopes
     from imulab.live.runner import Runner
     from imulab.live.session import Session
     from imulab.live.sources import open_source
@@ -77,16 +79,34 @@ def live(
     check_outputs([save, output, report], [name for name in (*replayed, layout) if name])
     known = _layout(layout)
     runner = Runner.open(lambda: open_source(source, layout, follow=follow), session, save, known, resume=resume)
+    plain = plain or not sys.stdout.isatty()
     try:
-        (_plain if plain or not sys.stdout.isatty() else _drawn)(runner, typed=source != "-")
+        (_plain if plain else _drawn)(runner, typed=source != "-")
+        runner.recorder.close()
+        record, why = with_gyroscopes(run_task("tumble", [save], {**options, "layout": None}, GivenFiles()), save)
+        finish(record, output, report, json=False)
+        _say_how(record, save, output, why)
+        if not plain and source != "-":
+            _corrected(runner, record)
     except UnknownFormatError as error:
         _offer(error)
         raise
+    except KeyboardInterrupt:
+        note(runner.kept())
+        raise
     finally:
         runner.close()
-    record = run_task("tumble", [save], {**options, "layout": None}, GivenFiles())
-    finish(record, output, report, json=False)
-    note(f"the recording is {save}; imulab tumble fit {save} makes the same record")
+
+
+def _say_how(record: Calibration, save: str, output: str | None, why: str) -> None:
+    """Say which commands make the same record, and why it has no gyroscopes where it should."""
+    gyros = any(name.startswith("gyro_") for name in record.parameters)
+    same = f"imulab tumble fit {save} makes the same record"
+    if gyros:
+        same = f"imulab tumble fit {save} -o accel.json and imulab tumble gyro {save} --accel accel.json make the same"
+    note(f"the recording is {save}; {same}")
+    if why:
+        note(why)
 
 
 def _layout(name: str | None) -> Layout | None:
@@ -118,6 +138,28 @@ def _offer(error: UnknownFormatError) -> None:
         print(f"{head}\n{error.guess.toml}", file=sys.stderr)
 
 
+def _corrected(runner: Runner, record: Calibration) -> None:
+    """Show what the record makes of the readings that still come, until a key is pressed or the stream ends."""
+    from time import monotonic
+
+    from rich.live import Live
+
+    from imulab.live.corrected import corrected_reading
+    from imulab.live.terminal import keys, pressed
+    from imulab.procedures.apply import loaded
+
+    ready, gravity = loaded(record), runner.session.guide.local_gravity
+    gyro = any(name.startswith("gyro_") for name in record.parameters)
+    with keys(wanted=True) as usable, Live(auto_refresh=False, transient=True) as screen:
+        drawn = 0.0
+        while usable and not runner.ended and not pressed(usable):
+            blocks = runner.listen(_WAIT)
+            if blocks and monotonic() - drawn > _EVERY:
+                reading = corrected_reading(ready, blocks[-1], gyro=gyro).text(gravity)
+                screen.update(f"turn the unit and see: {reading}   any key ends", refresh=True)
+                drawn = monotonic()
+
+
 def _plain(runner: Runner, *, typed: bool) -> None:
     """Print a line for each event, until it is enough or the stream ends."""
     while not runner.ended and not runner.session.enough:
@@ -143,8 +185,8 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
             if key == "u":
                 events += runner.drop()
             for event in events:
-                if event.kind in ("accepted", "knocked", "warning", "dropped", "enough"):
+                if event.kind not in ("state", "next", "format"):
                     screen.console.print(f"{event.time:8.1f} s  {event.text}", markup=False, highlight=False)
             if events or monotonic() - drawn > _EVERY:
-                screen.update(draw(runner.session.view()), refresh=True)
+                screen.update(draw(runner.session.view(), *screen.console.size), refresh=True)
                 drawn = monotonic()

@@ -20,7 +20,7 @@ FIRST = 2.0
 """So many seconds of a stream say what it is."""
 _MOST = 1 << 18
 _SILENT = 0.5
-_POLL_EVERY, _POLL_AGAIN = 0.005, 0.1
+_POLL_AGAIN = 0.1
 _TEXT = bytes(range(32, 127)) + b"\r\n\t"
 _MOSTLY = 0.9
 STRAIGHTENED = "arrival time, straightened by a robust line"
@@ -86,9 +86,11 @@ class Stream:
         UnknownFormatError
             Two seconds have passed, and the stream is none of the known.
         """
-        self._poll(data, arrival)
         if self._decoder is not None:
-            return self._blocks([(data, arrival)])
+            blocks = self._blocks([(data, arrival)])
+            self._poll(bool(blocks), arrival)
+            return blocks
+        self._poll(bool(data), arrival)
         if data:
             self._first = arrival if self._first is None else self._first
             self._held.append((data, arrival))
@@ -148,7 +150,7 @@ class Stream:
             metadata["time"] = STRAIGHTENED
         return Recording(columns, units, metadata, self._source)
 
-    def _poll(self, data: bytes, now: float) -> None:
+    def _poll(self, answered: bool, now: float) -> None:
         """Ask a flight controller for its readings: where nothing comes unasked, and again after each answer."""
         self.to_send = b""
         if not self._polled:
@@ -156,8 +158,9 @@ class Stream:
         if self._asked is None:
             self._asked = now + _SILENT - _POLL_AGAIN  # what speaks by itself is given the time to do so
         waited = now - self._asked
-        silent = not self._held or all(looks_like_msp(d) or d[:1] == b"$" for d, _ in self._held)
-        if silent and waited >= (_POLL_EVERY if data else _POLL_AGAIN):
+        answers = isinstance(self._decoder, Msp)
+        silent = answers or not self._held or all(looks_like_msp(d) or d[:1] == b"$" for d, _ in self._held)
+        if silent and waited >= (0 if answered else _POLL_AGAIN):
             self.to_send, self._asked = Msp.poll, now
 
     def _recognised(self, head: bytes) -> Decoder:

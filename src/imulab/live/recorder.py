@@ -108,19 +108,19 @@ class Recorder:
         OptionError
             It cannot be written.
         """
-        data = memoryview(b"".join(self._waiting))
+        whole, done = b"".join(self._waiting), 0
         self._waiting, self._written = [], now
-        size = len(data)
         try:
-            while data:
-                data = data[self._file.write(data) :]
+            while done < len(whole):
+                done += self._file.write(memoryview(whole)[done:])
         except OSError as error:
+            self._good += whole.rfind(b"\n", 0, done) + 1
             self._file.truncate(self._good)
             why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
             raise OptionError(
                 f"{self.path}: cannot be written on: {why}; what came before is kept, and --resume goes on with it"
             ) from None
-        self._good += size
+        self._good += len(whole)
 
     def tick(self, now: float) -> None:
         """Write out what has waited for a second where the stream has stopped."""

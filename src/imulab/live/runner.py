@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from imulab.columns import triad
 from imulab.errors import ReadError
 from imulab.live.formats import Stream
+from imulab.live.gyros import GyroFits
 from imulab.live.recorder import Recorder
 from imulab.live.session import Event, Session
 from imulab.live.sources import Source
@@ -25,6 +27,8 @@ class Runner:
         self._stream = Stream(source.name, layout, polled=source.polled)
         self._heard = source.now()
         self._silent = False
+        self._gyros: GyroFits | None = None
+        self._fit_due = False
         session.source = source.name
         for block in recorder.before():
             session.feed(block)
@@ -78,14 +82,16 @@ class Runner:
             events += self._take(self._stream.finish(), now)
         events += self._listen(bool(arrived), now)
         if self.source.lost:
-            kept = len(self.session.guide.kept)
-            raise ReadError(
-                f"{self.source.lost} {self.recorder.path} keeps {kept} attitude{'s' * (kept != 1)}: --resume goes on "
-                "with it"
-            )
+            raise ReadError(f"{self.source.lost} {self.kept()}")
+        events += self._gyroscopes(events)
         if self.session.state == "accepted" and not self.session.enough and self.session.next is not None:
             self.source.turn_to(self.session.next)
         return events
+
+    def kept(self) -> str:
+        """Say what the recording keeps of a session that ends before its record."""
+        count = len(self.session.guide.kept)
+        return f"{self.recorder.path} keeps {count} attitude{'s' * (count != 1)}: --resume goes on with it"
 
     def drop(self, number: int | None = None) -> list[Event]:
         """Drop an attitude, as `Session.drop` does, from the session and from the recording."""
@@ -104,6 +110,8 @@ class Runner:
 
     def close(self) -> None:
         """End the source, and write out the recording."""
+        if self._gyros is not None:
+            self._gyros.close()
         self.source.close()
         self.recorder.close()
 
@@ -112,10 +120,24 @@ class Runner:
         for block in blocks:
             lies = self.session.dropping
             placed = self.recorder.placed(block)
+            if self._gyros is None and all(name in block for name in triad("gyro")):
+                self._gyros = GyroFits(self.recorder.path, self.session.order, self.session.gravity)
             events += self.session.feed(placed, self._stream.counts)
             if not lies:  # in an attitude that was dropped nothing is recorded until it is left
                 self.recorder.write(placed, now)
         return events
+
+    def _gyroscopes(self, events: list[Event]) -> list[Event]:
+        """Fit the gyroscopes after an attitude once there is a fit of the accelerometers to stand on."""
+        if self._gyros is None:
+            return []
+        self._fit_due |= self.session.guide.fit is not None and any(event.kind == "accepted" for event in events)
+        if self._fit_due and self._gyros.ready:
+            self._fit_due = False
+            self.recorder.flush()
+            self._gyros.begin()
+        found = self._gyros.found()
+        return [] if found is None else self.session.know(*found)
 
     def _answer(self) -> None:
         if self._stream.to_send:

@@ -75,6 +75,7 @@ class Session:
     _next: Array | None = None
     _enough: str = ""
     _aside: frozenset[int] = frozenset()
+    _gyros: tuple[Known, ...] = ()
 
     def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
         """Take samples, with what was wrong with the stream so far, and return what happened.
@@ -154,6 +155,16 @@ class Session:
         self._plan()
         return gone.start, gone.stop
 
+    def know(self, gyros: tuple[Known, ...], why: str) -> list[Event]:
+        """Take the parameters of the gyroscopes that the recording so far gives, or why there are none."""
+        self.events = []
+        if gyros and not self._gyros:
+            self._say("gyro", "the gyroscopes are calibrated from the turns so far; each attitude makes them better")
+        elif why and not gyros and self._enough:
+            self._say("gyro", why)
+        self._gyros = gyros or self._gyros
+        return self.events
+
     def view(self) -> View:
         """Return what is to be seen now."""
         guide = self.guide
@@ -188,7 +199,7 @@ class Session:
             hold=self._seconds,
             attitudes=held,
             wanted=guide.wanted() if guide.kept else (guide.planned or 0),
-            parameters=known,
+            parameters=known + (self._gyros if known else ()),
             targets=tuple(zip((f"{t.stem} {t.text}" for t in self.targets), guide.shares(), strict=True)),
             next=None if self._next is None else tuple(self._next.tolist()),
             next_words="" if self._next is None else in_words(self._next),

@@ -3,53 +3,94 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from textwrap import wrap
 
 import numpy as np
 from rich.console import Group
-from rich.panel import Panel
-from rich.table import Table
 from rich.text import Text
 
-from imulab.live.view import View
+from imulab.live.view import Known, View, in_words
 from imulab.report.elements import format_uncertain
 from imulab.units import STANDARD_GRAVITY
 
 _COLOURS = {"waiting": "white", "moving": "yellow", "settling": "yellow", "still": "cyan", "accepted": "green"}
 _ROWS, _COLUMNS = 9, 37
 _MILLI = 1e3
+_BAR = 14
+_EVENTS = 3
+"""Lines that are left for what has happened, above the picture."""
+_MOST_WARNINGS = 3
+_NARROW = 70
 
 
-def draw(view: View) -> Group:
-    """Return a view as what rich prints: what to do first, then where one is, then what is known."""
-    colour = _COLOURS[view.state]
-    head = Text(f" {view.advice} ", style=f"bold black on {colour}")
-    beside = Table.grid(padding=(0, 3))
-    beside.add_row(_sphere(view), _parameters(view))
-    below = [Text(text, style="yellow") for text in view.warnings]
-    if not view.parameters and view.why_not and view.attitudes:
-        below.append(Text("No result yet: more attitudes are needed.", style="dim"))
-    keys = Text("u drops the last attitude (or the one that is off)   q finishes and writes the record", style="dim")
-    return Group(head, _facts(view), beside, _attitudes(view), *below, keys)
+def draw(view: View, width: int = 80, height: int = 24) -> Group:
+    """Return a view as what rich prints in `width` columns and `height` lines: what to do, where one is, what is known.
+
+    What there is no room for is left out, the map first.
+    """
+    above = [*_advice(view, width), _progress(view), _facts(view)]
+    below = [Text(line, style="yellow") for text in view.warnings[-_MOST_WARNINGS:] for line in wrap(text, width)]
+    below.append(_keys(view))
+    table = _parameters(view, width)
+    room = height - _EVENTS - len(above) - len(below)
+    sphere = _sphere(view)
+    held = [Text(line) for line in wrap(_attitudes(view), width)]
+    beside = max(map(len, table), default=0) + 3
+    if beside + _COLUMNS <= width and len(sphere) + len(held) <= room:
+        body = [*_side_by_side(table, sphere, beside), *held]
+    elif len(table) + len(sphere) + len(held) <= room:
+        body = [*table, *sphere, *held]
+    else:
+        body = [*table, *held[max(len(table) + len(held) - room, 0) :]][: max(room, 0)]
+    lines = [*above, *body, *below]
+    for line in lines:
+        line.no_wrap, line.overflow = True, "ellipsis"
+    return Group(*lines)
+
+
+def _advice(view: View, width: int) -> list[Text]:
+    """What to do, in a bar across the screen; and how the unit lies."""
+    style = f"bold reverse {_COLOURS[view.state]}"
+    advice = f"{view.advice}: {view.hold:.1f} s" if view.state == "still" and view.hold else view.advice
+    lines = [Text(f" {line}".ljust(width), style=style) for line in wrap(advice, width - 2) or [""]]
+    if view.up is not None:
+        now = Text.assemble(("now ", "dim"), in_words(np.array(view.up)))
+        if view.next is not None:
+            apart = np.degrees(np.arccos(np.clip(np.dot(view.up, view.next), -1, 1)))
+            now.append_text(Text.assemble(("   next ", "dim"), view.next_words, f"   {apart:.0f}° to turn"))
+        lines.append(now)
+    return lines
+
+
+def _progress(view: View) -> Text:
+    count, wanted = len(view.attitudes), max(view.wanted, len(view.attitudes), 1)
+    full = round(_BAR * count / wanted)
+    parts = [f"{count} of about {view.wanted} attitudes" if view.wanted else f"{count} attitudes"]
+    parts += [f"target {text}: {_share(share)}" for text, share in view.targets]
+    return Text.assemble(("█" * full, "green"), ("░" * (_BAR - full), "dim"), "  " + "   ".join(parts))
+
+
+def _share(share: float) -> str:
+    return "met" if share <= 1 else f"{share:.2g} times that" if share < np.inf else "not yet known"
 
 
 def _facts(view: View) -> Text:
     counts = {name: number for name, number in vars(view.counts).items() if number and name != "gaps"}
-    wrong = ", ".join(f"{number} {name}" for name, number in counts.items())
     parts = [
-        f"{view.source} {view.format}".strip(),
-        f"{view.rate:.4g} Hz, {view.seconds:.0f} s",
-        f"{len(view.attitudes)} of about {view.wanted} attitudes" if view.wanted else "",
-        "" if view.length is None else f"|f| = {view.length:.5g} {view.unit}",
+        f"{view.seconds:.0f} s",
+        f"{view.rate:.4g} Hz",
+        "" if view.length is None else f"|f| {view.length:.5g} {view.unit}",
         "" if view.temperature is None else f"{view.temperature:.1f} °C",
-        f"{view.state} {view.hold:.1f} s" if view.hold else view.state,
-        wrong,
+        *(f"{number} {name}" for name, number in counts.items()),
+        view.source,
+        view.format,
     ]
-    return Text("  ".join(part for part in parts if part))
+    return Text("  ".join(part for part in parts if part), style="dim")
 
 
-def _sphere(view: View) -> Panel:
+def _sphere(view: View) -> list[Text]:
     """The sphere of upward directions as a map: z up at the top, x in the middle; o held, x off, N next, + now."""
     marks = np.full((_ROWS, _COLUMNS), "·")
     for up, mark in [
@@ -60,30 +101,69 @@ def _sphere(view: View) -> Panel:
         row = round((np.pi / 2 - np.arcsin(np.clip(up[2], -1, 1))) / np.pi * (_ROWS - 1))
         column = round((np.arctan2(up[1], up[0]) / (2 * np.pi) + 0.5) * (_COLUMNS - 1))
         marks[row, column] = mark
-    text = Text("\n".join("".join(row) for row in marks))
-    for mark, style in (("N", "bold magenta"), ("[+]", "bold cyan"), ("o", "green"), ("x", "bold red")):
-        text.highlight_regex(mark, style)
-    return Panel(text, title="o held  N next  + now", expand=False)
+    lines = [Text("upward: o held, N next, + now", style="dim"), *(Text("".join(row)) for row in marks)]
+    for line in lines[1:]:
+        for mark, style in (("N", "bold magenta"), ("[+]", "bold cyan"), ("o", "green"), ("x", "bold red")):
+            line.highlight_regex(mark, style)
+    return lines
 
 
-def _parameters(view: View) -> Table:
-    table = Table(box=None, padding=(0, 1))
-    for title in ("parameter", "value", "±", "unit"):
-        table.add_column(title, justify="right" if title in ("value", "±") else "left")
-    for row in view.parameters:
-        table.add_row(row.name, *format_uncertain(row.value, row.standard_uncertainty), row.unit)
-    for text, share in view.targets:
-        met = Text("met", style="green") if share <= 1 else Text(f"{share:.2g} times" if share < np.inf else "not yet")
-        table.add_row(Text(f"target {text}"), met)
-    return table
+def _parameters(view: View, width: int) -> list[Text]:
+    """A line for each kind of parameter: its axes, the largest standard uncertainty, and what of its target that is."""
+    if not view.parameters:
+        return [Text("no result yet: more attitudes are needed", style="dim")] if view.attitudes else []
+    kinds: dict[str, list[Known]] = {}
+    for known in view.parameters:
+        kinds.setdefault(known.name.rpartition("_")[0], []).append(known)
+    rows: list[Sequence[str]] = [("", "x", "y", "z", "±", "unit", "")]
+    for stem, each in kinds.items():
+        for some in (each[k : k + 3] for k in range(0, len(each), 3)):
+            axes = " ".join(known.name.rpartition("_")[2] for known in some)
+            shown = [format_uncertain(known.value, known.standard_uncertainty) for known in some]
+            worst = max(range(len(some)), key=lambda k: some[k].standard_uncertainty or 0.0)
+            share = max((known.share for known in some if known.share is not None), default=None)
+            met = "" if share is None else "met" if share <= 1 else f"{share:.2g}×"
+            values = [value for value, _ in shown] + [""] * (3 - len(some))
+            unit = some[0].unit.removesuffix(" off nominal")
+            rows.append((stem if axes == "x y z" else f"{stem} {axes}", *values, shown[worst][1], unit, met))
+    widths = [max(len(row[k]) for row in rows) for k in range(7)]
+    lines = []
+    for row in rows:
+        fields = [
+            text.ljust(size) if k in (0, 5) else text.rjust(size)
+            for k, (text, size) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append(
+            Text(
+                (" " if width < _NARROW else "  ").join(fields),
+                style="dim" if row is rows[0] else "green" if row[6] == "met" else "",
+            )
+        )
+    return lines
 
 
-def _attitudes(view: View) -> Text:
-    parts = Text("attitudes, |f| - g in mg: " if view.attitudes else "")
-    for held in view.attitudes[-16:]:
+def _side_by_side(left: list[Text], right: list[Text], place: int) -> list[Text]:
+    lines = []
+    for k in range(max(len(left), len(right))):
+        line = left[k].copy() if k < len(left) else Text()
+        line.pad_right(place - len(line))
+        lines.append(line.append_text(right[k]) if k < len(right) else line)
+    return lines
+
+
+def _attitudes(view: View) -> str:
+    parts = []
+    for held in view.attitudes:
         off = "" if held.residual is None else f" {_MILLI * held.residual / STANDARD_GRAVITY:+.2f}"
-        parts.append(f"{held.number}{off}  ", style="bold red" if held.aside else "")
-    return parts
+        parts.append(f"{held.number}{off}{' OFF' if held.aside else ''}")
+    return "|f| - g in mg:  " + "   ".join(parts) if parts else ""
+
+
+def _keys(view: View) -> Text:
+    aside = [held.number for held in view.attitudes if held.aside]
+    named = (aside or [held.number for held in view.attitudes])[-1:]
+    drop = f"u: drop attitude {named[0]}   " if named else ""
+    return Text(f"{drop}q: finish, write record   Ctrl-C: stop", style="dim")
 
 
 @contextmanager
