@@ -14,6 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
+
 import imulab as il
 
 
@@ -74,6 +76,11 @@ class Device:
             except OSError:
                 return False
         return not data
+
+    def follow(self, numbers: np.ndarray) -> bool:
+        """Whether pieces of these numbers were sent one after the other."""
+        places = np.searchsorted([number for number, _ in self.sent], numbers)
+        return bool((np.diff(places) == 1).all())
 
     def answer(self, asked: bytes, pieces: Sequence[bytes], seconds: float = 30.0) -> None:
         """Send one piece for each time that these bytes are asked for, instead of by itself."""
