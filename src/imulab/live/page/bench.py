@@ -171,15 +171,15 @@ class Workbench(Part):
         values = given.get("values")
         if form is None or not isinstance(values, dict):
             raise OptionError(f"command {quoted(given.get('command'))}: not among those offered")
-        first = Path(next((_first(values.get(field.name)) for field in form.fields if not field.flag), ""))
+        inputs = [Path(each) for field in form.fields if not field.flag for each in _listed(values.get(field.name))]
         outputs: list[str] = []
         taken = {path for job in self._jobs.jobs.values() if job.state == "running" for path in job.outputs}
 
         def output(name: str, ending: str) -> str:
-            """Name what is made after the first file, and after what is done where that alone would not tell."""
-            stem = first.name.partition(".")[0] or form.path.replace(" ", "-")
+            """Name what is made after the last file, and after what is done where that alone would not tell."""
+            stem = inputs[-1].name.partition(".")[0] if inputs else form.path.replace(" ", "-")
             done = str(values.get("to") or form.path.split()[-1])
-            told = f"{stem}{ending}" if ending not in ("", first.suffix) else f"{stem}-{done}{ending}"
+            told = f"{stem}-{done}{ending}" if ending in ("", *(each.suffix for each in inputs)) else f"{stem}{ending}"
             outputs.append(self._files.new(name) if name else self._files.unused(told, taken.union(outputs)))
             return outputs[-1]
 
@@ -198,8 +198,8 @@ class Workbench(Part):
         return _json({})
 
 
-def _first(value: Any) -> str:
-    return str(value[0] if isinstance(value, list) and value else value or "")
+def _listed(value: Any) -> list[str]:
+    return [str(each) for each in (value if isinstance(value, list) else [value]) if each]
 
 
 def _json(value: Any) -> Response:

@@ -43,6 +43,7 @@ class Opening:
     folder: Path
     about: dict[str, Any] = field(default_factory=dict)
     process: subprocess.Popen[str] | None = None
+    closed: bool = False
 
     @property
     def head(self) -> Head:
@@ -122,13 +123,15 @@ class Openings:
         with process.stdout as lines:
             for line in lines:
                 opening.about = {**opening.about, **json.loads(line)}
-                self._tell(opening)
-        if process.wait() and "error" not in opening.about and opening.folder.exists():
+                if not opening.closed:
+                    self._tell(opening)
+        if process.wait() and "error" not in opening.about and not opening.closed:
             opening.about = {**opening.about, "error": f"{opening.name}: reading it has failed"}
             self._tell(opening)
 
 
 def _close(opening: Opening) -> None:
+    opening.closed = True
     if opening.process is not None:
         with suppress(OSError):
             opening.process.kill()

@@ -45,14 +45,14 @@ export function mount(place, given) {
       if (kind === "drop") take([...event.dataTransfer.files]);
     });
   }
-  ask("forms").then(found => { forms = found; offer(); }).catch(fail);
+  ask("forms").then(found => { forms = found; if (chosen) choose(chosen.name); }).catch(fail);
 }
 
 const fail = error => page.say(error.message, "bad");
 
 export function hear(message) {
   if (message.type === "files") listed(message);
-  else if (message.type === "opening" && message.file === chosen?.name && !(message.error && opening?.error)) opened(message);
+  else if (message.type === "opening" && message.file === chosen?.name && JSON.stringify(message.reading) === JSON.stringify(reading)) opened(message);
   else if (message.type === "job") worked(message);
 }
 
@@ -64,7 +64,7 @@ async function take(given) {
     try {
       const name = await send(file, gone => { part.value = gone; });
       if (!files.some(each => each.name === name)) listed(await ask("files"));
-      choose(name);
+      if (chosen?.name !== name) choose(name);
     } catch (error) {
       fail(error);
     }
@@ -149,7 +149,9 @@ function readingForm() {
 function open() {
   const name = chosen.name;
   opening = null;
-  ask("open", { file: name, reading }).then(found => { if (chosen?.name === name && !opening) opened(found); }).catch(error => opened({ error: error.message }));
+  const own = reading;
+  const here = () => chosen?.name === name && reading === own;
+  ask("open", { file: name, reading }).then(found => { if (here() && !opening) opened(found); }).catch(error => { if (here()) opened({ error: error.message }); });
 }
 
 function opened(message) {

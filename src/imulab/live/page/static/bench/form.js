@@ -77,7 +77,7 @@ function field(of, files, value, changed) {
   const help = of.help ? h("small", { id: `${id}-help` }, of.help) : null;
   const common = { id, "aria-describedby": help ? `${id}-help` : null, onchange: changed, oninput: changed };
   const label = text => h("label", { for: id }, text);
-  const title = of.flag ? plain(of.flag) : of.shows.replaceAll("...", "s").toLowerCase();
+  const title = of.flag ? plain(of.flag) : of.shows.replace("... ", "s, then ").replaceAll("...", "s").replaceAll("|", " or ").toLowerCase();
   const built = (control, read, more = {}) => ({
     of, read, element: h("div", { class: `field ${of.kind}` }, label(more.title || title), control, help), ...more,
   });
