@@ -1,0 +1,43 @@
+"""A user's script is checked by mypy --strict: the signatures say what comes back."""
+
+import subprocess
+import sys
+
+SCRIPT = """
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import imulab as il
+from imulab.report.plots import Plot, Plots
+
+recording: il.Recording = il.Recording.from_arrays(accel=np.ones((9, 3)), rate=100.0, unit="g")
+fit: il.TumbleFit = il.fit_tumble(recording, order=1, gravity=9.81, window=(1, 9))
+fit.save("sn42.json")
+every: Plots = fit.plot()
+one: Plot = fit.plot("residual")
+one.save("residuals.html")
+layout: dict[str, object] = one.to_dict()
+first: Plot = every["sphere"]
+drawn: Plots = recording.plot()
+covariance: NDArray[np.float64] = fit.cov("bias_x", "bias_y")
+frame = fit.to_frame("polars")
+files: list[Path] = fit.export("c", Path("firmware"))
+corrected: il.Recording = fit.apply(np.ones((9, 3)), rate=100.0, unit="g")
+record: il.Calibration = il.load("sn42.json")
+value: float = record.parameters["bias_x"].value
+changes = il.compare_records(fit, record)
+noise: il.NoiseFit = il.fit_noise([recording], columns=["accel_x"], horizon=10.0)
+fused: il.Fused = il.fuse(il.simulate_array(), method="mean")
+rate: NDArray[np.float64] = fused.rate
+il.write_report(fit, "sn42.html")
+"""
+
+
+def test_a_script_of_a_user_is_clean(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT, encoding="utf-8")
+    words = ["--strict", "--no-error-summary", "--cache-dir", str(tmp_path / "cache"), "--follow-imports=silent"]
+    done = subprocess.run([sys.executable, "-m", "mypy", *words, str(script)], capture_output=True, text=True)
+    assert (done.stdout, done.returncode) == ("", 0)
