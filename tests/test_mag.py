@@ -353,3 +353,72 @@ def test_an_exported_unit_runs_the_magnetometers_too(tmp_path):
     subprocess.run(["make", "-C", str(tmp_path / "c")], check=True, capture_output=True, timeout=120)
     said = subprocess.run([str(tmp_path / "c" / "selftest")], check=True, capture_output=True, text=True, timeout=60)
     assert "pass" in said.stdout
+
+
+def parameters_of(file):
+    """NAME and value of a parameter file of PX4 (tabs) or ArduPilot (commas)."""
+    found = {}
+    for line in file.read_text().splitlines():
+        if not line.startswith("#"):
+            words = line.replace(",", "\t").split("\t")
+            name, value = words[-3:-1] if len(words) > 2 else words
+            found[name] = float(value)
+    return found
+
+
+def turned_by(angles):
+    """Rz(yaw) Ry(pitch) Rx(roll), deg, as both autopilots build a matrix of Euler angles."""
+    roll, pitch, yaw = np.radians(angles)
+    x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+    y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    return z @ y @ x
+
+
+def px4_corrects(p, raw, mount):
+    """PX4 sensor_calibration/Magnetometer: rotation * (scale * (raw - offset)), gauss."""
+    k = np.diag([p["CAL_MAG0_XSCALE"], p["CAL_MAG0_YSCALE"], p["CAL_MAG0_ZSCALE"]])
+    k[0, 1] = k[1, 0] = p["CAL_MAG0_XODIAG"]
+    k[0, 2] = k[2, 0] = p["CAL_MAG0_YODIAG"]
+    k[1, 2] = k[2, 1] = p["CAL_MAG0_ZODIAG"]
+    corrected = (raw - [p["CAL_MAG0_XOFF"], p["CAL_MAG0_YOFF"], p["CAL_MAG0_ZOFF"]]) @ k.T
+    if mount == "internal":
+        assert p["CAL_MAG0_ROT"] == -1
+        return corrected
+    assert p["CAL_MAG0_ROT"] == 100
+    return corrected @ turned_by([p["CAL_MAG0_ROLL"], p["CAL_MAG0_PITCH"], p["CAL_MAG0_YAW"]]).T
+
+
+def ardupilot_corrects(p, raw, mount):
+    """AP_Compass_Backend::correct_field after rotate_field: K (rotated + OFS), mgauss."""
+    if mount == "external":
+        assert p["COMPASS_ORIENT"] == 101
+        raw = raw @ turned_by([p["CUST_ROT1_ROLL"], p["CUST_ROT1_PITCH"], p["CUST_ROT1_YAW"]]).T
+    k = np.diag([p["COMPASS_DIA_X"], p["COMPASS_DIA_Y"], p["COMPASS_DIA_Z"]])
+    k[0, 1] = k[1, 0] = p["COMPASS_ODI_X"]
+    k[0, 2] = k[2, 0] = p["COMPASS_ODI_Y"]
+    k[1, 2] = k[2, 1] = p["COMPASS_ODI_Z"]
+    return (raw + np.array([p["COMPASS_OFS_X"], p["COMPASS_OFS_Y"], p["COMPASS_OFS_Z"]])) @ k.T
+
+
+@pytest.mark.parametrize(
+    ("target", "file", "corrects", "per_tesla"),
+    [("px4", "imulab.params", px4_corrects, 1e4), ("ardupilot", "imulab.param", ardupilot_corrects, 1e7)],
+)
+def test_autopilots_correct_the_field_as_apply_does(target, file, corrects, per_tesla, tmp_path):
+    rng = np.random.default_rng(7)
+    truth = reference.random_unit(rng, NORTH, reference.random_rotation(rng), size=48.0)
+    turned = attitudes(rng)
+    outputs, mag = reference.simulate(truth, turned, rng, accel=5e-4, field=3e-3, dip=SWAY)
+    recording = table(outputs, mag, unit="uT")
+    record = il.fit_mag(recording, gravity=G, order=1, field="48 uT").calibration
+    il.export(target, record, tmp_path, lossy=True)
+    expected = il.apply(record, recording).triad("mag") * 1e-6 * per_tesla
+    raw = mag * 1e-6 * per_tesla
+    found = corrects(parameters_of(tmp_path / file), raw, "external")
+    assert np.abs(found - expected).max() < 2e-6 * np.abs(raw).max()
+    told = []
+    il.export(target, record, tmp_path, lossy=True, mag_mount="internal", tell=told.append)
+    assert any("turned against the accelerometers" in message for message in told)
+    inside = corrects(parameters_of(tmp_path / file), raw, "internal")
+    np.testing.assert_allclose(np.linalg.norm(inside, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-5)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from imulab.cli.fit_options import lists
+from imulab.cli.fit_options import lists, one_of
 from imulab.cli.options import call, warn
 from imulab.errors import OptionError
 
@@ -36,6 +36,14 @@ def export(
     memory: Annotated[
         str | None, typer.Option("--memory", help="c, blob: growing, growing:COUNT, or a gain between 0 and 1.")
     ] = None,
+    mag_mount: Annotated[
+        str,
+        one_of(
+            ("external", "internal"),
+            "px4, ardupilot: whether the magnetometers have a rotation of their own there, which holds their mounting.",
+            "--mag-mount",
+        ),
+    ] = "external",
 ) -> None:
     """Write calibration records in the form of firmware, an autopilot or a toolbox."""
     from imulab.procedures.exporting import export as write
@@ -44,7 +52,7 @@ def export(
         raise OptionError("-o '': expected a folder to write to")
     files = call(
         write, to=to, records=records, folder=output, lossy=lossy, device_id=device_id, noise=noise, method=method,
-        memory=memory, tell=warn,
+        memory=memory, mag_mount=mag_mount, tell=warn,
     )  # fmt: skip
     for file in files:
         print(f"{to}: {file}")

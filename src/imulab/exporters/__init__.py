@@ -28,6 +28,9 @@ def _nothing(message: str) -> None:
     """Tell nobody."""
 
 
+MAG_MOUNTS = ("external", "internal")
+
+
 @dataclass(frozen=True, slots=True)
 class ExportOptions:
     """What the command line of ``export`` offers.
@@ -44,6 +47,8 @@ class ExportOptions:
         What messages call the file that it came from.
     fusion
         Method and memory of an array in firmware or a blob; what its record carries where None.
+    mag_mount
+        ``external``: the autopilot turns the magnetometers by a rotation of their own; ``internal``: it does not.
     tell
         Called with a sentence on each loss that was allowed.
     """
@@ -53,6 +58,7 @@ class ExportOptions:
     noise: Mapping[str, Any] = field(default_factory=dict)
     noise_file: str = "the noise file"
     fusion: Fusion | None = None
+    mag_mount: str = "external"
     tell: Callable[[str], object] = _nothing
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
+from imulab.exporters.magnetometer import ardupilot_rows, magnetometers, settle
 from imulab.exporters.model import (
     AXES,
     accel_terms,
@@ -63,12 +64,21 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     rows += [(f"INS_ACCSCAL_{a.upper()}", v) for a, v in zip(AXES, scale, strict=True)]
     if gyro is not None:
         rows += [(f"INS_GYROFFS_{a.upper()}", v) for a, v in zip(AXES, gyro.scale * gyro.bias, strict=True)]
+    mag = magnetometers(unit.record, "ardupilot")
+    if mag is not None:
+        lost += settle(mag, "ardupilot", options, turned=options.mag_mount == "external")
+        rows += ardupilot_rows(mag, options)
     comments = [
         "ArduPilot parameters, " + unit.origin[0],
         unit.origin[1],
         "for Copter 3.4, Plane 3.5 and later: corrected = (raw - OFFS) * SCAL, m/s^2; older versions scale first",
         "gyroscopes: raw - OFFS, rad/s; ArduPilot measures these again at each start unless INS_GYR_CAL is 0",
         "no axes are turned: the record's axes are taken as ArduPilot's body axes (FRD, after the board's rotation)",
+        *(
+            ["magnetometers: corrected = K (raw + OFS) after ORIENT, mgauss; for 4.2 and later"]
+            if mag is not None
+            else []
+        ),
         *lost,
     ]
     lines = [f"# {line}" for line in comments] + [f"{name},{single_precision(value)}" for name, value in rows]

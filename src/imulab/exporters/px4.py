@@ -13,6 +13,7 @@ import numpy as np
 
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
+from imulab.exporters.magnetometer import magnetometers, px4_rows, settle
 from imulab.exporters.model import (
     AXES,
     accel_terms,
@@ -65,6 +66,17 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
         rest = gyro.scale * gyro.bias  # what the gyroscopes put out at rest
         rows.append(("CAL_GYRO0_ID", str(options.device_id), _INT32))
         rows += [(f"CAL_GYRO0_{a.upper()}OFF", single_precision(v), _FLOAT) for a, v in zip(AXES, rest, strict=True)]
+    mag = magnetometers(unit.record, "px4")
+    if mag is not None:
+        lost += settle(mag, "px4", options, turned=options.mag_mount == "external")
+        rows += [
+            (
+                name,
+                value if isinstance(value, str) else single_precision(value),
+                _INT32 if isinstance(value, str) else _FLOAT,
+            )
+            for name, value in px4_rows(mag, options)
+        ]
     unknown = (
         "device id 0: not known; PX4 ignores the calibration until CAL_ACC0_ID is that of the sensor (--device-id)"
     )
@@ -73,6 +85,7 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
         unit.origin[1],
         "corrected = (raw - OFF) * SCALE, m/s^2; gyroscopes: raw - OFF, rad/s; single precision",
         "no axes are turned: the record's axes are taken as the sensor's; PX4's body frame is FRD (-g on z at rest)",
+        *(["magnetometers: corrected = ROT (K (raw - OFF)), gauss, K of SCALE and ODIAG"] if mag is not None else []),
         *([unknown] if options.device_id == 0 else []),
         *lost,
         "",

@@ -13,7 +13,7 @@ from imulab import exporters
 from imulab.arguments import Folder
 from imulab.device.array_settings import Fusion
 from imulab.errors import ImulabError, OptionError, listed
-from imulab.exporters import EXPORTERS, ExportOptions
+from imulab.exporters import EXPORTERS, MAG_MOUNTS, ExportOptions
 from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.loading import load
 from imulab.procedures.registry import procedure_of
@@ -40,6 +40,7 @@ def export(
     noise: str | PathLike[str] | Mapping[str, Any] | Calibration | None = None,
     method: str | None = None,
     memory: str | float | None = None,
+    mag_mount: str = "external",
     tell: Callable[[str], object] = _nothing,
 ) -> list[Path]:
     """Write records in the form of firmware, an autopilot or a toolbox.
@@ -60,6 +61,9 @@ def export(
         A noise record, or what ``imulab allan --json`` printed, or the file of either, for noise keys.
     method, memory
         For c and blob: how an array fuses, as for `fuse`; what its record carries if not given.
+    mag_mount
+        For px4 and ardupilot: ``external`` where the autopilot turns the magnetometers by a rotation of their own,
+        which then holds their mounting exactly; ``internal`` where it does not.
     tell
         Called with a sentence on each loss that was allowed, and on each record that is not good.
 
@@ -84,6 +88,8 @@ def export(
     """
     if to not in EXPORTERS:
         raise OptionError(f"to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")
+    if mag_mount not in MAG_MOUNTS:
+        raise OptionError(f"mag_mount {mag_mount!r}: expected one of {listed(MAG_MOUNTS, str(mag_mount))}")
     number = whole(device_id, "device_id")
     if not 0 <= number < _DEVICE_IDS:
         raise OptionError(f"device_id {number}: expected a number from 0 to {_DEVICE_IDS - 1}")
@@ -108,7 +114,7 @@ def export(
     found: Mapping[str, Any] = _noise_of(noise, file) if isinstance(noise, Calibration) else {}
     if noise and not isinstance(noise, Calibration):
         found = noise if isinstance(noise, Mapping) else _noise(file)
-    options = ExportOptions(lossy, number, found, file if noise else "", fusion, tell)
+    options = ExportOptions(lossy, number, found, file if noise else "", fusion, mag_mount, tell)
     return exporters.export(to, loaded, Path(folder), options)
 
 
