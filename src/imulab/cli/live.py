@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from imulab.cli.fit_options import with_options
+from imulab.cli.live_page import NoBrowser, PagePort, again, checked_page, on_page
 from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, whole_number
 from imulab.errors import OptionError
 from imulab.procedures.options import FLAG, LAYOUT
 from imulab.procedures.tumble.task import GRAVITY, ORDER, TASK
 
 if TYPE_CHECKING:
-    from imulab.live.formats import UnknownFormatError
     from imulab.live.runner import Runner
     from imulab.readers.layout import Layout
     from imulab.records.calibration import Calibration
@@ -45,6 +47,9 @@ def live(
     attitudes: Annotated[
         str | None, typer.Option(metavar="N", help="Number of attitudes, instead of a target.")
     ] = None,
+    page: Annotated[bool, typer.Option("--page", help="Show it in a browser on this machine.")] = False,
+    port: PagePort = None,
+    no_browser: NoBrowser = False,
     plain: Annotated[bool, typer.Option("--plain", help="A line for each event; ends when it is enough.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file of --save.")] = False,
     follow: Annotated[bool, typer.Option("--follow", help="The simulated unit does what the guide says.")] = False,
@@ -54,7 +59,6 @@ def live(
     The recording is written out every second; at its end the record is that of `imulab tumble fit` on it.
     """
     from imulab.cli.result import finish
-    from imulab.live.formats import UnknownFormatError
     from imulab.live.gyros import with_gyroscopes
     from imulab.live.runner import Runner
     from imulab.live.session import Session
@@ -65,6 +69,7 @@ def live(
     if source == "serial:":
         _list_ports()
         return
+    listened = checked_page(page, port, no_browser=no_browser, plain=plain)
     if save is None:
         raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
     layout = options["layout"]
@@ -78,24 +83,30 @@ def live(
     replayed = [source.partition(":")[2].rpartition("@")[0] or source.partition(":")[2]]
     check_outputs([save, output, report], [name for name in (*replayed, layout) if name])
     known = _layout(layout)
+    fitted = {**options, "layout": None}
     runner = Runner.open(lambda: open_source(source, layout, follow=follow), session, save, known, resume=resume)
-    plain = plain or not sys.stdout.isatty()
-    try:
-        (_plain if plain else _drawn)(runner, typed=source != "-")
-        runner.recorder.close()
-        record, why = with_gyroscopes(run_task("tumble", [save], {**options, "layout": None}, GivenFiles()), save)
+
+    def made() -> Calibration:
+        record, why = with_gyroscopes(run_task("tumble", [save], fitted, GivenFiles()), save)
         finish(record, output, report, json=False)
         _say_how(record, save, output, why)
-        if not plain and source != "-":
-            _corrected(runner, record)
-    except UnknownFormatError as error:
-        _offer(error)
-        raise
-    except KeyboardInterrupt:
-        note(runner.kept())
-        raise
-    finally:
-        runner.close()
+        return record
+
+    plain = plain or not sys.stdout.isatty()
+    with _offering(), closing(runner):
+        try:
+            if listened is not None:
+                name = output or "record.json"
+                on_page(runner, made, again(save, fitted, output), name, port=listened, browser=not no_browser)
+                return
+            (_plain if plain else _drawn)(runner, typed=source != "-")
+            runner.recorder.close()
+            record = made()
+            if not plain and source != "-":
+                _corrected(runner, record)
+        except KeyboardInterrupt:
+            note(runner.kept())
+            raise
 
 
 def _say_how(record: Calibration, save: str, output: str | None, why: str) -> None:
@@ -129,13 +140,20 @@ def _list_ports() -> None:
         print("no serial port on this machine")
 
 
-def _offer(error: UnknownFormatError) -> None:
+@contextmanager
+def _offering() -> Iterator[None]:
     """Show the first lines of an unknown stream, and a layout to start from."""
-    for line in error.lines:
-        print(f"  {line}", file=sys.stderr)
-    if error.guess is not None:
-        head = f"# A guess ({error.guess.why}); check it, save it as layout.toml, and add --layout layout.toml:"
-        print(f"{head}\n{error.guess.toml}", file=sys.stderr)
+    from imulab.live.formats import UnknownFormatError
+
+    try:
+        yield
+    except UnknownFormatError as error:
+        for line in error.lines:
+            print(f"  {line}", file=sys.stderr)
+        if error.guess is not None:
+            head = f"# A guess ({error.guess.why}); check it, save it as layout.toml, and add --layout layout.toml:"
+            print(f"{head}\n{error.guess.toml}", file=sys.stderr)
+        raise
 
 
 def _corrected(runner: Runner, record: Calibration) -> None:

@@ -12,9 +12,11 @@ from imulab.errors import OptionError, listed
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.quantities import number, quantity, whole_number
 from imulab.recording import Array, Recording
-from imulab.units import STANDARD_GRAVITY
+from imulab.units import STANDARD_GRAVITY, from_si
 
 _LONGEST = 60.0
+_STRUCK, _SHIFT = 0.5, 5e-3 * STANDARD_GRAVITY
+"""When an attitude is knocked, s after it is put down: before it is accepted; and by how much, m/s^2."""
 _KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "speed")
 _KINDS = {
     "rate": ("frequency", "Hz"),
@@ -36,7 +38,7 @@ class SimulatedUnit:
     hold
         How long it stays in an attitude where nobody turns it, s.
     knock
-        Number of an attitude, from 1, that is knocked, or None.
+        Number of an attitude, from 1, that is knocked as soon as it is put down, or None.
     follow
         Whether `turn_to` turns it; otherwise it turns by itself.
     """
@@ -54,8 +56,9 @@ class SimulatedUnit:
     _wanted: Array | None = field(default=None, init=False)
 
     def turn_to(self, direction: Array) -> None:
-        """Turn until this direction of the body is up."""
-        self._wanted = direction
+        """Turn until this direction of the body is up, where it follows."""
+        if self.follow:
+            self._wanted = direction
 
     def blocks(self, step: float) -> Iterator[Recording]:
         """Yield its samples, `step` seconds at a time, without end."""
@@ -84,37 +87,38 @@ class SimulatedUnit:
                 yield Recording(part, leg.units, metadata, "simulated unit")
                 if start + size >= stay and not self.follow and (start + size - stay) / self.rate >= self.hold:
                     self._wanted = _random_direction(rng)
+                if self._wanted is not None and np.allclose(self._wanted, here):
+                    self._wanted = None  # said once more while the unit was being taken up
                 if self._wanted is not None and start + size >= stay:
                     break
             there, self._wanted = here if self._wanted is None else self._wanted, None
 
     def _leg(self, here: Array, there: Array, known: dict[str, float], number: int) -> Recording:
         """Return the samples of turning from one attitude to the next and lying there."""
-        knocked = self.knock == number + 1
         recording = simulate_tumble(
             attitudes=np.vstack([here, there]),
             order=self.order,
             truth=known or None,
             gravity=self.gravity,
             rate=self.rate,
-            hold=min(self.hold, 10.0) if knocked else _LONGEST,
+            hold=_LONGEST,
             move=self.move,
             noise=self.noise,
             unit=self.unit,
             gyro=False,
-            knock=2 if knocked else None,
             seed=self.seed if not number else 1000 * (self.seed + 1) + number,
         )
-        resting = round((min(self.hold, 10.0) if knocked else _LONGEST) * self.rate)
+        resting = round(_LONGEST * self.rate)
         # The first attitude, and one that lasts longer than expected, are lain in without having been turned to.
         first = 0 if not number or np.allclose(here, there) else resting
         names = [name for name in recording.columns if not name.startswith("truth_")]
         last = resting if first == 0 else len(recording)
-        return replace(
-            recording,
-            columns={name: recording.columns[name][first:last] for name in names},
-            units={name: recording.units[name] for name in names},
-        )
+        columns = {name: recording.columns[name][first:last] for name in names}
+        if self.knock == number + 1:
+            struck = round((self.move + _STRUCK) * self.rate)
+            for axis, up in zip("xyz", there.tolist(), strict=True):
+                columns[f"accel_{axis}"][struck:] += from_si(_SHIFT, self.unit) * up
+        return replace(recording, columns=columns, units={name: recording.units[name] for name in names})
 
 
 def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:

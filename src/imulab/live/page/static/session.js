@@ -1,15 +1,195 @@
-// The guided session.
+// The guided session: what to do now above all, then where one is, then what is known.
 
-import { h, put } from "./dom.js";
+import { bodyPlace, degreesBetween, drawBody, product, shortest, upright } from "./body.js";
+import { h, put, show } from "./dom.js";
+import { ResultArea } from "./result.js";
+import { beep, soundButton } from "./sound.js";
+import { drawSphere, spherePlace } from "./sphere.js";
+import { attitudeTable, milli, parameterTable, targetList } from "./tables.js";
 
 export const title = "Session";
-let advice = null;
+const STEPS = ["moving", "settling", "still", "accepted"];
+const NEAR = 12;
+const LOG = 60;
 
-export function mount(place) {
-  advice = h("p", { class: "advice", "aria-live": "assertive" });
-  place.append(advice);
+let page = null, place = null, result = null;
+let orientation = null, aim = null;
+let drawn = {};
+const parts = {};
+
+export function mount(into, given) {
+  page = given;
+  place = into;
+  parts.advice = h("p", { class: "advice", role: "status", "aria-live": "assertive" }, "Connecting");
+  parts.steps = STEPS.map(step => h("li", {}, step));
+  parts.hold = h("span", { class: "hold" });
+  parts.progress = h("progress", { max: 1, value: 0, "aria-label": "Attitudes" });
+  parts.count = h("span", {});
+  parts.finish = h("button", { onclick: () => page.send({ type: "finish" }) }, "Finish");
+  parts.enough = h("p", { class: "enough", role: "status" });
+  parts.now = h("div", { class: "now" },
+    parts.advice,
+    parts.where = h("div", { class: "where" }, h("ol", { class: "steps", "aria-label": "State" }, parts.steps), parts.hold),
+    parts.toward = h("div", { class: "toward" }, parts.progress, parts.count, h("span", { class: "actions" }, soundButton(), parts.finish)),
+    parts.enough);
+  parts.knocked = h("div", { role: "alert" });
+  parts.warnings = h("div", { role: "alert" });
+  parts.next = bodyPlace("Next attitude");
+  parts.nextText = h("figcaption", {});
+  parts.live = bodyPlace("The unit now");
+  parts.liveText = h("figcaption", {});
+  parts.nextFigure = h("figure", { class: "wanted" }, h("h2", {}, "Turn it like this"), parts.next, parts.nextText);
+  parts.bodies = h("section", { class: "bodies" },
+    parts.nextFigure, h("figure", {}, h("h2", {}, "Now"), parts.live, parts.liveText));
+  parts.sphere = spherePlace();
+  parts.facts = h("dl", { class: "facts" });
+  parts.parameters = h("div", {});
+  parts.attitudes = h("div", {});
+  parts.log = h("ol", { class: "log" });
+  result = new ResultArea(page);
+  place.append(parts.now, parts.knocked, parts.warnings, result.place,
+    h("div", { class: "beside" }, parts.bodies,
+      h("section", { class: "covered" }, h("h2", {}, "What is covered"), parts.sphere,
+        h("p", { class: "caption" }, "Numbers: held. Ring: next. Cross: now."))),
+    parts.facts,
+    parts.known = h("section", {}, h("h2", {}, "Parameters"), parts.parameters),
+    h("section", {}, h("h2", {}, "Attitudes"), parts.attitudes),
+    h("details", {}, h("summary", {}, "What happened"), parts.log));
 }
 
 export function hear(message) {
-  if (message.type === "view") put(advice, message.advice);
+  if (message.type === "hello") parts.log.replaceChildren();  // what happened comes again
+  if (message.type === "view") view(message);
+  else if (message.type === "event") happened(message);
+  else if (message.type === "done") result.done(message);
+  else if (message.type === "corrected") result.corrected(message);
+  else if (message.type === "failed") failed(message);
+}
+
+const duration = seconds => (seconds < 60 ? "" : `${Math.floor(seconds / 60)} min `) + `${Math.floor(seconds % 60)} s`;
+const sentence = text => text.charAt(0).toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
+
+function view(now) {
+  const measuring = now.phase === "measuring";
+  put(parts.advice, advice(now));
+  parts.now.dataset.state = measuring ? now.state : now.phase;
+  document.title = `${measuring ? now.state : now.phase} · imulab`;
+  parts.steps.forEach((item, k) => {
+    if (STEPS[k] === now.state && measuring) item.setAttribute("aria-current", "step");
+    else item.removeAttribute("aria-current");
+  });
+  put(parts.hold, now.hold && measuring ? `${now.hold.toFixed(1)} s` : "");
+  progress(now, measuring);
+  bodies(now, measuring);
+  facts(now);
+  once("sphere", [now.attitudes, now.next, now.up?.map(each => each.toFixed(2))], () => drawSphere(parts.sphere, now));
+  once("parameters", [now.parameters, now.targets], () =>
+    parts.parameters.replaceChildren(targetList(now), parameterTable(now)));
+  once("attitudes", [now.attitudes, measuring], () =>
+    parts.attitudes.replaceChildren(attitudeTable(now, measuring ? drop : null)));
+  once("knocked", [now.attitudes.filter(each => each.aside), measuring], () => knocked(now, measuring));
+  once("warnings", [now.warnings, now.silent], () =>
+    parts.warnings.replaceChildren(...[now.silent, ...now.warnings].filter(Boolean).map(text =>
+      h("p", { class: "said look" }, sentence(text)))));
+}
+
+function advice(now) {
+  if (now.phase === "computing") return "Computing the record.";
+  if (now.phase === "done") return "Done: the record is made.";
+  if (now.enough && now.state === "accepted") return "Enough: make the record.";
+  return sentence(now.advice);
+}
+
+// Draws a part anew only where what it shows has changed, so that the focus and a button under the finger stay.
+function once(name, value, draw) {
+  const text = JSON.stringify(value);
+  if (drawn[name] === text) return;
+  drawn[name] = text;
+  draw();
+}
+
+function progress(now, measuring) {
+  const count = now.attitudes.length;
+  parts.progress.max = Math.max(now.wanted, count, 1);
+  parts.progress.value = count;
+  put(parts.count, now.wanted ? `${count} of about ${Math.max(now.wanted, count)} attitudes` : `${count} attitudes`);
+  put(parts.enough, now.enough ? sentence(now.enough.replace(/^enough: /, "")) : "");
+  show(parts.enough, measuring && Boolean(now.enough));
+  for (const part of [parts.where, parts.toward, parts.known]) show(part, now.phase !== "done");
+  show(parts.finish, measuring);
+  parts.finish.disabled = !count;
+  parts.finish.className = now.enough ? "main" : "";
+  put(parts.finish, now.enough ? "Make the record" : "Finish now");
+}
+
+function bodies(now, measuring) {
+  show(parts.bodies, Boolean(now.up));
+  if (!now.up) return;
+  const wanted = measuring ? now.next : null;
+  const key = JSON.stringify(wanted);
+  if (!orientation) orientation = upright(now.up);
+  if (aim?.key !== key) aim = { key, up: wanted, R: wanted && product(orientation, shortest(wanted, lastUp(now))) };
+  orientation = aim.up ? product(aim.R, shortest(now.up, aim.up)) : upright(now.up);
+  drawBody(parts.live, orientation);
+  show(parts.nextFigure, Boolean(aim.up));
+  if (!aim.up) {
+    put(parts.liveText, "");
+    return;
+  }
+  once("aim", [aim.key, now.next_words], () => {
+    drawBody(parts.next, aim.R);
+    parts.next.setAttribute("aria-label", `Next attitude: ${now.next_words}`);
+    put(parts.nextText, now.next_words);
+  });
+  const away = degreesBetween(now.up, aim.up);
+  put(parts.liveText, away < NEAR ? "this is it" : `${Math.round(away / 5) * 5}° away`);
+  parts.liveText.className = away < NEAR ? "there" : "";
+}
+
+// The direction that the drawn orientation has up.
+const lastUp = () => orientation[2];
+
+function facts(now) {
+  const wrong = Object.entries(now.counts).filter(([name, number]) => number && name !== "gaps");
+  const rows = [
+    ["|f| now", now.length === null ? "–" : `${now.length.toPrecision(5)} ${now.unit.replace("^2", "²")}`],
+    ["stream", now.rate ? `${now.rate.toPrecision(3)} Hz` : "–"],
+    ["recorded", duration(now.seconds)],
+    ...(now.temperature === null ? [] : [["temperature", `${now.temperature.toFixed(1)} °C`]]),
+    ...wrong.map(([name, number]) => [`samples ${name}`, `${number}`]),
+  ];
+  if (parts.facts.children.length !== rows.length) {
+    parts.facts.replaceChildren(...rows.map(() => h("div", {}, h("dt", {}), h("dd", {}))));
+  }
+  rows.forEach(([name, text], k) => {
+    put(parts.facts.children[k].firstChild, name);
+    put(parts.facts.children[k].lastChild, text);
+  });
+  put(document.getElementById("where"), [now.source, now.format, now.recording].filter(Boolean).join(" · "));
+}
+
+function knocked(now, measuring) {
+  parts.knocked.replaceChildren(...now.attitudes.filter(each => each.aside && measuring).map(each => {
+    const off = each.residual === null ? "" : ` is off by ${milli(each.residual)} mg`;
+    return h("p", { class: "said bad" }, `Attitude ${each.number}${off}: knocked? Drop it, or put it down so once more. `,
+      h("button", { onclick: () => drop(each.number) }, `Drop attitude ${each.number}`));
+  }));
+}
+
+const drop = number => page.send({ type: "drop", attitude: number });
+
+function happened(event) {
+  parts.log.prepend(h("li", {}, h("span", { class: "time" }, `${event.time.toFixed(1)} s`), ` ${event.text}`));
+  while (parts.log.children.length > LOG) parts.log.lastChild.remove();
+  beep(event.kind);
+}
+
+function failed(message) {
+  page.end(sentence(message.text), "bad");
+  const below = message.lines.length ? [h("p", {}, "The first lines of the stream:"), h("pre", {}, message.lines.join("\n"))] : [];
+  if (message.guess) {
+    below.push(h("p", {}, "A guess of its columns; check it, save it as layout.toml, and add --layout layout.toml:"),
+      h("pre", {}, message.guess));
+  }
+  place.replaceChildren(...(below.length ? [h("section", {}, below)] : []));
 }

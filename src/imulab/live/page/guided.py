@@ -1,0 +1,274 @@
+"""The guided session on the page: it runs in a thread of its own, and every page sees the same.
+
+Messages to the page, beside those of `parts`:
+
+``view``
+    The `View` as JSON, at most ten a second: numbers in SI or as `View` says, parameters as texts (`name`, `value`,
+    `uncertainty`, `unit`) with `share`, their standard uncertainty over the target's; each attitude in `words`; `phase`
+    (``measuring``, ``computing`` or ``done``); `silent`, a sentence while nothing comes; `recording`, its file.
+``event``
+    Something that happened: `kind`, `text`, `time`, as `Event`.
+``done``
+    The record is made: `headline`, `verdict` (``good``, ``look`` or ``bad``), `reasons`, `parameters` as above, `files`
+    (`kind`, `name`, `href`) and `command`, which makes the same record.
+``corrected``
+    After that, ten times a second: `length`, `raw` and `gravity`, m/s², of the reading now.
+``failed``
+    The session has ended: `text` says why; `lines` are the first of an unknown stream, `guess` a layout for it.
+
+Messages from the page: ``drop`` (`attitude`: its number), ``finish`` and ``quit``.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextvars import copy_context
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from time import monotonic, sleep
+
+import numpy as np
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Route
+
+from imulab.errors import ImulabError, OptionError, quoted
+from imulab.live.formats import UnknownFormatError
+from imulab.live.page.parts import Hub, Message, Part
+from imulab.live.page.security import report_response
+from imulab.live.runner import Runner
+from imulab.live.session import Event
+from imulab.live.view import View, in_words
+from imulab.procedures.apply import Loaded, apply, loaded
+from imulab.procedures.reports import exhibits_of, parameter_rows, rendered
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+from imulab.report.elements import format_uncertain
+
+_WAIT, _EVERY = 0.05, 0.1
+_TOLD = 0.3
+_EVENTS = 60
+_PATIENCE = 5.0
+
+
+class GuidedPart(Part):
+    """The guided session as a part of the page.
+
+    Parameters
+    ----------
+    runner
+        The session with its source and its recording.
+    fit
+        Makes the record from the recording, and writes what is to be written.
+    command
+        The words of the command that makes the same record.
+    record_name
+        What the record's file is called.
+
+    Attributes
+    ----------
+    record
+        What `fit` has made; None before.
+    error
+        Why the session ended, where it was no ordinary end.
+    """
+
+    name = "session"
+
+    def __init__(self, runner: Runner, fit: Callable[[], Calibration], command: str, record_name: str) -> None:
+        super().__init__()
+        self.record: Calibration | None = None
+        self.error: Exception | None = None
+        self._runner, self._fit, self._command, self._record_name = runner, fit, command, record_name
+        self._asked: SimpleQueue[Message] = SimpleQueue()
+        self._view: Message = {}
+        self._done: Message = {}
+        self._failed: Message = {}
+        self._events: deque[Message] = deque(maxlen=_EVENTS)
+        self._phase, self._silent, self._finish = "measuring", "", False
+        self._stop = threading.Event()
+        self._hub = Hub()
+        self._thread = threading.Thread(target=partial(copy_context().run, self._run), daemon=True, name="imulab live")
+        self.hears = {"drop": self._drop, "finish": self._asked.put, "quit": lambda _: self._hub.stop()}
+        self.routes = [Route("/api/session/{kind}", self._file)]
+
+    def begin(self, hub: Hub) -> None:
+        """Begin the session."""
+        self._hub = hub
+        self._thread.start()
+
+    def greet(self) -> Iterable[Message]:
+        """Yield the view, what happened lately, and how the session has ended where it has."""
+        return [message for message in (self._view, *tuple(self._events), self._done, self._failed) if message]
+
+    def end(self) -> None:
+        """End the session; what is recorded is kept."""
+        self._stop.set()
+        self._thread.join(_PATIENCE)
+
+    def _drop(self, message: Message) -> None:
+        number = message.get("attitude")
+        if type(number) is not int:
+            raise OptionError(f"drop: expected the number of an attitude, found {quoted(number)}")
+        self._asked.put(message)
+
+    def _run(self) -> None:
+        try:
+            while not self._measured():
+                if self._stop.is_set():
+                    return
+            self._follow()
+        except Exception as error:
+            self.error, self._failed = error, _failure(error)
+            self._tell(self._failed)
+            given_up = monotonic() + _PATIENCE  # a page that is just being opened is told, too
+            while not (self._hub.pages or self._stop.is_set()) and monotonic() < given_up:
+                sleep(_WAIT)
+            sleep(_TOLD)  # the pages are told before the server ends
+            self._hub.stop()
+
+    def _measured(self) -> bool:
+        """Measure until a person finishes or the stream ends; return whether there is a record then."""
+        runner, told = self._runner, 0.0
+        self._phase, self._finish = "measuring", False
+        while not (self._stop.is_set() or self._finish or runner.ended):
+            events = [*self._answers(), *runner.step(_WAIT)]
+            for event in events:
+                self._told(event)
+            if events or monotonic() - told > _EVERY:
+                self._show()
+                told = monotonic()
+        if self._stop.is_set():
+            return False
+        self._phase = "computing"
+        self._show()
+        runner.recorder.flush()
+        try:
+            self.record = self._fit()
+        except ImulabError as error:
+            if runner.ended:
+                raise
+            self._tell({"type": "refused", "text": str(error)})
+            return False
+        runner.recorder.close()
+        self._phase, self._done = "done", self._result(self.record)
+        self._show()
+        self._tell(self._done)
+        return True
+
+    def _answers(self) -> list[Event]:
+        """Do what the pages have asked for."""
+        events: list[Event] = []
+        try:
+            while True:
+                message = self._asked.get_nowait()
+                if message["type"] == "finish":
+                    self._finish = True
+                    continue
+                try:
+                    events += self._runner.drop(message["attitude"])
+                except OptionError as error:
+                    self._tell({"type": "refused", "text": str(error)})
+        except Empty:
+            return events
+
+    def _told(self, event: Event) -> None:
+        if event.kind == "again":
+            self._silent = ""
+        elif event.text.startswith("nothing has come"):
+            self._silent = event.text
+        if event.kind != "state":
+            self._events.append({"type": "event", **asdict(event)})
+            self._tell(self._events[-1])
+
+    def _show(self) -> None:
+        self._view = {
+            **view_message(self._runner.session.view()),
+            "phase": self._phase,
+            "silent": self._silent,
+            "recording": self._runner.recorder.path,
+        }
+        self._tell(self._view, latest=True)
+
+    def _tell(self, message: Message, *, latest: bool = False) -> None:
+        self._hub.tell(message, latest=latest)
+
+    def _follow(self) -> None:
+        """Show that the record corrects: the length of the reading, raw and corrected, until the end."""
+        assert self.record is not None
+        ready, runner, told = loaded(self.record), self._runner, 0.0
+        gravity = runner.session.guide.local_gravity
+        while not (self._stop.is_set() or runner.ended):
+            blocks = runner.listen(_WAIT)
+            if blocks and monotonic() - told > _EVERY:
+                raw, length = _lengths(ready, blocks[-1])
+                self._tell({"type": "corrected", "length": length, "raw": raw, "gravity": gravity}, latest=True)
+                told = monotonic()
+
+    def _result(self, record: Calibration) -> Message:
+        names = {"record": self._record_name, "report": "report", "recording": Path(self._runner.recorder.path).name}
+        return {
+            "type": "done",
+            "headline": exhibits_of(record).headline,
+            "verdict": record.verdict.state,
+            "reasons": list(record.verdict.reasons),
+            "parameters": [
+                _parameter(row.name, row.value, row.standard_uncertainty, row.unit) for row in parameter_rows(record)
+            ],
+            "files": [{"kind": kind, "name": name, "href": f"/api/session/{kind}"} for kind, name in names.items()],
+            "command": self._command,
+        }
+
+    def _file(self, request: Request) -> Response:
+        kind = request.path_params["kind"]
+        if kind == "recording":
+            path = self._runner.recorder.path
+            return FileResponse(path, filename=Path(path).name, media_type="text/csv")
+        if self.record is None:
+            raise OptionError("there is no record yet: finish the session first")
+        if kind == "report":
+            return report_response(rendered(self.record))
+        if kind == "record":
+            headers = {"content-disposition": f'attachment; filename="{_ascii(self._record_name)}"'}
+            return Response(self.record.to_json(), media_type="application/json", headers=headers)
+        raise OptionError(f"{quoted(kind)}: expected one of record report recording")
+
+
+def view_message(view: View) -> Message:
+    """Return a view as the message of the page."""
+    shown = [{**_parameter(p.name, p.value, p.standard_uncertainty, p.unit), "share": p.share} for p in view.parameters]
+    held = [{**asdict(each), "words": in_words(np.array(each.up))} for each in view.attitudes]
+    return {"type": "view", **asdict(view), "parameters": shown, "attitudes": held}
+
+
+def _parameter(name: str, value: float, uncertainty: float | None, unit: str) -> Message:
+    texts = format_uncertain(value, uncertainty)
+    return {"name": name, "value": texts[0], "uncertainty": texts[1], "unit": unit}
+
+
+def _lengths(ready: Loaded, block: Recording) -> Sequence[float]:
+    """Return the length of the mean reading of a block, raw and corrected, m/s^2."""
+
+    def length(of: Recording) -> float:
+        mean: Array = np.array([of.si(f"accel_{axis}").mean() for axis in "xyz"])
+        return float(np.linalg.norm(mean))
+
+    return length(block), length(apply(ready, block))
+
+
+def _failure(error: Exception) -> Message:
+    lines: Iterable[str] = ()
+    guess = ""
+    if isinstance(error, UnknownFormatError):
+        lines, guess = error.lines, error.guess.toml if error.guess else ""
+    text = str(error) if isinstance(error, ImulabError) else f"a fault of imulab: {type(error).__name__}: {error}"
+    return {"type": "failed", "text": text, "lines": list(lines), "guess": guess}
+
+
+def _ascii(name: str) -> str:
+    """Return a file's name as a header can hold it."""
+    return "".join(each if each.isascii() and each.isprintable() and each not in '"\\' else "_" for each in name)

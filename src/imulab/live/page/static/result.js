@@ -1,0 +1,43 @@
+// The record, once it is made: what it says, its files, and the reading corrected by it.
+
+import { h, put } from "./dom.js";
+import { parameterTable } from "./tables.js";
+
+const HEADS = { good: "Good.", look: "Look first.", bad: "Stop." };
+const FILES = { record: "Save the record", report: "Open the report", recording: "Save the recording" };
+
+export class ResultArea {
+  constructor(page) {
+    this.page = page;
+    this.place = h("div", {});
+  }
+
+  done(message) {
+    this.length = h("dd", {}, "–");
+    this.beside = h("p", { class: "caption" });
+    const files = message.files.map(file => h("a", {
+      class: "button", href: file.href, ...(file.kind === "report" ? { target: "_blank", rel: "noopener" } : { download: file.name }),
+    }, FILES[file.kind]));
+    this.place.replaceChildren(h("section", { class: "result" },
+      h("h2", {}, "The record"),
+      h("p", { class: `said ${message.verdict}` }, h("strong", {}, `${HEADS[message.verdict]} `), message.headline,
+        message.reasons.length ? h("ul", {}, message.reasons.map(text => h("li", {}, text))) : null),
+      h("p", { class: "files" }, files, h("button", { onclick: () => this.quit() }, "End the session")),
+      h("dl", { class: "facts" }, h("div", {}, h("dt", {}, "|f| now, corrected by the record"), this.length)),
+      this.beside,
+      h("p", { class: "caption" }, "The same record, from the recording:"),
+      h("pre", {}, message.command),
+      parameterTable({ parameters: message.parameters })));
+  }
+
+  corrected(message) {
+    if (!this.length) return;
+    put(this.length, `${message.length.toFixed(4)} m/s²`);
+    put(this.beside, `${message.raw.toFixed(4)} m/s² uncorrected; at rest ${message.gravity.toFixed(4)} m/s² is right. Turn the unit, and see.`);
+  }
+
+  quit() {
+    this.page.send({ type: "quit" });
+    this.page.end("The session has ended; this page can be closed.", "note");
+  }
+}

@@ -1,0 +1,315 @@
+"""The guided session in a real Chromium, by what a person clicks; the command line beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("starlette", reason="the page needs imulab[live]")
+sync_api = pytest.importorskip("playwright.sync_api", reason="the browser tests need playwright")
+
+from imulab.cli import main  # noqa: E402
+
+SLOW = 60_000
+"""What takes longer than this many ms hangs."""
+FIT = ["--order", "1", "--gravity", "9.81+-0"]
+UNIT = "simulate:order=1,gravity=9.81,noise=0.2mg"
+EVIL = "<img src=x onerror=document.title='taken'><script>document.title='taken'</script>"
+
+
+class Live:
+    """`imulab live --page` in a process of its own."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "imulab", "live", *words, "--page", "--no-browser"],
+            cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.lines: queue.Queue[str] = queue.Queue()
+        self.reader = threading.Thread(target=self._read, daemon=True)
+        self.reader.start()
+        self.address = self.lines.get(timeout=60)
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(line.strip())
+
+    def end(self) -> tuple[int, str]:
+        """Wait for the end; exit status and standard error."""
+        assert self.process.stderr is not None
+        status = self.process.wait(30)
+        error = self.process.stderr.read()
+        self.close()
+        return status, error
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait(30)
+        self.reader.join(5)
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+@pytest.fixture(scope="module")
+def browser(chromium) -> Iterator[object]:
+    with sync_api.sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def new_page(browser) -> Iterator[object]:
+    """A function that opens a page; at the end none may have reported a fault."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(SLOW)
+    faults: list[str] = []
+
+    def opened(address: str):
+        page = context.new_page()
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("console", lambda said: faults.append(said.text) if "Content Security" in said.text else None)
+        page.goto(address)
+        return page
+
+    yield opened
+    context.close()
+    assert not faults
+
+
+@pytest.fixture
+def live(tmp_path) -> Iterator[object]:
+    started: list[Live] = []
+
+    def start(*words: str) -> Live:
+        started.append(Live(tmp_path, *words))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.close()
+
+
+def content(record: Path) -> dict:
+    found = json.loads(record.read_text())
+    return {key: value for key, value in found.items() if key not in ("created", "content_sha256")}
+
+
+def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_page, tmp_path, monkeypatch):
+    words = ["--follow", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "sn42.json"]
+    running = live(f"{UNIT},speed=25,knock=5", *words)
+    page = new_page(running.address)
+    named = page.locator(".said.bad:has(button:text-is('Drop attitude 5'))")
+    named.wait_for()
+    assert "knocked?" in named.inner_text()
+    other = new_page(running.address)  # a second page on the session: the same, and it can drop, too
+    other.locator(".said.bad button").click()
+    named.wait_for(state="detached")
+    page.reload()
+    page.wait_for_selector(".enough:not([hidden])")
+    numbers = page.locator("section:has(> h2:text-is('Attitudes')) tbody tr td:first-child").all_inner_texts()
+    assert "5" not in numbers
+    assert len(numbers) >= 14
+    page.get_by_role("button", name="Make the record").click()
+    for each in (page, other):
+        each.wait_for_selector(".result")
+        assert each.locator(".advice").inner_text() == "Done: the record is made."
+    page.wait_for_selector(r".result .facts dd:text-matches('^9\\.8[01]\\d+ m')")  # 10.2 uncorrected
+    with page.expect_download() as saved:
+        page.get_by_text("Save the record", exact=True).click()
+    monkeypatch.chdir(tmp_path)
+    assert Path(saved.value.path()).read_bytes() == Path("sn42.json").read_bytes()
+    with page.context.expect_page() as opened:
+        page.get_by_text("Open the report").click()
+    opened.value.wait_for_selector("html[data-drawn]")
+    assert opened.value.evaluate("origin") == "null"  # a page of its own, which reaches nothing of the session
+    page.get_by_role("button", name="End the session").click()
+    assert "can be closed" in page.locator("#said").inner_text()
+    assert running.end()[0] == 0
+    assert main(["tumble", "fit", "rec.csv", *FIT, "-o", "fit.json"]) == 0
+    assert content(tmp_path / "sn42.json") == content(tmp_path / "fit.json")
+
+
+class Elsewhere(BaseHTTPRequestHandler):
+    """A page of another port of this machine, which may do what it likes."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("content-type", "text/html")
+        self.end_headers()
+        self.wfile.write(b"<title>elsewhere</title>")
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def elsewhere() -> Iterator[str]:
+    with HTTPServer(("127.0.0.1", 0), Elsewhere) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_wrong_token_and_another_page_get_nothing(live, new_page, elsewhere):
+    running = live(f"{UNIT},speed=5", "--save", "rec.csv")
+    base = running.address.partition("?")[0]
+    stranger = new_page(f"{base}?token=wrong")
+    assert "open that one, with its token" in stranger.inner_text("body")
+    page = new_page(running.address)
+    page.wait_for_selector(".now[data-state]")
+    assert page.url == base  # the token has left the address
+    # Another page of this browser asks for the socket and for an answer; the browser sends the cookie along.
+    hostile = new_page(elsewhere)
+    hostile.evaluate(
+        """base => {
+      window.found = [];
+      const socket = new WebSocket(base.replace("http", "ws") + "ws");
+      socket.onopen = () => found.push("socket open");
+      socket.onclose = () => found.push("socket closed");
+      fetch(base + "api/session/recording", { credentials: "include", mode: "no-cors" })
+        .then(() => found.push("answer, unreadable"), () => found.push("no answer"));
+      const script = document.createElement("script");
+      script.onload = () => found.push("script"), script.onerror = () => found.push("no script");
+      script.src = base + "static/plotly.js";
+      document.head.append(script);
+    }""",
+        base,
+    )
+    hostile.wait_for_function("found.length === 3")
+    assert sorted(hostile.evaluate("found")) == ["no answer", "no script", "socket closed"]
+
+
+def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page):
+    running = live(f"{UNIT},speed=5", "--follow", *FIT, "--save", "rec.csv")
+    page = new_page(running.address)
+    page.get_by_role("button", name="Finish now").click()
+    page.wait_for_selector("#said .bad")
+    assert "attitudes" in page.locator("#said").inner_text()
+    page.locator(".sphere .held").nth(3).wait_for(state="attached")
+    running.process.send_signal(signal.SIGINT)
+    page.wait_for_selector("#said .bad:has-text('The program has ended')")
+    status, error = running.end()
+    assert status == 130
+    assert "attitudes: --resume goes on with it" in error
+
+
+def test_a_killed_program_is_said_on_the_page(live, new_page):
+    running = live(f"{UNIT},speed=5", "--save", "rec.csv")
+    page = new_page(running.address)
+    page.wait_for_selector(".now[data-state]")
+    os.kill(running.process.pid, signal.SIGKILL)
+    page.wait_for_selector("#said .bad:has-text('The program has ended, or cannot be reached')")
+
+
+def test_nothing_of_a_stream_is_executed(live, new_page, tmp_path):
+    (tmp_path / "hostile.csv").write_text(
+        f"# format = {EVIL}\n# {EVIL} = {EVIL}\n"
+        f"time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2],{EVIL} [count]\n"
+        + "".join(f"{k / 100},{0.01 * (k % 3)},0.02,9.81,1\n" for k in range(3000))
+    )
+    running = live("replay:hostile.csv", "--save", "rec.csv")
+    page = new_page(running.address)
+    page.wait_for_selector(".log:has-text('<img')", state="attached")
+    assert page.locator("main img").count() == 0
+    assert "taken" not in page.title()
+
+
+def test_an_unknown_stream_shows_its_lines_and_a_guess(live, new_page, tmp_path):
+    rows = "".join(f"{10 * k},{k % 3},{4 - k % 3},{1000 + k % 5}\\n" for k in range(400))
+    sender = subprocess.Popen(
+        [
+            sys.executable, "-c",
+            "import socket, time\n"
+            "s = socket.create_server(('127.0.0.1', 0)); print(s.getsockname()[1], flush=True)\n"
+            f"c, _ = s.accept()\nfor line in '{rows}'.splitlines(True):\n"
+            "  c.sendall(line.encode()); time.sleep(0.01)\n",
+        ],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        port = sender.stdout.readline().strip()
+        running = live(f"tcp:127.0.0.1:{port}", "--save", "rec.csv")
+        page = new_page(running.address)
+        page.wait_for_selector("#said .bad:has-text('unknown format')")
+        assert "[columns]" in page.locator("pre").last.inner_text()
+        status, error = running.end()
+        assert status == 2
+        assert "unknown format" in error
+        assert not (tmp_path / "rec.csv").exists()
+    finally:
+        sender.kill()
+        sender.communicate()
+
+
+def test_no_script_and_old_browsers_are_told(live, browser):
+    running = live(f"{UNIT},speed=5", "--save", "rec.csv")
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto(running.address)
+    assert "This page needs JavaScript" in page.inner_text("main")
+    context.close()
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(running.address)
+    page.route("**/", old)
+    page.reload()
+    page.wait_for_selector("#old:not([hidden])")
+    assert "too old for this page" in page.locator("#old").inner_text()
+    context.close()
+
+
+def old(route) -> None:
+    """Answer with the page as a browser sees it that knows neither modules nor nomodule."""
+    answer = route.fetch()
+    module = '<script type="module" src="/static/app.js"></script>'
+    route.fulfill(response=answer, body=answer.text().replace(module, "").replace("nomodule ", ""))
+
+
+@pytest.mark.parametrize("width", [1280, 768, 390])
+def test_nothing_overflows_sideways(live, new_page, width):
+    running = live(f"{UNIT},speed=25", "--follow", "--target", "bias 100 ug", *FIT, "--save", "rec.csv")
+    page = new_page(running.address)
+    page.set_viewport_size({"width": width, "height": 844})
+    page.wait_for_selector("table")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--page", "--plain"], "--page together with --plain"),
+        (["--port", "8000"], "--port: expected --page with it"),
+        (["--no-browser"], "--no-browser: expected --page with it"),
+        (["--page", "--port", "70000"], "--port 70000: expected 0 (a free one) to 65535"),
+        (["--page", "--port", "x"], "--port 'x'"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_no_file(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["live", "simulate", "--save", "rec.csv", *words]) == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error
+    assert "\n" not in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_installed_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("imulab.live.page.find_spec", lambda name: None if name == "uvicorn" else name)
+    assert main(["live", "simulate", "--save", "rec.csv", "--page"]) == 2
+    assert "the page needs uvicorn, which is not here: pip install 'imulab[live]'" in capsys.readouterr().err
