@@ -41,6 +41,7 @@ FUNCTIONS = {
     "warmup table": il.warmup_table,
     "noise fit": il.fit_noise,
     "noise plan": il.plan_noise,
+    "noise check": il.check_noise,
     "noise simulate": il.simulate_noise,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,

@@ -17,6 +17,7 @@ BLOCK = re.compile(r"<!-- tested -->\n+```(\w*)\n(.*?)```", re.DOTALL)
 EXAMPLES = (
     "allan_deviation",
     "apply",
+    "check_noise",
     "check_tumble",
     "compare_methods",
     "export",

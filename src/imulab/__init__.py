@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import merge_array as merge_array
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
     from imulab.procedures.loading import load as load
+    from imulab.procedures.noise.check import check_noise as check_noise
     from imulab.procedures.noise.fit import NoiseFit as NoiseFit
     from imulab.procedures.noise.fit import fit_noise as fit_noise
     from imulab.procedures.noise.plan import plan_noise as plan_noise
@@ -87,6 +88,7 @@ _HOME = {
     "Fused": "procedures.gyro_array.fuse",
     "allan_deviation": "procedures.allan",
     "calibrate_array": "procedures.gyro_array.public",
+    "check_noise": "procedures.noise.check",
     "check_tumble": "procedures.tumble.compare",
     "compare_methods": "procedures.gyro_array.public",
     "fuse": "procedures.gyro_array.public",

@@ -7,10 +7,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import lists, with_options
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, quantity
-from imulab.errors import OptionError
+from imulab.cli.fit_options import READ, lists, reading, with_options
+from imulab.cli.options import (
+    AsJson,
+    GivenFiles,
+    OutputFile,
+    RecordFile,
+    ReportFile,
+    call,
+    check_outputs,
+    note,
+    quantity,
+    read_recording,
+    warn,
+)
+from imulab.errors import OptionError, RecordError
 from imulab.procedures.noise.task import OPTIONS
+from imulab.quantities import labelled
 
 if TYPE_CHECKING:
     from imulab.procedures.noise.plan import NoisePlan
@@ -33,7 +46,7 @@ FromRecord = Annotated[
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    for function in (fit, plan, simulate):
+    for function in (fit, plan, check, simulate):
         group.command(function.__name__)(function)
     return group
 
@@ -66,7 +79,6 @@ def fit(
     from imulab.cli.result import finish
     from imulab.procedures.noise.wants import check_program, noise_for
     from imulab.procedures.run import run_task
-    from imulab.quantities import labelled
 
     check_outputs([output, report], [*files, *([options["layout"]] if options["layout"] else [])])
     hertz = None if rate is None else quantity(rate, "--rate", "frequency", "Hz")
@@ -148,6 +160,54 @@ def _print_plan(result: NoisePlan) -> None:
 def finite(value: float) -> float | None:
     """Return a number, None where it is none."""
     return value if math.isfinite(value) else None
+
+
+@with_options(READ)
+def check(
+    record: RecordFile,
+    files: Annotated[list[str], typer.Argument(metavar="LOG...", help="Logs at rest, of the record's rate.")],
+    *,
+    tolerance: Annotated[str, typer.Option(help="Change of size that is not held against the log.")] = "1 %",
+    false_alarm: Annotated[
+        str, typer.Option("--false-alarm", help="Share of logs of unchanged noise that fail.")
+    ] = "5 %",
+    options: dict[str, str | None],
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> int:
+    """Test whether a new log at rest is of the noise of a record; exit status 0: pass, 1: fail.
+
+    Several logs add up. Says what differs by how much; a log that is of the same noise fails once in twenty tests.
+    """
+    from imulab.cli.speech import coloured
+    from imulab.procedures.loading import load
+    from imulab.procedures.noise.check import check_recordings
+    from imulab.procedures.noise.checkfigures import as_json, as_text, check_page
+    from imulab.verdict import Note
+
+    check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
+    held = load(record)
+    recordings = [read_recording(file, **reading(options)) for file in files]
+    with labelled("--{}", ["tolerance", "false_alarm"]):
+        try:
+            result = check_recordings(held, recordings, tolerance, false_alarm)
+        except RecordError as error:
+            raise RecordError(f"{record}: {error}") from None
+    if report:
+        from imulab.atomic_write import write_text
+
+        write_text(report, check_page(result, held, record=record, files=files))
+    if json:
+        from imulab.records.json_text import json_text
+
+        print(json_text(as_json(result)), end="")
+    else:
+        print(as_text(result, record, files, coloured("pass" if result.passed else "fail")))
+    for message in result.notes:
+        (note if isinstance(message, Note) else warn)(message)
+    if report and not json:
+        print(f"report: {report}")
+    return 0 if result.passed else 1
 
 
 def simulate(

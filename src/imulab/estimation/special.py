@@ -46,6 +46,6 @@ def _functions() -> ModuleType:
 
 
 _HELD = _functions()
-chdtrc, chdtri, fdtrc = _HELD.chdtrc, _HELD.chdtri, _HELD.fdtrc
+chdtrc, chdtri, fdtrc, fdtri = _HELD.chdtrc, _HELD.chdtri, _HELD.fdtrc, _HELD.fdtri
 ndtr, ndtri, stdtr, stdtrit = _HELD.ndtr, _HELD.ndtri, _HELD.stdtr, _HELD.stdtrit
 sici = _HELD.sici

@@ -14,7 +14,7 @@ from imulab.errors import OptionError, UnitError
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME
 from imulab.quantities import in_si, split_quantity
 from imulab.recording import Array
-from imulab.units import parse_unit
+from imulab.units import parse_unit, si_unit
 
 Markov: TypeAlias = str | tuple[float | str, float | str]
 """Standard deviation and correlation time of a Gauss-Markov term: ``"20 deg/h:300 s"``, or the two of them."""
@@ -25,7 +25,7 @@ EXAMPLES = {
     "quantisation": "1 arcsec",
     "gm": "20 deg/h:300 s",
 }
-_SI = {"rate": "rad/s", "acceleration": "m/s^2"}
+_LEVELS = ("rate", "acceleration", "output", "number")
 _INTEGRALS = {"m/s": ("m/s^2", 1.0), "mm/s": ("m/s^2", 1e-3)}
 _HOUR = math.sqrt(3600.0)
 # What follows the unit of a level, or of its integral, and the factor that it makes.
@@ -52,7 +52,7 @@ class GivenTerms:
 
 
 def given_terms(
-    unit: str | None,
+    unit: str,
     *,
     white: float | str | None,
     flicker: float | str | None,
@@ -65,7 +65,7 @@ def given_terms(
     Parameters
     ----------
     unit
-        SI unit of the level; that of the texts, or rad/s, if None.
+        SI unit of the level where no text has one.
     white, flicker, walk, quantisation
         N, B, K, Q.
     gm
@@ -91,7 +91,7 @@ def given_terms(
         levels |= {} if level is None else {"gm": level}
         if not 0 < values[TIME[k]] < math.inf:
             raise OptionError(f"gm {time}: expected a correlation time above 0")
-    found = unit or next(iter(levels.values()), "rad/s")
+    found = next(iter(levels.values()), unit)
     for name, level in levels.items():
         if level != found:
             raise OptionError(f"{name}: noise of an output in {level}; expected that of one in {found}")
@@ -138,9 +138,7 @@ def _level(text: str) -> tuple[float, str] | None:
         unit = parse_unit(text)
     except UnitError:
         return None
-    if unit.quantity in ("output", "number"):
-        return 1.0, unit.symbol
-    return (unit.factor, _SI[unit.quantity]) if unit.quantity in _SI else None
+    return (unit.factor, si_unit(text)) if unit.quantity in _LEVELS else None
 
 
 def _integral(text: str) -> tuple[float, str] | None:

@@ -110,7 +110,7 @@ def _for_filters(fit: Fit) -> ReportTable:
                 name,
                 f"{white.value:.3g}",
                 f"{walk.value:.2g}",
-                f"{walk.interval_95[0]:.1g} to {walk.interval_95[1]:.1g}",
+                f"{walk.interval_95[0]:.2g} to {walk.interval_95[1]:.2g}",
                 column.unit,
                 *(plain_number(means[t] * factor, 2) if t in means else "–" for t in times),
                 unit,

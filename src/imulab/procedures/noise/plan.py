@@ -12,8 +12,8 @@ import numpy as np
 
 from imulab.errors import OptionError, listed
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
-from imulab.estimation.noise.terms import NAMES, SIGMA
-from imulab.estimation.noise.use import at_band_edge
+from imulab.estimation.noise.terms import NAMES
+from imulab.estimation.noise.use import edge_as_white
 from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.noise.coefficients import Markov, given_terms
 from imulab.procedures.noise.engineering import label, shown
@@ -22,7 +22,7 @@ from imulab.procedures.noise.simulate import RATE, names_given, terms_of
 from imulab.quantities import fraction, in_si
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.report.elements import QUIET, Figure, plain_number
+from imulab.report.elements import LEGEND, QUIET, Figure, plain_number
 from imulab.report.plots import Plot
 from imulab.report.traces import DASHES, log_axis, rounded, scatter
 from imulab.shown import Shown
@@ -155,7 +155,9 @@ def plan_figure(plan: NoisePlan) -> Figure:
             scatter(rounded(plan.lengths[shown_] / _HOUR, 5), rounded(np.where(reached < 300, reached, np.nan), 5),
                     "lines", name=name, line=line, hovertemplate="%{x:.3g} h: %{y:.2g} %<extra>" + name + "</extra>")
         )  # fmt: skip
-    for wanted in sorted({each.wanted for each in plan._wanted}):
+    levels = sorted({each.wanted for each in plan._wanted})
+    least = min(levels, default=0.1)
+    for wanted in levels:
         ends = plan.lengths[shown_][[0, -1]] / _HOUR
         traces.append(
             scatter(ends.tolist(), [100 * wanted] * 2, "lines", name=f"wanted, {_percent(wanted)}", hoverinfo="skip",
@@ -166,8 +168,8 @@ def plan_figure(plan: NoisePlan) -> Figure:
         caption="Relative standard uncertainty that a record at rest can reach (the Cramer-Rao bound). Four times the "
         "record halves it, once the term is seen at all.",
         traces=traces,
-        layout={"xaxis": log_axis("length of the record, h"), "yaxis": log_axis("standard uncertainty, %"),
-                "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"}},
+        layout={"xaxis": log_axis("length of the record, h"), "legend": LEGEND,
+                "yaxis": log_axis("standard uncertainty, %", range=np.log10([100 * least / 30, 300]).tolist())},
         height=430,
         message=plan._lead(),
     )  # fmt: skip
@@ -250,7 +252,7 @@ def plan_noise(
     if seconds is not None and not 0 < seconds < 1e9:
         raise OptionError(f"duration {seconds:g} s: expected more than 0")
     if from_ is None:
-        given = given_terms(None, **terms)  # type: ignore[arg-type]
+        given = given_terms("rad/s", **terms)  # type: ignore[arg-type]
         name = {"rad/s": "gyro", "m/s^2": "accel"}.get(given.unit, "output")
         hertz = in_si(RATE if rate is None else rate, "rate", "frequency", "Hz")
         if not 1e-3 <= hertz <= 1e6:
@@ -289,19 +291,10 @@ def _of_record(record: Calibration, columns: str | Sequence[str] | None) -> tupl
             for term in NAMES
             if (p := record.parameters.get(f"{name}_{term}")) is not None and p.value == 0 and p.interval_95
         }
-        found[name] = _Column(
-            _without_edge(values[name], column.shortest_time.value), units[name], column.interval.value,
-            fit.band[name].value, column.ripple, unseen, column.length.value,
-        )  # fmt: skip
+        inside = edge_as_white(values[name], np.eye(len(NAMES)), column.shortest_time.value)[0]
+        dt, band, length = column.interval.value, fit.band[name].value, column.length.value
+        found[name] = _Column(inside, units[name], dt, band, column.ripple, unseen, length)
     return found, max(fit.columns[name].length.value for name in values)
-
-
-def _without_edge(values: Array, shortest: float) -> Array:
-    """Without Gauss-Markov terms at the shortest time constant, which are the sensor's filter and no noise to plan."""
-    left = values.copy()
-    for k in np.flatnonzero(at_band_edge(values, shortest)).tolist():
-        left[[SIGMA[k], SIGMA[k] + 1]] = 0
-    return left
 
 
 def _planned(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: float | None) -> NoisePlan:

@@ -35,6 +35,7 @@ class NoiseLog:
     rate: float
     count: int
     seed: int
+    sensor: Mapping[str, str]
 
     def blocks(self) -> Iterator[Recording]:
         """Yield the log in blocks, of which no more than one is in memory."""
@@ -54,7 +55,7 @@ class NoiseLog:
             start += len(parts[0])
 
     def _head(self) -> dict[str, str]:
-        head = {"serial": f"SIM-{self.seed:04d}", "model": "simulated noise"}
+        head = {"model": "simulated noise", **self.sensor}
         for column, values in self.values.items():
             for term, value in by_name(values).items():
                 head[f"truth_{column}_{term}"] = f"{value!r} {unit_of(term, self.units[column])}"
@@ -77,10 +78,14 @@ def noise_log(
     """Return a log to simulate; arguments and errors as for `simulate_noise`."""
     terms = {"white": white, "flicker": flicker, "walk": walk, "quantisation": quantisation, "gm": gm}
     names = names_given(columns)
+    sensor: Mapping[str, str] = {}
     if from_ is None:
-        by_columns = {_SENSORS[u] for u in _SENSORS if names and names[0].startswith(_SENSORS[u])}
-        unit = next((u for u, sensor in _SENSORS.items() if sensor in by_columns), None)
-        given = given_terms(unit, **terms)  # type: ignore[arg-type]
+        unit = next((u for u, sensor in _SENSORS.items() if names and names[0].startswith(sensor)), None)
+        given = given_terms(unit or "rad/s", **terms)  # type: ignore[arg-type]
+        if unit and given.unit in _SENSORS and given.unit != unit:
+            raise OptionError(
+                f"columns {' '.join(names or ())}: noise of an output in {given.unit} is of no such sensor"
+            )
         names = names or [f"{_SENSORS.get(given.unit, 'gyro')}_{axis}" for axis in "xyz"]
         values, units = dict.fromkeys(names, given.values), dict.fromkeys(names, given.unit)
         hertz = in_si(RATE if rate is None else rate, "rate", "frequency", "Hz")
@@ -88,7 +93,9 @@ def noise_log(
         for name, value in terms.items():
             if value:
                 raise OptionError(f"{name}: the record says that already; expected either terms or a record")
-        values, units, own = terms_of(as_record(from_, "simulate_noise"), names)
+        record = as_record(from_, "simulate_noise")
+        values, units, own = terms_of(record, names)
+        sensor = {key: str(record.sensor[key]) for key in ("serial",) if key in record.sensor}
         hertz = own if rate is None else in_si(rate, "rate", "frequency", "Hz")
     seconds, number = in_si(duration, "duration", "time", "s"), whole(seed, "seed")
     if not 1e-3 <= hertz <= 1e6:
@@ -97,7 +104,7 @@ def noise_log(
         raise OptionError(f"duration {seconds:g} s: expected 2 to {_MOST_SAMPLES:.0e} samples at {hertz:g} Hz")
     if number < 0:
         raise OptionError(f"seed {number}: expected a whole number from 0")
-    return NoiseLog(values, units, hertz, round(seconds * hertz), number)
+    return NoiseLog(values, units, hertz, round(seconds * hertz), number, sensor)
 
 
 def terms_of(record: Calibration, names: Sequence[str] | None) -> tuple[dict[str, Array], dict[str, str], float]:

@@ -1,0 +1,181 @@
+"""Whether two sets of spectra are of the same noise: by the terms of a model, and octave by octave without one.
+
+Source: the likelihood ratio of one model for both against one for each, its mean under the common model from drawn
+spectra (Bartlett 1937); ratios of mean squares in octaves, which are F variables whatever the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.estimation.noise.choice import CANDIDATES, choose
+from imulab.estimation.noise.cosine import frequencies
+from imulab.estimation.noise.likelihood import Flags, score, time_limits
+from imulab.estimation.noise.spectrum import Spectrum
+from imulab.estimation.noise.terms import Bins, prepare
+from imulab.recording import Array
+
+_DRAWS = 100
+_TAIL = 0.025
+
+
+@dataclass(frozen=True)
+class Octaves:
+    """Mean squares of the second set over those of the first, octave by octave.
+
+    Attributes
+    ----------
+    low, high
+        Ends of each, Hz, shape (o,).
+    ratio
+        Of the mean squares, each over the common model, shape (..., o).
+    freedom
+        Coefficients in both, shape (2, o).
+    """
+
+    low: Array
+    high: Array
+    ratio: Array
+    freedom: Array
+
+    @property
+    def scores(self) -> Array:
+        """Standard normal where both are of the same noise, shape (..., o)."""
+        from imulab.estimation.special import fdtrc, ndtri
+
+        upper = fdtrc(self.freedom[1], self.freedom[0], self.ratio)
+        lower = fdtrc(self.freedom[0], self.freedom[1], 1 / self.ratio)
+        tail = np.maximum(np.minimum(upper, lower), 1e-300)
+        return np.asarray(np.where(upper < lower, 1.0, -1.0) * -ndtri(tail))
+
+    @property
+    def probability(self) -> Array:
+        """Of so large a sum of squares of the scores, if both are of the same noise, shape (...)."""
+        from imulab.estimation.special import chdtrc
+
+        return np.asarray(chdtrc(max(len(self.low), 1), np.sum(self.scores**2, axis=-1)))
+
+    @property
+    def interval(self) -> tuple[Array, Array]:
+        """Ends of the 95 % interval of the ratio of the two powers, shapes (..., o)."""
+        from imulab.estimation.special import fdtri
+
+        d1, d2 = self.freedom
+        return self.ratio / fdtri(d2, d1, 1 - _TAIL), self.ratio / fdtri(d2, d1, _TAIL)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What speaks against one noise for both sets.
+
+    Attributes
+    ----------
+    model
+        Terms of the common model, shape (8,).
+    terms_probability
+        Of so large a likelihood ratio, if both are of the same noise.
+    octaves
+        The ratios by octave.
+    probability
+        Of either probability as small as the smaller of the two, if both are of the same noise.
+    """
+
+    model: Flags
+    terms_probability: float
+    octaves: Octaves
+    probability: float
+
+
+def agreement(
+    first: Sequence[Spectrum],
+    second: Sequence[Spectrum],
+    highest: float,
+    *,
+    candidates: tuple[str, ...] = CANDIDATES,
+    full_band: bool = False,
+) -> Agreement:
+    """Test whether two sets of spectra, of one sampling rate, are of the same noise.
+
+    Spectra drawn from the common model tell the mean of the likelihood ratio, and how many independent tests the two
+    tests count for, between one and two.
+
+    Parameters
+    ----------
+    first, second
+        Their bins count what they are to be trusted with.
+    highest
+        Up to which frequency, Hz.
+    candidates, full_band
+        For the choice of the common model, as for `choose`.
+    """
+    from imulab.estimation.special import chdtrc
+
+    spectra = [*first, *second]
+    bins, limits = prepare(spectra), time_limits(spectra)
+    own = np.arange(len(bins.freedom)) < sum(len(each.power) for each in first)
+    choice = choose(bins, limits, bins.power[None], bins.freedom[None], candidates, full_band)
+    best = int(choice.chosen[0])
+    values, model = choice.values[0, best], choice.models[0, best]
+    variance = bins.variances(values[None])[0]
+    used = np.maximum(bins.freedom, 1e-9)
+    drawn = variance * np.random.default_rng(1).chisquare(used, (_DRAWS, len(used))) / used
+    power = np.concatenate([bins.power[None], drawn])
+    ratios = _likelihood_ratios(bins, own, values, limits, power)
+    count = int(np.count_nonzero(values > 0))
+    by_terms = chdtrc(count, count * ratios / max(float(ratios[1:].mean()), 1e-9))
+    octaves = _octaves(spectra, own, power / variance, highest)
+    least = np.minimum(by_terms, octaves.probability)
+    # The least of m independent probabilities p has -ln(1 - p) of mean 1/m.
+    tests = float(np.clip(-1 / np.mean(np.log1p(-np.minimum(least[1:], 1 - 1e-16))), 1, 2))
+    return Agreement(
+        model,
+        float(by_terms[0]),
+        replace(octaves, ratio=octaves.ratio[0]),
+        float(-np.expm1(tests * np.log1p(-min(least[0], 1 - 1e-16)))),
+    )
+
+
+def _likelihood_ratios(bins: Bins, own: Flags, values: Array, limits: tuple[float, float], power: Array) -> Array:
+    """Of powers, shape (r, b), from the values of the common model on, shape (r,)."""
+    start = np.broadcast_to(values, (len(power), len(values)))
+    deviances = []
+    for part in (own | ~own, own, ~own):
+        counted = np.broadcast_to(np.where(part, bins.freedom, 0.0), power.shape)
+        deviances.append(score(bins, start, start > 0, limits, power, counted).deviance)
+    return np.maximum(deviances[0] - deviances[1] - deviances[2], 0.0)
+
+
+def _octaves(spectra: Sequence[Spectrum], own: Flags, relative: Array, highest: float) -> Octaves:
+    """Octaves below `highest` that both sets have, of powers over the model, shape (r, b)."""
+    below = np.concatenate([_octave(each, highest) for each in spectra])
+    inside = below == np.arange(int(below.max()) + 1)[:, None]
+    freedom = np.concatenate([each.freedom for each in spectra])
+    counts = [(inside & part) * freedom for part in (own, ~own)]
+    total = np.array([each.sum(axis=1) for each in counts])
+    kept = np.flatnonzero((total >= 1).all(axis=0))[::-1]
+    mean = [relative @ each[kept].T / many[kept] for each, many in zip(counts, total, strict=True)]
+    edge = highest / np.exp2(kept.astype(np.float64))
+    return Octaves(edge / 2, edge, mean[1] / mean[0], total[:, kept])
+
+
+def _octave(spectrum: Spectrum, highest: float) -> NDArray[np.int64]:
+    """Which octave below `highest`, Hz, each bin is in, from 0, shape (b,)."""
+    return np.floor(np.log2(highest / np.minimum(frequencies(spectrum), highest))).astype(np.int64)
+
+
+def trusted(spectrum: Spectrum, highest: float, tolerance: float) -> Spectrum:
+    """Return a spectrum whose octaves up to `highest`, Hz, count no more than a change of size by `tolerance` needs.
+
+    The ratio of two octaves of ``1/tolerance^2`` coefficients is known to twice the tolerance, that of the sizes to the
+    tolerance: what changes by less is not held against the second.
+    """
+    if not tolerance > 0:
+        return spectrum
+    below = _octave(spectrum, highest)
+    total = np.bincount(below, spectrum.freedom)
+    share = np.minimum(1.0, 1 / tolerance**2 / np.maximum(total, 1e-9))
+    return replace(spectrum, freedom=spectrum.freedom * share[below])

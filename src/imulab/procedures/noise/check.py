@@ -1,0 +1,319 @@
+"""Whether a new log at rest agrees with the noise of a record, and what differs by how much."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import ClassVar, Unpack
+
+import numpy as np
+
+from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
+from imulab.estimation.noise.agreement import Agreement, agreement, trusted
+from imulab.estimation.noise.band import within
+from imulab.estimation.noise.choice import CANDIDATES
+from imulab.estimation.noise.cosine import frequencies
+from imulab.estimation.noise.likelihood import fit, time_limits
+from imulab.estimation.noise.spectrum import Spectrum
+from imulab.estimation.noise.terms import NAMES, prepare
+from imulab.estimation.noise.use import edge_as_white
+from imulab.procedures.inputs import Data, Reading, as_record, as_recording
+from imulab.procedures.noise.engineering import label
+from imulab.procedures.noise.fit import fit_recordings
+from imulab.procedures.noise.sections import Column, Fit, drawn_of, fit_of
+from imulab.procedures.result import Drawn
+from imulab.quantities import fraction
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+from imulab.report.elements import Exhibits
+from imulab.units import si_unit
+from imulab.verdict import Note
+
+FALSE_ALARM, TOLERANCE = "5 %", "1 %"
+_SAME_RATE = 0.01
+_NORMAL = 1.96
+_HALF, _CERTAIN = 0.5, 0.05
+
+
+@dataclass(frozen=True)
+class TermChange:
+    """A term in the log over that in the record, with its 95 % interval."""
+
+    term: str
+    ratio: float
+    low: float
+    high: float
+
+    @property
+    def score(self) -> float:
+        """In standard uncertainties of the logarithm."""
+        return abs(math.log(self.ratio)) / (math.log(self.high / self.low) / 2 / _NORMAL)
+
+
+@dataclass(frozen=True)
+class ColumnCheck:
+    """What speaks against a column of the log being of the record's noise.
+
+    Attributes
+    ----------
+    name, unit
+        Of the column; the unit in SI.
+    agreement
+        The tests.
+    changes
+        Of the terms of the record's model.
+    """
+
+    name: str
+    unit: str
+    agreement: Agreement
+    changes: tuple[TermChange, ...]
+
+    @property
+    def probability(self) -> float:
+        """Of so large a difference, if nothing changed."""
+        return self.agreement.probability
+
+    def said(self) -> str:
+        """Return what changed, by how much, with 95 % intervals: certain changes, or the one that is most so."""
+        certain = [each for each in self.changes if not each.low < 1 < each.high] or list(self.changes[:1])
+        parts = [f"{label(each.term, self.unit)} {times(each.ratio, each.low, each.high)}" for each in certain]
+        octaves = self.agreement.octaves
+        if float(octaves.probability) < min(_CERTAIN, self.agreement.terms_probability):
+            worst = int(np.argmax(np.abs(octaves.scores)))
+            low, high = (float(np.sqrt(end[worst])) for end in octaves.interval)
+            size = times(float(np.sqrt(octaves.ratio[worst])), low, high)
+            parts.append(f"noise from {octaves.low[worst]:.2g} to {octaves.high[worst]:.2g} Hz {size}")
+        return "; ".join(parts)
+
+
+@dataclass(frozen=True, repr=False)
+class NoiseCheck(Drawn):
+    """How well a log agrees with a record's noise.
+
+    Attributes
+    ----------
+    columns
+        By name.
+    false_alarm
+        Share of logs of unchanged noise that fail, at most.
+    tolerance
+        Relative change of size that is not held against the log.
+    notes
+        What a user must know of the test, a sentence each.
+    log
+        The log's own record, as `fit_noise` makes it.
+    """
+
+    columns: Mapping[str, ColumnCheck]
+    false_alarm: float
+    tolerance: float
+    notes: tuple[str, ...]
+    log: Calibration
+
+    subject: ClassVar[str] = "Noise check"
+
+    @property
+    def probability(self) -> float:
+        """Of so large a difference in any column, if nothing changed: ``1 - (1 - min p)^k`` of k columns."""
+        least = min(each.probability for each in self.columns.values())
+        return -math.expm1(len(self.columns) * math.log1p(-min(least, 1 - 1e-16)))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the log agrees with the record."""
+        return self.probability >= self.false_alarm
+
+    def differs(self, name: str) -> bool:
+        """Return whether a column by itself fails."""
+        share = -math.expm1(math.log1p(-self.false_alarm) / len(self.columns))
+        return self.columns[name].probability < share
+
+    def exhibits(self) -> Exhibits:
+        """Return what its report shows."""
+        from imulab.procedures.noise.checkfigures import exhibits_of_check
+
+        return exhibits_of_check(self)
+
+
+def times(ratio: float, low: float, high: float) -> str:
+    """Return a ratio in words: ``10 % larger (9 to 11 %)``, ``2.1 times the record's (1.7 to 2.6)``."""
+    if not 1 - _HALF < low < high < 1 + _HALF:
+        return f"{ratio:.2g} times the record's ({low:.2g} to {high:.2g})"
+    change, ends = 100 * (ratio - 1), sorted((100 * (low - 1), 100 * (high - 1)))
+    if change < 0:
+        ends = [-ends[1], -ends[0]]
+    places = max(0, -math.floor(math.log10(max(ends[1] - ends[0], 1e-9) / 2)))
+    word = "larger" if change >= 0 else "smaller"
+    return f"{abs(change):.{places}f} % {word} ({ends[0]:z.{places}f} to {ends[1]:z.{places}f} %)"
+
+
+def check_noise(
+    record: Calibration | str | PathLike[str],
+    data: Data | Sequence[Data],
+    *,
+    tolerance: float | str = TOLERANCE,
+    false_alarm: float | str = FALSE_ALARM,
+    **reading: Unpack[Reading],
+) -> NoiseCheck:
+    """Test whether a new log at rest is of the noise of a record, column by column.
+
+    Two tests of each column, on mean squares of cosine coefficients: the likelihood ratio of one model for record and
+    log against one for each, over its mean under the common model; and the ratios of both in octaves of frequency, F
+    variables whatever the model. The smallest probability of all tests is corrected for their number.
+
+    Parameters
+    ----------
+    record
+        Of `fit_noise`, or its file.
+    data
+        A log of the same sampling rate, or a list of logs, as for `fit_noise`.
+    tolerance
+        Relative change of the size of the noise, in an octave, that is not held against the log: no sensor keeps its
+        noise to better than about 1 %, and long logs would show less. 0: none.
+    false_alarm
+        Share of logs of unchanged noise that fail; with a tolerance, at most.
+    reading
+        How arrays and files are to be understood, as for `fit_noise`.
+
+    Raises
+    ------
+    RecordError
+        The record is of another procedure.
+    DataError, UnitError
+        The log has another sampling rate, none of the record's columns, or other units; and as for `fit_noise`.
+    OptionError
+        An option has a value that cannot be used.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> noise = {"white": "0.3 deg/sqrt(h)", "walk": "30 deg/h/sqrt(h)", "duration": "10 min"}
+    >>> record = il.fit_noise(il.simulate_noise(**noise)).calibration
+    >>> il.check_noise(record, il.simulate_noise(**noise, seed=2)).passed
+    True
+    >>> noise["white"] = "0.33 deg/sqrt(h)"
+    >>> il.check_noise(record, il.simulate_noise(**noise, seed=2)).passed
+    False
+
+    Source: Bartlett (1937), the mean of a likelihood ratio; Whittle (1953).
+    """
+    held = as_record(record, "check_noise")
+    alone = not isinstance(data, list | tuple) or not data or not all(_is_log(each) for each in data)
+    logs = [data] if alone else list(data)  # type: ignore[arg-type]
+    recordings = [as_recording(each, reading, check_noise) for each in logs]  # type: ignore[arg-type]
+    return check_recordings(held, recordings, tolerance, false_alarm)
+
+
+def _is_log(data: object) -> bool:
+    from imulab.frames import is_frame
+
+    return isinstance(data, str | PathLike | Recording | Mapping) or is_frame(data)
+
+
+def check_recordings(
+    record: Calibration, recordings: Sequence[Recording], tolerance: float | str, false_alarm: float | str
+) -> NoiseCheck:
+    """Test recordings against a record; arguments and errors as for `check_noise`."""
+    if record.procedure != "noise":
+        raise RecordError(f"a {record.procedure} record holds no model of noise; expected a record of noise fit")
+    allowed, share = fraction(tolerance, "tolerance"), fraction(false_alarm, "false_alarm")
+    if not 0 <= allowed < 1:
+        raise OptionError(f"tolerance {tolerance}: expected a share from 0 to 1, such as 1 %")
+    if not 0 < share < 1:
+        raise OptionError(f"false_alarm {false_alarm}: expected a share between 0 and 1, such as 5 %")
+    fit = fit_of(record)
+    names, notes = _columns(record, fit, recordings)
+    options = record.options
+    found = fit_recordings(
+        recordings, terms="auto", horizon=fit.columns[names[0]].interval.value, band=None,
+        regress=options.get("regress"), columns=names, steps=options.get("steps"),
+    ).calibration  # fmt: skip
+    rate = fit_of(found).sample_rate.value
+    if abs(rate / fit.sample_rate.value - 1) > _SAME_RATE:
+        raise DataError(
+            f"{recordings[0].name}: {rate:.4g} samples in a second, but the record is of {fit.sample_rate.value:.4g}; "
+            "expected a log of the record's rate"
+        )
+    notes += [f"log: {reason}" for reason in found.verdict.reasons]
+    checked = {name: _checked(record, found, name, allowed) for name in names}
+    return NoiseCheck(checked, share, allowed, tuple(notes), found)
+
+
+def _columns(record: Calibration, fit: Fit, recordings: Sequence[Recording]) -> tuple[list[str], list[str]]:
+    """The record's columns that all logs have, in its units, and what is to be said."""
+    notes: list[str] = []
+    names = [name for name in fit.columns if all(name in each for each in recordings)]
+    for recording in recordings:
+        if not names:
+            raise DataError(
+                f"{recording.name}: none of the record's columns {' '.join(fit.columns)}; "
+                f"found {listed(recording.columns, '')}"
+            )
+        for name in names:
+            if si_unit(recording.units[name]) != fit.columns[name].unit:
+                raise UnitError(
+                    f"{recording.name}: column {name} in {recording.units[name]}, but the record has it in "
+                    f"{fit.columns[name].unit}; expected the same quantity"
+                )
+        serials = [record.sensor.get("serial"), recording.metadata.get("serial")]
+        if all(serials) and serials[0] != serials[1]:
+            notes.append(f"{recording.name}: of unit {serials[1]}, while the record is of {serials[0]}")
+        if recording.source is not None and recording.source.sha256 in [each.sha256 for each in record.sources]:
+            notes.append(f"{recording.name}: the record was made from this log, which says nothing of a change")
+    if missing := [name for name in fit.columns if name not in names]:
+        notes.append(Note(f"not in the log, and not checked: {' '.join(missing)}"))
+    return names, notes
+
+
+def _checked(record: Calibration, log: Calibration, name: str, tolerance: float) -> ColumnCheck:
+    column, highest = fit_of(record).columns[name], fit_of(record).band[name].value
+    first, off = _spectra(record, name)
+    second, _ = _spectra(log, name)
+    before, after = (
+        [trusted(_used(each, highest, off), highest, tolerance) for each in part] for part in (first, second)
+    )
+    chosen = str(record.options.get("terms", "auto"))
+    candidates = CANDIDATES if chosen == "auto" else (chosen,)
+    found = agreement(before, after, highest, candidates=candidates, full_band=column.full_band)
+    return ColumnCheck(name, column.unit, found, _changes((before, after), column))
+
+
+def _spectra(record: Calibration, name: str) -> tuple[list[Spectrum], list[tuple[float, float]]]:
+    """The spectra of a column, lines left out, and the ranges of frequency, Hz, that its model was not held against."""
+    spectra, off = [], []
+    for each in drawn_of(record, name).spectra:
+        first, last = np.array(each.first), np.array(each.last)
+        spectrum = Spectrum(each.interval, each.count, first, last, np.array(each.power), np.array(each.freedom))
+        left = np.flatnonzero((np.array(each.counted) == 0) & (spectrum.freedom > 0)).tolist()
+        off += [((first[k] - 0.5) / (2 * spectrum.length), (last[k] + 0.5) / (2 * spectrum.length)) for k in left]
+        spectra.append(spectrum)
+    return spectra, off
+
+
+def _used(spectrum: Spectrum, highest: float, off: Sequence[tuple[float, float]]) -> Spectrum:
+    f = frequencies(spectrum)
+    out = np.zeros(len(f), dtype=np.bool_)
+    for low, high in off:
+        if high <= highest:
+            out |= (f > low) & (f < high)
+    return within(replace(spectrum, freedom=np.where(out, 0.0, spectrum.freedom)), highest)
+
+
+def _changes(sets: Sequence[Sequence[Spectrum]], column: Column) -> tuple[TermChange, ...]:
+    """The terms of the record's model, fitted to both, the most certain change first."""
+    model = np.array(column.values) > 0
+    fitted: list[tuple[Array, Array]] = []
+    for spectra in sets:
+        bins = prepare(spectra)
+        found = fit(bins, model[None], time_limits(spectra), bins.power[None], bins.freedom[None])
+        fitted.append(edge_as_white(found.values[0], found.covariance[0], column.shortest_time.value))
+    (before, covariance), (after, other) = fitted
+    changes = []
+    for k, term in enumerate(NAMES):
+        if before[k] > 0 and after[k] > 0:
+            ratio, u = float(after[k] / before[k]), float(np.sqrt(covariance[k, k] + other[k, k]))
+            changes.append(TermChange(term, ratio, ratio * math.exp(-_NORMAL * u), ratio * math.exp(_NORMAL * u)))
+    return tuple(sorted(changes, key=lambda each: -each.score))
