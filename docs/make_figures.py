@@ -103,6 +103,7 @@ def main() -> None:
         screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 1075)
         first_figure(folder, "array.json", "gyro_array")
         first_figure(folder, "warmup.json", "warmup")
+        first_figure(folder, "noise.json", "noise")
         centrifuge(folder)
 
 

@@ -178,7 +178,7 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     assert done.returncode == 0, done.stderr
     names = {p.name for p in (tmp_path / "here").iterdir()}
     assert {"tumble.csv", "tumble.json", "tumble.html", "tumble_corrected.csv"} <= names
-    for name in ("tumble", "array", "warmup", "centrifuge"):
+    for name in ("tumble", "array", "warmup", "centrifuge", "noise"):
         assert {f"{name}.json", f"{name}.html"} <= names
     assert {"imulab.c", "imulab.h", "unit.c", "README.md"} <= {
         p.name for p in (tmp_path / "here" / "firmware").iterdir()
@@ -186,7 +186,7 @@ def test_the_demonstration_makes_what_it_names(imulab, tmp_path):
     assert {"line", "fleet.html"} <= names
     index = (tmp_path / "here" / "index.html").read_text()
     assert 'href="fleet.html"' in index
-    for name in ("tumble", "array", "warmup", "centrifuge"):
+    for name in ("tumble", "array", "warmup", "centrifuge", "noise"):
         verdict = il.load(tmp_path / "here" / f"{name}.json").verdict
         assert f'class="state {verdict.state}"' in index
         assert all(reason in unescape(index) for reason in verdict.reasons[:1])

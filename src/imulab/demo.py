@@ -1,4 +1,4 @@
-"""The demonstration: four procedures and a fleet on simulated instruments, by the commands a user would type."""
+"""The demonstration: five procedures and a fleet on simulated instruments, by the commands a user would type."""
 
 from __future__ import annotations
 
@@ -84,6 +84,17 @@ imulab centrifuge reduce centrifuge/manifest.toml -o centrifuge.json --report ce
         "centrifuge.html",
     ),
     Scenario(
+        "noise",
+        "What must a filter be told of the noise of this unit, and how sure is that?",
+        """
+imulab noise simulate --white "0.3 deg/sqrt(h)" --flicker "12 deg/h" --walk "60 deg/h/sqrt(h)" --rate 50 -o rest.csv
+imulab noise fit rest.csv -o noise.json --report noise.html
+imulab noise plan --from noise.json --for walk=10%
+""",
+        "noise.json",
+        "noise.html",
+    ),
+    Scenario(
         "fleet",
         "Is the production line still making the same thing?",
         """
@@ -136,7 +147,7 @@ def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
             lines += [f"  {answer}", ""]
             cards.append(Card(scenario.question, answer, scenario.lines, figure, scenario.report, verdict))
         lead = (
-            "Four procedures and a production line on simulated instruments: the question, the answer, and the "
+            "Five procedures and a production line on simulated instruments: the question, the answer, and the "
             "commands that found it."
         )
         write_text("index.html", render_index("imulab demonstration", lead, cards))

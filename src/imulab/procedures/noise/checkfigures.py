@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from imulab._version import VERSION
-from imulab.procedures.noise.check import NoiseCheck
 from imulab.records.calibration import Calibration
 from imulab.report import panels, render_page
 from imulab.report.elements import BAD, GOOD, Exhibits, Figure, ReportTable
 from imulab.report.traces import rounded, scatter
 from imulab.verdict import Bad, Note, verdict_of
+
+if TYPE_CHECKING:
+    from imulab.procedures.noise.check import NoiseCheck
 
 _DIGITS = 5
 _TICKS = [0.01, 0.1, 0.2, 0.5, 1, 2, 5, 10, 100]
