@@ -119,6 +119,9 @@ make -C firmware test
 )
 
 
+_LIVE = "live, with a simulated unit: imulab live simulate --follow --save live.csv (--help says more)"
+
+
 def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
     """Run the scenarios in `folder`, with an index page; return what was found, as text.
 
@@ -151,7 +154,7 @@ def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:
             "commands that found it."
         )
         write_text("index.html", render_index("imulab demonstration", lead, cards))
-    return "\n".join([*lines, f"firmware: {home / 'firmware'}", f"open {home / 'index.html'}"])
+    return "\n".join([*lines, f"firmware: {home / 'firmware'}", _LIVE, f"open {home / 'index.html'}"])
 
 
 @contextlib.contextmanager

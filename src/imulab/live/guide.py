@@ -16,7 +16,7 @@ from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.fit import TumbleFit, fit_tumble
 from imulab.procedures.tumble.model import parameter_count, parameter_names
 from imulab.procedures.tumble.optimal import Search, information_rows, quick_set
-from imulab.procedures.tumble.plan import MOST_ATTITUDES, sphere_candidates
+from imulab.procedures.tumble.plan import sphere_candidates
 from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.recording import Array, Recording
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
@@ -28,6 +28,8 @@ _MORE = 1.5
 _SPARE = 4
 """Attitudes beyond the parameters without which a fit can neither tell a knocked one nor whether its order is right."""
 _NEAR = np.cos(np.radians(12.0))
+_HORIZON = 60
+"""So many attitudes are planned ahead at most: more take seconds, and hardly change which one is next."""
 _FIVE = 5
 _LOWERS = 0.05
 _LONGEST = 10.0
@@ -118,6 +120,7 @@ class Guide:
         near = self._outstanding @ direction if len(self._outstanding) else np.empty(0)
         if near.size and near.max() > _NEAR:
             self._outstanding = np.delete(self._outstanding, int(np.argmax(near)), axis=0)
+            self._known = len(self._outstanding) > 0
         else:
             self._known = False
 
@@ -244,7 +247,7 @@ class Guide:
         least = max(parameter_count(self.model_order) + spare - len(there), 1)
         if self.planned is not None or not self.targets:
             left = self.wanted() - len(there)
-            return self._planned(max(left, least), there) if left > 0 or least > 1 else np.empty((0, 3))
+            return self._planned(max(min(left, _HORIZON), least), there) if left > 0 or least > 1 else np.empty((0, 3))
         count, noise = max(least, 3), self.noise()
         tried: list[int] = []
         for _ in range(_ROUNDS):
@@ -253,7 +256,7 @@ class Guide:
             share = self._predicted(covariance, noise)
             # Variances fall as the number of attitudes rises, in proportion.
             need = int(np.ceil((count + len(there)) * share**2)) - len(there)
-            count = min(max(need, least), MOST_ATTITUDES)
+            count = max(min(need, _HORIZON), least)
             if count in tried:
                 break
         return self._planned(count, there)

@@ -1,0 +1,138 @@
+"""The terminal of a live session: what is drawn at every size, and what its keys do in a real terminal."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from contextlib import suppress
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+import imulab as il
+from imulab.live.session import Session
+from imulab.live.targets import read_targets
+from imulab.live.terminal import draw
+
+
+def shown(session: Session, width: int, height: int) -> list[str]:
+    console = Console(width=width, height=height, file=StringIO())
+    console.print(draw(session.view(), width, height))
+    return console.file.getvalue().rstrip("\n").split("\n")
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    """Twelve attitudes, the last of them just put down."""
+    made = Session(1, None, read_targets("bias 10 ug"))
+    recording = il.simulate_tumble(attitudes=12, order=1, gravity=9.81, gyro=False)
+    for start in range(0, len(recording), 50):
+        part = {name: column[start : start + 50] for name, column in recording.columns.items()}
+        made.feed(il.Recording(part, recording.units, recording.metadata))
+    return made
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (120, 40), (60, 20), (40, 12)])
+def test_what_to_do_is_first_and_nothing_is_wider_or_longer_than_the_terminal(session, width, height):
+    lines = shown(session, width, height)
+    assert len(lines) <= height
+    assert max(map(len, lines)) <= width
+    advice = session.view().advice
+    assert lines[0].strip() == advice or advice.startswith(lines[0].strip())
+    if height >= 20:
+        assert any(line.startswith("bias ") and "mg" in line for line in lines)
+        assert "u: drop attitude 12   q: finish" in lines[-1]
+    # The map needs room.
+    assert any("N next" in line for line in lines) == (width >= 80)
+
+
+def test_a_terminal_without_samples_says_what_it_waits_for():
+    assert shown(Session(1), 80, 24)[0].strip() == "waiting for samples"
+
+
+class Screen:
+    """A command in a pseudo-terminal of 80 by 24; reading never waits longer than is said."""
+
+    def __init__(self, words: list[str], folder: os.PathLike[str], **environment: str) -> None:
+        self.end, inner = os.openpty()
+        fcntl.ioctl(inner, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        self.text = ""
+
+        def own() -> None:
+            os.setsid()
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "imulab", "live", *words],
+            cwd=folder, stdin=inner, stdout=inner, stderr=inner, preexec_fn=own,
+            env={**os.environ, "TERM": "xterm", **environment},
+        )  # fmt: skip
+        os.close(inner)
+
+    def until(self, what: str, seconds: float = 25.0) -> bool:
+        end = time.monotonic() + seconds
+        while what not in self.text and time.monotonic() < end:
+            if select.select([self.end], [], [], 0.1)[0]:
+                try:
+                    self.text += os.read(self.end, 1 << 16).decode("utf-8", "replace")
+                except OSError:
+                    break
+        return what in self.text
+
+    def press(self, key: str) -> None:
+        self.text = ""
+        os.write(self.end, key.encode())
+
+    def ended(self, seconds: float = 15.0) -> int:
+        end = time.monotonic() + seconds
+        while self.process.poll() is None and time.monotonic() < end:
+            self.until("\0", 0.1)  # what nobody reads would hold the process up
+        self.close()
+        return self.process.wait(1.0)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait(5.0)
+        with suppress(OSError):
+            os.close(self.end)
+
+
+WORDS = ["simulate:speed=20,order=1", "--follow", "--attitudes", "16", "--order", "1", "--save", "rec.csv"]
+
+
+def test_the_keys_drop_finish_and_show_that_it_works(tmp_path):
+    screen = Screen([*WORDS, "-o", "rec.json"], tmp_path)
+    try:
+        assert screen.until("attitude 3 accepted"), screen.text
+        screen.press("u")
+        assert screen.until(" is dropped"), screen.text
+        assert screen.until("enough: "), screen.text
+        screen.press("q")
+        assert screen.until("turn the unit and see: corrected |f|"), screen.text
+        screen.press("x")
+        assert screen.ended() == 0
+    finally:
+        screen.close()
+    assert il.load(tmp_path / "rec.json").fit["attitudes"] >= 15
+
+
+def test_an_interrupt_keeps_the_recording_and_says_so(tmp_path):
+    screen = Screen([*WORDS, "-o", "rec.json"], tmp_path, NO_COLOR="1")
+    try:
+        assert screen.until("attitude 2 accepted"), screen.text
+        screen.press("\x03")
+        assert screen.until("--resume goes on with it"), screen.text
+        assert "Traceback" not in screen.text
+        assert screen.ended() == 130
+    finally:
+        screen.close()
+    assert not (tmp_path / "rec.json").exists()
+    assert len(il.read(tmp_path / "rec.csv")) > 100
