@@ -48,8 +48,8 @@ class Fit:
 def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> Fit:
     """Hold the Allan variances at octaves of averaging time, 4/f_max to L/10, against a model.
 
-    ``J = r' Omega^-1 r``, r the difference that is left when the parameters are fitted to it, Omega the covariance of
-    the Allan variances under the model.
+    ``J = r' Omega^-1 r``, r the difference that is left when the parameters are fitted to it, of cube roots, which are
+    nearly normal (Wilson and Hilferty 1931), Omega the covariance of the Allan variances under the model.
 
     Parameters
     ----------
@@ -84,7 +84,10 @@ def test_of_fit(spectra: Sequence[Spectrum], values: Array, highest: float) -> F
     found = weight @ (counted * bins.power)
     scale = 1 / predicted[0]
     root = np.linalg.cholesky((spread * scale[:, None]) @ (spread * scale[:, None]).T)
-    r = np.linalg.solve(root, (found - predicted[0]) * scale)
+    # The cube root of what is distributed as chi-square over its freedom is nearly normal, about 1 - 2/(9 freedom).
+    square = np.sum((spread * scale[:, None]) ** 2, axis=1)
+    ratio = 3 * (np.cbrt(np.maximum(found * scale, 0.0)) - (1 - square / 9))
+    r = np.linalg.solve(root, ratio)
     basis = np.linalg.solve(root, slope * scale[:, None])
     step, _, rank, _ = np.linalg.lstsq(basis, r, rcond=1e-6)
     freedom = octaves - int(rank)
