@@ -38,7 +38,7 @@ class Frame(Protocol):
 
 @dataclass
 class Units:
-    """What was said of units: for single columns or sensors, and one for all sensors whose quantity it measures.
+    """The units that were given: for single columns or sensors, and one for all sensors whose quantity it measures.
 
     ``where`` is how a message says to state a unit that is missing, with ``{name}``, ``{sensor}`` and ``{unit}``.
     """
@@ -60,10 +60,10 @@ class Units:
 
     def of(self, column: str, stated: str | None = None) -> str:
         """Return the unit of a column; `stated` is that of its title."""
-        said = next((key for key in _stems(column) if key in self.each), None)
-        if said is not None:
-            self.used.add(said)
-            symbol = self._known(column, self.each[said])
+        given = next((key for key in _stems(column) if key in self.each), None)
+        if given is not None:
+            self.used.add(given)
+            symbol = self._known(column, self.each[given])
             if stated is not None and self._known(column, stated) != symbol:
                 raise OptionError(f"{self.name}: column {column} [{stated}]: units has {symbol!r} for it; expected one")
             return symbol
@@ -84,7 +84,7 @@ class Units:
         raise UnitError(f"{self.name}: column {column} has no unit; expected {how}")
 
     def check_used(self, columns: Iterable[str]) -> None:
-        """Refuse what was said of no column."""
+        """Refuse a unit that is of no column."""
         known = list(dict.fromkeys(stem for column in columns for stem in _stems(column)))
         for key in self.each:
             if key not in self.used:

@@ -99,8 +99,8 @@ def with_power_on_temperature(blocks: Iterable[Recording]) -> Iterator[Recording
                 f"{block.name}: no power_on_temperature in the head of the file, and no reading in a column "
                 "temperature to take its place"
             )
-        said = {"power_on_temperature": f"{found!r}", TAKEN_FROM: "the first reading of the column temperature"}
-        yield replace(block, metadata={**block.metadata, **said})
+        head = {"power_on_temperature": f"{found!r}", TAKEN_FROM: "the first reading of the column temperature"}
+        yield replace(block, metadata={**block.metadata, **head})
 
 
 def head_temperature(recording: Recording, key: str) -> float | None:

@@ -146,9 +146,9 @@ class Recording:
                     f"{self.name}: no column {name}, but one of each of {len(several)} IMUs; choose one, from "
                     f"{several[0]} to {several[-1]} (--element {several[0]})"
                 ) from None
-            said = next((note for note in self.notes if "--layout" in note), None)
-            said = said or "a layout says where columns of other names are (--layout; docs/recordings.md)"
-            hint = f"; {said}" if foreign else ""
+            advice = next((note for note in self.notes if "--layout" in note), None)
+            advice = advice or "a layout says where columns of other names are (--layout; docs/recordings.md)"
+            hint = f"; {advice}" if foreign else ""
             raise DataError(f"{self.name}: no column {name}; found {' '.join(self.columns)}{hint}") from None
 
     def si(self, name: str) -> Array:

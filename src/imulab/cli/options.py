@@ -40,16 +40,16 @@ def with_notes(
 
     `tell` takes a file's name and what is wrong with it; a warning at once if not given.
     """
-    said: set[str] = set()
+    shown: set[str] = set()
     for block in blocks:
         yield block  # first: where the data are refused, the refusal is the one line there is
-        for said_of in block.notes:
-            kind = said_of.partition(":")[0]
-            if kind not in said and said_of.startswith("truncated"):
-                tell(block.name, said_of) if tell else warn(f"{block.name}: {said_of}")
-            elif said_of not in said and notes and not said_of.startswith("truncated"):
-                note(f"{block.name}: {said_of}")
-            said |= {kind, said_of}
+        for message in block.notes:
+            kind = message.partition(":")[0]
+            if kind not in shown and message.startswith("truncated"):
+                tell(block.name, message) if tell else warn(f"{block.name}: {message}")
+            elif message not in shown and notes and not message.startswith("truncated"):
+                note(f"{block.name}: {message}")
+            shown |= {kind, message}
 
 
 def read_recording(file: str, **how: Any) -> Recording:

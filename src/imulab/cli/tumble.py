@@ -304,15 +304,15 @@ def check(
     except RecordError as error:
         raise RecordError(f"{record}: {error}") from None
     recording = attitudes.recording
-    said = [f"{recording.name}: was corrected before, by {entry}" for entry in recording.corrected_by]
-    if said:
-        said[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
-    notes = (*said, *warnings_of(held, recording), *result.notes)
+    corrected = [f"{recording.name}: was corrected before, by {entry}" for entry in recording.corrected_by]
+    if corrected:
+        corrected[-1] += "; a record is checked by what the unit puts out, so the test means nothing here"
+    notes = (*corrected, *warnings_of(held, recording), *result.notes)
     if report:
         from imulab.atomic_write import write_text
         from imulab.procedures.tumble.checkfigures import check_page
 
-        write_text(report, check_page(result, attitudes, held, record=record, file=file, said=notes))
+        write_text(report, check_page(result, attitudes, held, record=record, file=file, warnings=notes))
     print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, record, file))
     for message in notes:
         warn(message)

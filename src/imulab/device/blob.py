@@ -140,9 +140,9 @@ def _check_text(text: Any, kinds: list[str]) -> None:
     """Check that what a blob says of its sections, of these kinds, in this order, is what `make_blob` writes."""
     _complete(_Text, text, "its text")
     check_sizes(text)
-    said = [section["kind"] for section in text["sections"]]
-    if said != kinds:
-        raise RecordError(f"its text speaks of {' '.join(map(str, said))}, but it holds {' '.join(kinds)}")
+    stated = [section["kind"] for section in text["sections"]]
+    if stated != kinds:
+        raise RecordError(f"its text speaks of {' '.join(map(str, stated))}, but it holds {' '.join(kinds)}")
     for number, kind in enumerate(kinds):
         _complete(_COLUMNS[kind], text["sections"][number], f"sections[{number}]")
 

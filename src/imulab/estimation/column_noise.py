@@ -96,7 +96,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     """Return Allan curves and noise coefficients of every sensor column, in SI, as plain JSON values.
 
     Of a recording whose sampling rate changes, the longest stretch of one rate counts; a few rows without numbers are
-    bridged. Both is said.
+    bridged. The warnings name both.
 
     Raises
     ------
@@ -232,15 +232,15 @@ def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
         reason = its.angle_random_walk.reason or its.bias_instability.reason
         if reason:
             told.setdefault(reason, []).append(name)
-    said = []
+    messages = []
     for reason, names in told.items():
         alone = not noises[names[0]].coefficients.angle_random_walk.reason
         which = "bias instability and random walk of the zero" if alone else "noise coefficients"
-        said.append((Note if alone else str)(f"{_columns(names)}: {which} not determined: {reason}"))
+        messages.append((Note if alone else str)(f"{_columns(names)}: {which} not determined: {reason}"))
     filtered = {n: f.coefficients for n, f in noises.items() if f.coefficients.filtered}
     if filtered:
         highest = min(f.highest for f in filtered.values())
-        said.append(
+        messages.append(
             Note(
                 f"{_columns(list(filtered))}: the noise is correlated from sample to sample, as behind a filter; the "
                 f"coefficients are read from frequencies up to {highest:.3g} Hz"
@@ -253,12 +253,12 @@ def noise_lines(noises: Mapping[str, ColumnNoise]) -> list[str]:
         )
         more = len(with_lines) - _MOST_COLUMNS
         each += f"; and in {more} more columns" if more > 0 else ""
-        said.append(
+        messages.append(
             Note(
                 f"spectral lines, taken out of the noise that the coefficients are read from, largest first, Hz: {each}"
             )
         )
-    return said
+    return messages
 
 
 def _columns(names: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Weighted nonlinear least squares, and what can be said of its results.
+"""Weighted nonlinear least squares, and the statistics of its results.
 
 The leading axis of every array counts independent problems, of which one fit is a batch of one and Monte Carlo a batch
 of trials. There is no Python loop over problems; batches of tumbles are solved in C (tumble/_fit.c).

@@ -29,7 +29,7 @@ _EDGE, _SHARE = 1.5, 0.003
 _LEVELS = 0.01
 """How far off the white noise the level at the end of the band may be, relative."""
 _MUCH = 2.0
-"""How many times as large unseen noise must be able to make the uncertainty of a mean for that to be said."""
+"""How many times as large unseen noise must be able to make the uncertainty of a mean for a warning."""
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ def _dask(scheduler: str | None, workers: int | None, stack: ExitStack) -> DaskE
         raise OptionError("--engine dask needs Dask: pip install 'imulab[fleet]'") from None
     for name in ("asyncio", *logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("asyncio", "distributed", "tornado"):
-            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # what a person must know is said by the watch
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # `_Watch` reports what a person must know
     if scheduler is None:
         count = workers or processes.available()
         cluster = stack.enter_context(

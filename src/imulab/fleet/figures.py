@@ -49,7 +49,7 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> list
     ]  # fmt: skip
 
 
-def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str) -> Figure:
+def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str) -> Figure:
     traces: list[dict[str, Any]] = []
     layout = grid.grid()
     beyond = 0
@@ -92,8 +92,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], said: str)
     standing = sorted({s for item in panels for s, o in zip(item.serials, item.outliers, strict=True) if o})
     return Figure(
         title,
-        said
-        + "Bars count units. Dotted: median. Red lines: limits, where they are within sight. Red diamonds: units whose "
+        lead + "Bars count units. Dotted: median. Red lines: limits that lie near. Red diamonds: units whose "
         "robust z is beyond what one normal population of this size in a hundred would show." + edge_note(beyond),
         traces,
         layout,
@@ -125,7 +124,7 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Fig
     ]
 
 
-def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, dated: bool) -> Figure:
+def _over_date(title: str, panels: Sequence[ParameterStatistics], lead: str, *, dated: bool) -> Figure:
     traces: list[dict[str, Any]] = []
     layout = grid.grid()
     beyond = 0
@@ -159,7 +158,7 @@ def _over_date(title: str, panels: Sequence[ParameterStatistics], said: str, *, 
     drifting = [item.name for item in panels if item.drift is not None and item.drift.significant]
     return Figure(
         title,
-        said
+        lead
         + (
             "Lines: drift, red and dashed where it is beyond chance (1 in 1000). The date is that of the recording "
             "where its head has a line date, otherwise that of the record."

@@ -71,7 +71,7 @@ def run(function: Callable[..., T], calls: Iterable[tuple[object, ...]], process
 
 
 def _close(results: Generator[object, None, None]) -> None:
-    """End what is in vain without a word: joblib warns, and its thread may look for work that was just dropped."""
+    """Close results that nobody takes, silently: joblib warns, and its thread may look for work that was dropped."""
     hook = threading.excepthook
     threading.excepthook = lambda _: None
     try:
@@ -84,10 +84,10 @@ def _close(results: Generator[object, None, None]) -> None:
 
 @contextmanager
 def _no_interrupts() -> Iterator[None]:
-    """Start processes that hear of no interrupt, and threads that start more of them.
+    """Start processes with interrupts blocked, and threads that start more of them.
 
-    An interrupt of the terminal goes to all its processes; this one says what is to be said of it, and it comes here
-    when the processes have been started.
+    An interrupt of the terminal goes to all its processes; this one alone reports it, once the processes have been
+    started.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield

@@ -119,22 +119,22 @@ def fleet_exhibits(
         ("units that stand out", str(len(out))),
         ("parameters that drift", str(len(drifting))),
     ]
-    said = [f"{state.count('done')} of {len(state.rows)} units have their record"]
+    phrases = [f"{state.count('done')} of {len(state.rows)} units have their record"]
     if state.failures:
-        said.append(f"{len(state.failures)} failed")
+        phrases.append(f"{len(state.failures)} failed")
     standing = f"{first_of(sorted(out), _NAMED)} {'stands' if len(out) == 1 else 'stand'} out"
-    said.append(standing if out else "none stands out")
+    phrases.append(standing if out else "none stands out")
     if drifting:
-        said.append(f"{first_of(drifting, _NAMED)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
+        phrases.append(f"{first_of(drifting, _NAMED)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
     if capable:
         worst = min(capable, key=lambda item: item.capability.cpk if item.capability else 0.0)
         if worst.capability is not None:
             facts.append(("smallest Cpk", f"{worst.capability.cpk:.2f}"))
-            said.append(f"the smallest Cpk is {worst.capability.cpk:.2f} ({worst.name})")
+            phrases.append(f"the smallest Cpk is {worst.capability.cpk:.2f} ({worst.name})")
     if fresh:
         facts.append(("changed since last", str(len(moved))))
     if moved:
-        said.append(f"{first_of(sorted(moved), _NAMED)} changed since the last calibration")
+        phrases.append(f"{first_of(sorted(moved), _NAMED)} changed since the last calibration")
     items: list[Figure | ReportTable | None] = [reporttables.failure_table(state.failures)]
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = PROCEDURES[procedure].line_title
@@ -147,7 +147,7 @@ def fleet_exhibits(
             figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
         ]
     items += [reporttables.outlier_table(statistics), reporttables.change_table(changes)]
-    return Exhibits("; ".join(said) + ".", facts, [item for item in items if item is not None])
+    return Exhibits("; ".join(phrases) + ".", facts, [item for item in items if item is not None])
 
 
 def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
@@ -161,12 +161,12 @@ def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
 
 
 def _warnings(state: FleetState) -> list[str]:
-    said = []
+    notes = []
     if state.at_work:
-        said.append(
+        notes.append(
             f"A run is at work on the folder ({state.at_work}): this is what was there when the report was made."
         )
     missing = state.count("missing")
     if missing:
-        said.append(f"{missing} units have no record yet.")
-    return said
+        notes.append(f"{missing} units have no record yet.")
+    return notes

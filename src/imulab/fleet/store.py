@@ -170,7 +170,7 @@ class Store:
             return set()
 
     def fail(self, unit: FleetUnit, reason: str) -> None:
-        """Write why a unit failed; a record of other files or options that it has is put aside."""
+        """Write why a unit failed; a record that it has of other files or options is moved to the folder superseded."""
         write_text(self.failure(unit.serial), json.dumps({**asdict(unit), "reason": reason}, ensure_ascii=False))
         record = self.record(unit.serial)
         if record.exists():

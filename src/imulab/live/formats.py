@@ -63,7 +63,7 @@ class Stream:
     layout
         Where the columns of a foreign stream are.
     polled
-        Whether the other side may have to be asked before it speaks (serial ports and TCP).
+        Whether the other side may have to be asked before it sends (serial ports and TCP).
     """
 
     def __init__(self, source: str, layout: Layout | None = None, *, polled: bool = False) -> None:
@@ -156,7 +156,7 @@ class Stream:
         if not self._polled:
             return
         if self._asked is None:
-            self._asked = now + _SILENT - _POLL_AGAIN  # what speaks by itself is given the time to do so
+            self._asked = now + _SILENT - _POLL_AGAIN  # a device that sends unasked is given the time to do so
         waited = now - self._asked
         answers = isinstance(self._decoder, Msp)
         silent = answers or not self._held or all(looks_like_msp(d) or d[:1] == b"$" for d, _ in self._held)

@@ -143,7 +143,7 @@ class XImu3(LineDecoder):
         numbers = [float(field) for field in fields]
         if kind == b"I" and len(numbers) == 7:
             if any(other not in self._latest for other in self._extra):
-                return None  # a moment at the beginning, before each sensor has spoken
+                return None  # a moment at the beginning, before each sensor has sent a reading
             return numbers + [value for other in self._extra for value in self._latest[other]]
         if kind in self._extra and len(numbers) == 1 + len(_EXTRA[kind]):
             self._latest[kind] = numbers[1:]

@@ -86,7 +86,7 @@ def read(
     selection = Selection(topic, instance, window, element)
     name, known = name or _name(file), _layout(layout)
     hashed = _Hash()
-    blocks = _told(selection.of(_blocks(file, name, known, selection, hashed), name))
+    blocks = _logged(selection.of(_blocks(file, name, known, selection, hashed), name))
     first, parts, notes = _gathered(blocks)
     source, units = Source(name, hashed.of(file)), first.units
     first = replace(first, columns={})
@@ -129,10 +129,10 @@ def read_blocks(
     """
     selection = Selection(topic, instance, window, element)
     name = name or _name(file)
-    yield from _told(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
+    yield from _logged(selection.of(_blocks(file, name, _layout(layout), selection, None), name))
 
 
-def _told(blocks: Iterator[Recording]) -> Iterator[Recording]:
+def _logged(blocks: Iterator[Recording]) -> Iterator[Recording]:
     """Pass blocks on, and log at the end what there was and the time that reading took."""
     rows, seconds, name, columns, ends = 0, 0.0, "", "", list[float]()
     while True:
@@ -202,8 +202,8 @@ def _blocks(
                 except OSError as error:
                     raise ReadError(f"{name}: cannot be read: {error.strerror}") from None
     chosen = {"layout": layout and layout.name, "topic": selection.topic, "instance": selection.instance}
-    said = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
-    _LOG.info("%s: a %s file%s", name, kind.name, said)
+    parts = "".join(f", {key} {value}" for key, value in chosen.items() if value is not None)
+    _LOG.info("%s: a %s file%s", name, kind.name, parts)
     if kind.layout == "none" and layout is not None and layout.if_needed:
         layout = None
     if kind.layout == "none" and layout is not None:

@@ -92,8 +92,8 @@ def _parsed(text: str) -> Any:
 
 def _refuse(error: json.JSONDecodeError, text: str, name: str) -> NoReturn:
     end = "; the file ends there: was it cut?" if not text[error.pos :].strip(" \r\n\t]") else ""
-    said = error.msg[0].lower() + error.msg[1:]
-    raise ReadError(f"{name}: line {error.lineno}, column {error.colno}: not JSON: {said}{end}") from None
+    reason = error.msg[0].lower() + error.msg[1:]
+    raise ReadError(f"{name}: line {error.lineno}, column {error.colno}: not JSON: {reason}{end}") from None
 
 
 # --- from keys to columns ------------------------------------------------------------------------------------------
@@ -152,10 +152,10 @@ def _blocks(values: dict[str, list[Any]], layout: Layout, name: str) -> Iterator
         whole = np.array([None not in row for row in zip(*values.values(), strict=True)], dtype=bool)
         skipped = count - int(whole.sum())
         if skipped:
-            said = layout.skipped(skipped)
+            reason = layout.skipped(skipped)
             if skipped == count:
-                raise ReadError(f"{name}: no rows of data: {said}")
-            rows, notes = rows[whole], (Note(said),)
+                raise ReadError(f"{name}: no rows of data: {reason}")
+            rows, notes = rows[whole], (Note(reason),)
             values = {key: [entries[row - 1] for row in rows.tolist()] for key, entries in values.items()}
             lengths = dict.fromkeys(values, len(rows))
     columns = {key: _column(key, entries, rows, layout, name) for key, entries in values.items()}

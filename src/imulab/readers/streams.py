@@ -229,18 +229,18 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
     """Say by how much the first stream that ends ends before the others, and warn where that is much of them."""
     timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and not b.stream.slow]
     end, _, first = min(timed, key=lambda one: one[0])
-    said = []
+    messages = []
     for last, start, buffer in timed:
         left = last - end
         if left > WIDEST_GAP * np.nan_to_num(max(first.step, buffer.step)):
             lost = f"{left / per_second:.4g} s"
             share = left / (last - start)
-            said.append(
+            messages.append(
                 f"{'truncated stream: ' if share > _MUCH else ''}the {first.stream.what} ends {lost} before the "
                 f"{buffer.stream.what}: rows end there, and {lost} ({100 * share:.2g} %) of the "
                 f"{buffer.stream.what} are left out"
             )
-    return said
+    return messages
 
 
 def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:

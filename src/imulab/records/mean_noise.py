@@ -85,14 +85,14 @@ def mean_uncertainties(
         square = weights @ bias_square(models, np.append(time, duration), column.interval.value) / weights.sum()
         more = np.array(stated.standard_uncertainty.value) ** 2 / square[:-1]
         found.append(np.sqrt(square[-1] * np.interp(np.log(duration), np.log(time), more)))
-    said = []
+    notes = []
     shortest = min(fit.columns[name].length.value for name in columns)
     if shortest < _ENOUGH * duration:
-        said.append(
+        notes.append(
             f"noise: the record is of {shortest:.4g} s, and noise that is slower does not show in it; expected "
             f"{_ENOUGH:g} times the {duration:.4g} s at rest, better 10 times"
         )
     theirs, own = record.sensor.get("serial"), of.get("serial")
     if theirs and own and theirs != own:
-        said.append(f"noise: the record is of unit {theirs}, the recording of {own}")
-    return np.array(found), said
+        notes.append(f"noise: the record is of unit {theirs}, the recording of {own}")
+    return np.array(found), notes

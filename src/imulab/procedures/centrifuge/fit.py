@@ -136,7 +136,7 @@ def _beside(
     """Return a manifest, what reads the recordings beside it, and what states the files."""
     test, folder = load_manifest(file), Path(file).parent
     paths = {run.file: folder / run.file for run in test.runs}
-    for index, run in enumerate(test.runs):  # what is missing is said before hours of data are read
+    for index, run in enumerate(test.runs):  # a missing file is refused before hours of data are read
         if not paths[run.file].is_file():
             raise ReadError(f"{test.place(index)}: no such file")
 

@@ -18,7 +18,7 @@ from imulab.procedures.centrifuge.model import CROSS_UNIT, CURVE_UNITS, K_UNIT
 from imulab.recording import Array
 
 _ROUNDING = 1e-7
-"""Turning of the drift, rad, below which nothing is said of it however small the noise."""
+"""Turning of the drift, rad, below which it is not warned of however small the noise."""
 
 
 @dataclass

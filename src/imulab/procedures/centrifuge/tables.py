@@ -168,16 +168,16 @@ def run_table(runs: list[Run]) -> ReportTable:
     """Return what was measured in each run; a column that says the same of all runs goes to the caption."""
     axes = [axis for axis in "xy" if any(run.line(axis) is not None for run in runs)]
     origins = list(dict.fromkeys(run.table_rate_from for run in runs if run.role == "loaded"))
-    said = ["cycle"] * (len({run.power_cycle for run in runs}) > 1)
-    said += ["spin axis"] * (len({run.spin_axis for run in runs}) > 1)
-    columns = ["run", "file", *said, "g", "sense", "table rate, deg/s"]
+    varied = ["cycle"] * (len({run.power_cycle for run in runs}) > 1)
+    varied += ["spin axis"] * (len({run.spin_axis for run in runs}) > 1)
+    columns = ["run", "file", *varied, "g", "sense", "table rate, deg/s"]
     columns += ["from"] * (len(origins) > 1)
     columns += ["periods"]
     columns += [*(f"{axis.upper()} drift ± u, deg/h" for axis in axes), "FOG line, deg/h"]
     rows = []
     for index, run in enumerate(runs):
         row = [str(index + 1), " ".join([run.file, *([] if run.window is None else [run.window])])]
-        row += [str(run.power_cycle if name == "cycle" else run.spin_axis) for name in said]
+        row += [str(run.power_cycle if name == "cycle" else run.spin_axis) for name in varied]
         if run.role == "static":
             rows.append([*row, "0", "static", *["–"] * (len(columns) - len(row) - 2)])
             continue

@@ -24,7 +24,7 @@ def _fit(
     (manifest,) = files
     test = load_manifest(access.path(manifest), manifest)
     names = {run.file: access.beside(manifest, run.file) for run in test.runs}
-    for index, run in enumerate(test.runs):  # what is missing is said before hours of data are read
+    for index, run in enumerate(test.runs):  # a missing file is refused before hours of data are read
         if not access.path(names[run.file]).is_file():
             raise ReadError(f"{test.place(index)}: no such file")
 

@@ -185,7 +185,7 @@ def fuse(
 
 @dataclass
 class Fuser:
-    """A stream over the blocks of a recording: the state between them, and what is said at the end."""
+    """A stream over the blocks of a recording: the state between them, and the warnings at the end."""
 
     options: FuseOptions
     weights: bool = False
@@ -248,15 +248,15 @@ class Fuser:
 
     def notes(self) -> list[str]:
         """Return what there is to say at the end: gaps, rows of zeros, and what the readings show (`Checks`)."""
-        said: list[str] = []
+        more: list[str] = []
         if self.options.method == "feedback" and self.health is not None:
-            said = feedback_notes(len(self.health.names[0]), self.clock.rate)
+            more = feedback_notes(len(self.health.names[0]), self.clock.rate)
         known = self.health.stuck() if self.health is not None else ()
         found = self.checks.lines(turned=not self._aligns(), known=known) if self.checks is not None else []
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
             found = [*found, f"{rows} left out: every gyro is exactly zero; the output is nan there"]
-        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*found, *said])]
+        return [*self.clock.lines(self.name), *(type(line)(f"{self.name}: {line}") for line in [*found, *more])]
 
     def _drop_zeros(self, readings: Array) -> None:
         """Set rows of a block, (m, axes, n), in which every gyro is exactly zero to not a number."""

@@ -31,10 +31,10 @@ def exhibits_of_fused(fused: Fused) -> Exhibits:
     """Return the rate over time and, for each axis with flags, the state of its gyros; a table of them."""
     elements = fused.elements
     length = f"{fused.time[-1] - fused.time[0]:.4g} s"
-    said = fused.health.lines()
+    health = fused.health.lines()
     return Exhibits(
         headline=f"{len(fused.time)} samples of {elements.count} gyros fused over {length}; "
-        + (f"not all gyros were in use: {'; '.join(said[:2])}." if said else "every gyro was in use throughout."),
+        + (f"not all gyros were in use: {'; '.join(health[:2])}." if health else "every gyro was in use throughout."),
         facts=[],
         items=[_rate(fused), *_states(fused), _table(fused)],
     )

@@ -302,7 +302,7 @@ def _has_time(data: object) -> bool:
 
 
 def _fitting(data: object, reading: dict[str, Any]) -> dict[str, Any]:
-    """Return what was said of the data at rest as far as it goes with those in motion."""
+    """Return the keywords of the data at rest that go with those in motion too."""
     ours = ("layout", "topic", "instance") if isinstance(data, str | PathLike) else ("rate", "time", "unit", "units")
     ours = ("element",) if hasattr(data, "corrected_by") else (*ours, "element")
     return {key: value for key, value in reading.items() if key in ours and key != "time"}

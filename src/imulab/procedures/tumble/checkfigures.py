@@ -66,16 +66,16 @@ def _limit_alone(check: Check) -> bool:
 
 
 def check_page(
-    check: Check, attitudes: Attitudes, held: Calibration, *, record: str, file: str, said: Sequence[str]
+    check: Check, attitudes: Attitudes, held: Calibration, *, record: str, file: str, warnings: Sequence[str]
 ) -> str:
-    """Return the report; `said` is what was warned of."""
+    """Return the report; `warnings` are those of the command."""
     failed = [] if check.passed else [Bad(meaning(check)), *next_step(check, record, file)]
     return render_page(
         f"Tumble check: {'pass' if check.passed else 'fail'}",
         held.sensor.get("serial", "unit without serial number"),
         exhibits_of_check(check, attitudes),
-        verdict=verdict_of([*failed, *said]),
-        notes=[note for note in said if isinstance(note, Note)],
+        verdict=verdict_of([*failed, *warnings]),
+        notes=[note for note in warnings if isinstance(note, Note)],
         provenance=[
             ("record", f"{record}, created {held.created}"),
             ("file", file),

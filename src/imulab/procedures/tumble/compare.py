@@ -158,13 +158,13 @@ def check_tumble(
     scaling = Scaling(np.zeros(3), np.abs(scale))
     theta = scaled_parameters(np.array([record.value(name) for name in parameter_names(order)]), scaling, g)
     norm, jacobian, _, _ = norm_and_jacobian(theta[None], (attitudes.mean / scaling.scale)[None], order)
-    covariance, said = _noise(record, attitudes, scaling)
+    covariance, of_noise = _noise(record, attitudes, scaling)
     motion = None if attitudes.motion is None else attitudes.motion.scaled(scaling.scale)
     lengthening, own = length_noise(theta[None], jacobian, covariance[None], motion)
     seen, rows = (norm - 1 - lengthening)[0], jacobian[0]
     residuals = g * (norm[0] - 1 if motion is None else seen)
     check_fresh(residuals, g, attitudes.recording.name)
-    notes = [*([local.note] if local.note else []), *said]
+    notes = [*([local.note] if local.note else []), *of_noise]
     if made_from(record, attitudes.recording):
         notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
     if not record.covariance.names:
@@ -194,8 +194,8 @@ def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes
     if given is None and "gravity" not in attitudes.recording.metadata:
         stated = model_of(record).gravity
         value, uncertainty = float(stated.value), float(stated.standard_uncertainty or 0.0)
-        said = f"gravity {value:.6g} m/s^2 was taken from the record, as if measured at the same place"
-        return Gravity(value, stated.from_, uncertainty, Note(said))
+        sentence = f"gravity {value:.6g} m/s^2 was taken from the record, as if measured at the same place"
+        return Gravity(value, stated.from_, uncertainty, Note(sentence))
     return local_gravity(given, attitudes.recording)
 
 
@@ -212,17 +212,17 @@ def _in_unit_of(record: Calibration, attitudes: Attitudes) -> Attitudes:
 
 
 def _noise(record: Calibration, attitudes: Attitudes, scaling: Scaling) -> tuple[Array, list[str]]:
-    """Covariance of the attitudes, g^2, shape (n, 3, 3), and what is to be said of it."""
+    """Covariance of the attitudes, g^2, shape (n, 3, 3), and a note on where it is from."""
     if attitudes.covariance is not None:
         return attitudes.covariance / (scaling.scale[:, None] * scaling.scale), []
     g, chi_square = model_of(record).gravity.value, fit_of(record).reduced_chi_square
     stated = attitudes_of(record).standard_uncertainty
     sigma = median(np.array(stated)) if stated else float(np.sqrt(chi_square)) if chi_square else 0.0
-    said = Note(
+    note = Note(
         f"nothing is known of the noise of these attitudes: the {1e6 * sigma / g:.3g} µg of those that the record was "
         "made from were used; a recording, or std_* columns, would say"
     )
-    return np.broadcast_to((sigma / g) ** 2 * np.eye(3), (len(attitudes), 3, 3)), [said]
+    return np.broadcast_to((sigma / g) ** 2 * np.eye(3), (len(attitudes), 3, 3)), [note]
 
 
 def _excess(record: Calibration, g: float) -> float:
