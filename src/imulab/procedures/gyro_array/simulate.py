@@ -144,18 +144,23 @@ def simulate_array(
     readings += _gauss_markov(readings.shape, noise, rate, rng)
     for each in faults:
         _break(readings, each, rate, rng)
+    head = {"serial": f"ARRAY-{seed:04d}", "model": f"simulated array of {elements}", "experiment": experiment}
+    return _recording(time, readings, truth, biases, unit, head)
+
+
+def _recording(time: Array, readings: Array, truth: Array, biases: Array, unit: str, head: dict[str, str]) -> Recording:
+    """Return readings, shape (m, axes, n), with their truth, shape (m, axes), as a recording in a unit."""
     factor = conversion_factor("rad/s", unit)
-    letters = ("",) if axes == 1 else ("x_", "y_", "z_")
-    columns: dict[str, Array] = {"time": time}
-    metadata = {"serial": f"ARRAY-{seed:04d}", "model": f"simulated array of {elements}", "experiment": experiment}
+    letters = ("",) if readings.shape[1] == 1 else ("x_", "y_", "z_")
+    columns, metadata = {"time": time}, dict(head)
     for a, letter in enumerate(letters):
-        for i in range(elements):
+        for i in range(readings.shape[2]):
             columns[f"gyro_{letter}{i + 1}"] = readings[:, a, i] * factor
             metadata[f"truth_bias_{letter}{i + 1}"] = f"{float(biases[a, i])!r} rad/s"
     for a, letter in enumerate(letters):
         columns[f"truth_rate_{letter}".rstrip("_")] = truth[:, a] * factor
     units = {name: "s" if name == "time" else unit for name in columns}
-    return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated {experiment} array")
+    return Recording(columns=columns, units=units, metadata=metadata, name=f"simulated {head['experiment']} array")
 
 
 def _spread(given: tuple[float, float] | str) -> tuple[float, float]:

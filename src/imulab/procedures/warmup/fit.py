@@ -130,14 +130,7 @@ def fit_warmup(
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
     """
     at = check_options(model, temperatures, tolerance, settling_time, exit, taper_time, pool, beyond)
-    given = list(cycles)
-    if not given:
-        raise DataError("no power cycles: expected at least one file for each calibration temperature")
-    start = in_si(latest_start, "latest_start", "time", "s")
-    found = [
-        item if isinstance(item, Cycle) else _averaged(item, reading, start, from_column=temperature_column)
-        for item in given
-    ]
+    found = _cycles(cycles, reading, in_si(latest_start, "latest_start", "time", "s"), from_column=temperature_column)
     if axes is not None:
         found = [with_axes(cycle, tuple(axes)) for cycle in found]
     order = common_axes(found)
@@ -180,6 +173,19 @@ def fit_warmup(
         },
     )
     return WarmupFit(record, table, tuple(rows), spread, curves)
+
+
+def _cycles(
+    given: Sequence[Cycle | Data], reading: Mapping[str, Any], latest_start: float, *, from_column: bool
+) -> list[Cycle]:
+    """Return power cycles, those that are not yet averaged over bins of a second."""
+    found = [
+        item if isinstance(item, Cycle) else _averaged(item, reading, latest_start, from_column=from_column)
+        for item in given
+    ]
+    if not found:
+        raise DataError("no power cycles: expected at least one file for each calibration temperature")
+    return found
 
 
 def _averaged(data: Data, reading: Mapping[str, Any], latest_start: float, *, from_column: bool) -> Cycle:
