@@ -176,7 +176,7 @@ def test_clipped_rows_of_a_table(imulab, tmp_path):
     ("arguments", "fragments"),
     [
         (["frobnicate"], ["No such command 'frobnicate'", "known commands:", "tumble"]),
-        (["tumble", "frobnicate"], ["known commands: plan simulate fit gyro check"]),
+        (["tumble", "frobnicate"], ["known commands: plan simulate fit gyro mag check"]),
         (["tumble", "fit"], ["Missing argument 'FILE'"]),
         (["tumble", "fit", "good.csv", "--frob"], ["--frob"]),
         (["tumble", "fit", "good.csv", "--order", "7"], ["--order '7': expected one of auto 0 1 2 3 4 5 blend"]),

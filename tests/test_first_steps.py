@@ -273,7 +273,7 @@ def test_an_option_that_is_none_is_answered_with_those_there_are(imulab, command
 
 
 def test_lists_of_commands_are_cut_nowhere(imulab):
-    groups = [[], ["tumble"], ["array"], ["warmup"], ["centrifuge"], ["fleet"]]
+    groups = [[], ["tumble"], ["array"], ["warmup"], ["centrifuge"], ["noise"], ["fleet"]]
     for group in groups:
         lines = imulab(*group, "--help").stdout.split("Commands:\n")[1].split("\n\n")[0].splitlines()
         assert all(re.fullmatch(r"  \w+ +[A-Z].*\.", line) for line in lines), lines
