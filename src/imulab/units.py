@@ -110,7 +110,6 @@ _SPELLINGS = {
     "μrad": "urad",
     "µT": "uT",
     "μT": "uT",
-    "G": "gauss",
     "Gauss": "gauss",
     "mG": "mgauss",
     "counts": "count",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -97,7 +98,7 @@ def live(
         try:
             if listened is not None:
                 name = output or "record.json"
-                on_page(runner, made, again(save, fitted, output), name, port=listened, browser=not no_browser)
+                on_page(runner, made, partial(again, save, fitted, output), name, port=listened, browser=not no_browser)
                 return
             (_plain if plain else _drawn)(runner, typed=source != "-")
             runner.recorder.close()

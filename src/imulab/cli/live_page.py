@@ -42,14 +42,25 @@ def checked_page(page: bool, port: str | None, *, no_browser: bool, plain: bool)
     return port_number(port)
 
 
-def again(save: str, texts: Mapping[str, str | None], output: str | None) -> str:
-    """Return the command that makes the same record from the recording."""
+def again(save: str, texts: Mapping[str, str | None], output: str | None, record: Calibration) -> str:
+    """Return the command that makes the same record from the recording, or the two where it has gyroscopes."""
     given = [word for key, text in texts.items() if text is not None for word in (f"--{key}", text)]
-    return shlex.join(["imulab", "tumble", "fit", save, *given, *(["-o", output] if output else [])])
+    to = ["-o", output] if output else []
+    fit = ["imulab", "tumble", "fit", save, *given]
+    if "gyro_bias_x" not in record.parameters:
+        return shlex.join([*fit, *to])
+    gyro = ["imulab", "tumble", "gyro", save, "--accel", "accel.json", *to]
+    return f"{shlex.join([*fit, '-o', 'accel.json'])} && {shlex.join(gyro)}"
 
 
 def on_page(
-    runner: Runner, made: Callable[[], Calibration], command: str, output: str, *, port: int, browser: bool
+    runner: Runner,
+    made: Callable[[], Calibration],
+    command: Callable[[Calibration], str],
+    output: str,
+    *,
+    port: int,
+    browser: bool,
 ) -> None:
     """Show a session on the page until it is ended there or by Ctrl-C.
 

@@ -28,6 +28,7 @@ def _nothing(message: str) -> None:
     """Tell nobody."""
 
 
+_WITH_MAGNETOMETERS = ("c", "blob", "px4", "ardupilot")
 MAG_MOUNTS = ("external", "internal")
 
 
@@ -78,5 +79,8 @@ def export(
         if error.name != module:
             raise
         raise OptionError(f"target {target} is not there yet; known targets: {' '.join(EXPORTERS)}") from None
-    files: list[Path] = exporter.export(records, Path(folder), options or ExportOptions())
+    chosen = options or ExportOptions()
+    files: list[Path] = exporter.export(records, Path(folder), chosen)
+    if target not in _WITH_MAGNETOMETERS and any("mag_bias_x" in record.parameters for record in records):
+        chosen.tell(f"{target}: its file has no place for magnetometers: theirs are left out")
     return files

@@ -14,9 +14,9 @@ from imulab.units import STANDARD_GRAVITY
 
 @dataclass(frozen=True)
 class Reading:
-    """Length of the mean reading of a block, m/s^2, as it came and corrected; and of the corrected rate, rad/s."""
+    """Length of the mean reading of a block, m/s^2, as it came (None for counts) and corrected; and its rate, rad/s."""
 
-    raw: float
+    raw: float | None
     length: float
     rate: float | None
 
@@ -40,5 +40,5 @@ def corrected_reading(ready: Loaded, block: Recording, *, gyro: bool) -> Reading
     def length(of: Recording, sensor: str) -> float:
         return float(np.linalg.norm([of.si(name).mean() for name in triad(sensor)]))
 
-    raw = float("nan") if block.units["accel_x"] == "count" else length(block, "accel")
+    raw = None if block.units["accel_x"] == "count" else length(block, "accel")
     return Reading(raw, length(after, "accel"), length(after, "gyro") if gyro else None)

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextvars import copy_context
 from dataclasses import asdict
 from functools import partial
@@ -37,15 +37,15 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from imulab.errors import ImulabError, OptionError, quoted
+from imulab.live.corrected import corrected_reading
 from imulab.live.formats import UnknownFormatError
 from imulab.live.page.parts import Hub, Message, Part
 from imulab.live.page.security import report_response
 from imulab.live.runner import Runner
 from imulab.live.session import Event
 from imulab.live.view import View, in_words
-from imulab.procedures.apply import Loaded, apply, loaded
+from imulab.procedures.apply import loaded
 from imulab.procedures.reports import exhibits_of, parameter_rows, rendered
-from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.report.elements import format_uncertain
 
@@ -65,7 +65,7 @@ class GuidedPart(Part):
     fit
         Makes the record from the recording, and writes what is to be written.
     command
-        The words of the command that makes the same record.
+        The words of the command, or commands, that make the same record.
     record_name
         What the record's file is called.
 
@@ -79,7 +79,9 @@ class GuidedPart(Part):
 
     name = "session"
 
-    def __init__(self, runner: Runner, fit: Callable[[], Calibration], command: str, record_name: str) -> None:
+    def __init__(
+        self, runner: Runner, fit: Callable[[], Calibration], command: Callable[[Calibration], str], record_name: str
+    ) -> None:
         super().__init__()
         self.record: Calibration | None = None
         self.error: Exception | None = None
@@ -202,11 +204,12 @@ class GuidedPart(Part):
         assert self.record is not None
         ready, runner, told = loaded(self.record), self._runner, 0.0
         gravity = runner.session.guide.local_gravity
+        gyro = "gyro_bias_x" in self.record.parameters
         while not (self._stop.is_set() or runner.ended):
             blocks = runner.listen(_WAIT)
             if blocks and monotonic() - told > _EVERY:
-                raw, length = _lengths(ready, blocks[-1])
-                self._tell({"type": "corrected", "length": length, "raw": raw, "gravity": gravity}, latest=True)
+                found = corrected_reading(ready, blocks[-1], gyro=gyro and "gyro_x" in blocks[-1])
+                self._tell({"type": "corrected", **asdict(found), "gravity": gravity}, latest=True)
                 told = monotonic()
 
     def _result(self, record: Calibration) -> Message:
@@ -220,7 +223,7 @@ class GuidedPart(Part):
                 _parameter(row.name, row.value, row.standard_uncertainty, row.unit) for row in parameter_rows(record)
             ],
             "files": [{"kind": kind, "name": name, "href": f"/api/session/{kind}"} for kind, name in names.items()],
-            "command": self._command,
+            "command": self._command(record),
         }
 
     def _file(self, request: Request) -> Response:
@@ -248,16 +251,6 @@ def view_message(view: View) -> Message:
 def _parameter(name: str, value: float, uncertainty: float | None, unit: str) -> Message:
     texts = format_uncertain(value, uncertainty)
     return {"name": name, "value": texts[0], "uncertainty": texts[1], "unit": unit}
-
-
-def _lengths(ready: Loaded, block: Recording) -> Sequence[float]:
-    """Return the length of the mean reading of a block, raw and corrected, m/s^2."""
-
-    def length(of: Recording) -> float:
-        mean: Array = np.array([of.si(f"accel_{axis}").mean() for axis in "xyz"])
-        return float(np.linalg.norm(mean))
-
-    return length(block), length(apply(ready, block))
 
 
 def _failure(error: Exception) -> Message:

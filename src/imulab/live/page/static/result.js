@@ -33,7 +33,9 @@ export class ResultArea {
   corrected(message) {
     if (!this.length) return;
     put(this.length, `${message.length.toFixed(4)} m/s²`);
-    put(this.beside, `${message.raw.toFixed(4)} m/s² uncorrected; at rest ${message.gravity.toFixed(4)} m/s² is right. Turn the unit, and see.`);
+    const turning = message.rate === null ? "" : `, ${(message.rate * 180 / Math.PI).toFixed(3)} deg/s corrected`;
+    const raw = message.raw === null ? "" : `${message.raw.toFixed(4)} m/s² uncorrected${turning}; `;
+    put(this.beside, `${raw}at rest ${message.gravity.toFixed(4)} m/s² is right. Turn the unit, and see.`);
   }
 
   quit() {

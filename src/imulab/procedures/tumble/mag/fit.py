@@ -152,14 +152,17 @@ def fit_mag(
         same_direction=same_direction,
         drop=drop,
     )
-    robust = loss == "huber"
-    joint, aside = solve(ready.pair, ready.start, robust=robust), tuple[Disturbed, ...]()
-    if loss == "auto":
-        joint, aside = _set_aside(joint, ready)
-    if str(mag_order) != "1":
-        joint = _order_two(joint, str(mag_order), robust=robust)
-    what = seen(joint.pair, joint.theta)
-    _check_seen(what, ready.estimate.attitudes)
+    name = attitudes.recording.name
+    try:
+        with np.errstate(all="ignore"):  # what runs away ends in no solution
+            joint, aside = _solved(ready, loss, str(mag_order))
+            what = seen(joint.pair, joint.theta)
+    except np.linalg.LinAlgError:
+        raise DataError(
+            f"{name}: the fit of both triads finds no solution: are both of the same attitudes, by one clock"
+            f"{', and does one axis point the same way in those of same-direction' if same_direction else ''}?"
+        ) from None
+    _check_seen(what, np.delete(ready.kept, [one.index for one in aside]), name)
     _check_result(joint, ready, hemisphere)
     options = {
         "loss": loss, "mag_order": mag_order, "field": magnitude, "hemisphere": hemisphere,
@@ -203,9 +206,10 @@ def prepare(
     dropped = _numbers(drop, count, "drop")
     kept = np.setdiff1d(np.arange(count), dropped)
     groups = [_numbers(group, count, "same-direction") for group in same_direction]
-    local = local_gravity(_gravity(gravity, known), attitudes.recording)
     if known is not None:
         check_prior(known)
+    local = local_gravity(_gravity(gravity, known), attitudes.recording)
+    if known is not None:
         if str(order) not in ("auto", str(model_of(known).order)):
             raise OptionError(f"order {order} with a record of order {model_of(known).order}: expected that or auto")
         order = model_of(known).order
@@ -226,9 +230,13 @@ def prepare(
     pair, start = _pair(estimate, means, kept, mag, prior), np.concatenate([first, [begin.dip], theta])
     if groups:
         places = [np.flatnonzero(np.isin(kept, group)).tolist() for group in groups]
+        _check_groups(places, name)
         held, more = find_held(triad(first, pair.mag, MAGNETOMETERS).vector, force, places)
         pair, start = replace(pair, held=held), np.concatenate([start, more])
-    _check_seen(seen(pair, start), estimate.attitudes)
+    try:
+        _check_seen(seen(pair, start), kept, name)
+    except np.linalg.LinAlgError:
+        raise DataError(f"{name}: the attitudes determine no field: are both triads of the same attitudes?") from None
     return Ready(estimate, scaling, local, means, kept, mag, pair, start, notes)
 
 
@@ -247,6 +255,29 @@ def _numbers(given: str | Sequence[int | str], count: int, option: str) -> NDArr
                 )
             found += range(int(ends[0]) - 1, int(ends[1]))
     return np.unique(np.array(found, dtype=np.intp))
+
+
+def _check_groups(places: Sequence[Sequence[int]], name: str) -> None:
+    """Refuse groups of attitudes from which no direction can be told."""
+    every = [place for group in places for place in group]
+    if len(set(every)) < len(every):
+        raise OptionError(f"same-direction: an attitude of {name} is in two groups; expected each in one")
+    if any(len(group) < 2 for group in places) or 2 * len(every) <= 2 + 2 * len(places):
+        raise OptionError(
+            "same-direction: too few attitudes in the groups to tell a direction from; expected three or more of one "
+            "group"
+        )
+
+
+def _solved(ready: Ready, loss: str, mag_order: str) -> tuple[Joint, tuple[Disturbed, ...]]:
+    """Fit both triads, leave disturbed attitudes out, and take the order that is asked for."""
+    robust = loss == "huber"
+    joint, aside = solve(ready.pair, ready.start, robust=robust), tuple[Disturbed, ...]()
+    if loss == "auto":
+        joint, aside = _set_aside(joint, ready)
+    if mag_order != "1":
+        joint = _order_two(joint, mag_order, robust=robust)
+    return joint, aside
 
 
 def _gravity(given: float | str | Gravity | None, known: Calibration | None) -> float | str | Gravity | None:
@@ -343,7 +374,7 @@ def _order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
     return second if better and p < _SIGNIFICANT else joint
 
 
-def _check_seen(what: Seen, attitudes: Attitudes) -> None:
+def _check_seen(what: Seen, kept: NDArray[np.intp], name: str) -> None:
     """Refuse attitudes that leave something blind, and say what would help."""
     if what.rank == what.size and what.condition < _WORST_CONDITION:
         return
@@ -353,11 +384,11 @@ def _check_seen(what: Seen, attitudes: Attitudes) -> None:
         if blind
         else ""
     )
-    which = " ".join(str(i + 1) for i in sorted(what.heading))
+    which = " ".join(str(int(kept[i]) + 1) for i in sorted(what.heading))
     raise ObservabilityError(
-        f"{attitudes.recording.name}: {len(attitudes)} attitudes determine {what.rank} of {what.size} combinations of "
+        f"{name}: {len(kept)} attitudes determine {what.rank} of {what.size} combinations of "
         f"the magnetometers' parameters and the dip{cannot}; turn the heading between attitudes: attitudes {which} "
-        "once more with the unit facing a quarter turn away would help most (imulab tumble plan --with mag)"
+        "once more with the unit facing a quarter turn away would help most"
     )
 
 

@@ -25,7 +25,10 @@ _MOVED = 3.0
 """Standard uncertainties of an accelerometer parameter beyond which the joint fit moves it too far."""
 _ONE_WAY = 6.0
 """Condition number from which turning the heading would halve the uncertainty, or better."""
-_LARGE_RMS = 0.1
+_LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
+"""Scatter of |m| and dip that steady attitudes in one field do not have; the worst of real ones: 0.5 %, 0.3 deg."""
+_HOPELESS = 5.0  # times that
+_POINTING = np.radians(3.0)
 
 
 def with_mag(
@@ -59,7 +62,12 @@ def with_mag(
             **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
         },
         data={**accel.data, "mag": _data(ready, joint, aside)},
-        warnings=(*accel.warnings, *ready.means.notes, *ready.notes, *_warnings(ready, joint, seen, aside, moved)),
+        warnings=(
+            *accel.warnings,
+            *ready.means.notes,
+            *ready.notes,
+            *_warnings(ready, joint, seen, aside, moved, options),
+        ),
         verdict=UNJUDGED,
     )
 
@@ -140,6 +148,7 @@ def _fit(
         "noise": "estimated from the residuals" if joint.pair.noise is None else "known",
         "sigma_magnitude": float(joint.sigma[0]),
         "sigma_dip": {"value": float(joint.sigma[1]), "unit": "rad"},
+        **({} if joint.pair.held is None else {"sigma_direction": {"value": float(joint.sigma[2]), "unit": "rad"}}),
         "condition_number": seen.condition,
         "set_aside": [int(ready.kept[one.index]) + 1 for one in aside],
         "heading": {
@@ -172,8 +181,28 @@ def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, A
     }
 
 
+def _scatter(joint: Joint) -> list[str]:
+    """Say if |m| or dip scatter so much that the triads do not belong together, or the field was not steady."""
+    magnitude, dip = _rms(joint.found.residuals[:, 1]), _rms(joint.found.residuals[:, 2])
+    worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
+    if worst <= 1:
+        return []
+    kind = Bad if worst > _HOPELESS else str
+    return [
+        kind(
+            f"mag: |m| scatters by {100 * magnitude:.2g} % of the field, the dip by {np.degrees(dip):.2g} deg: were "
+            "both triads in the same attitudes, by one clock, and was no iron near that moved?"
+        )
+    ]
+
+
 def _warnings(
-    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], moved: Mapping[str, float]
+    ready: Ready,
+    joint: Joint,
+    seen: Seen,
+    aside: Sequence[Disturbed],
+    moved: Mapping[str, float],
+    options: Mapping[str, Any],
 ) -> list[str]:
     attitudes, found = ready.estimate.attitudes, list[str]()
     for one in aside:
@@ -191,7 +220,8 @@ def _warnings(
         )
     if seen.condition > _ONE_WAY:
         heading = np.degrees(heading_uncertainty(joint)[0])
-        which = " ".join(str(int(ready.kept[i]) + 1) for i in sorted(seen.heading))
+        left = np.delete(ready.kept, [one.index for one in aside])
+        which = " ".join(str(int(left[i]) + 1) for i in sorted(seen.heading))
         found.append(
             f"mag: the attitudes face nearly one way (condition {seen.condition:.0f}): heading is known to "
             f"{heading:.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help most"
@@ -203,12 +233,20 @@ def _warnings(
             f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
             "gravity contradict each other; was iron near, or did the unit move?"
         )
-    rms = _rms(joint.found.residuals[:, 1])
-    if rms > _LARGE_RMS:
+    found += _scatter(joint)
+    if joint.pair.held is not None and joint.sigma[2] > _POINTING:
         found.append(
-            Bad(
-                f"mag: the calibrated magnitudes scatter by {100 * rms:.2g} % of the field: these are no attitudes in "
-                "one field"
+            f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
+            "directions: does one axis of the body point the same way in them?"
+        )
+    if "hemisphere" not in options:
+        dip = float(np.degrees(joint.theta[joint.pair.layout.dip_at]))
+        where, other = ("northern", "southern") if dip > 0 else ("southern", "northern")
+        found.append(
+            Note(
+                f"mag: the dip of {dip:+.1f} deg is one of the {where} hemisphere; if this is the {other}, a "
+                "magnetometer axis is reversed, two are exchanged, or the accelerometers read minus the specific force "
+                "(--hemisphere checks it)"
             )
         )
     if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":

@@ -222,12 +222,20 @@ def _rows_at(pair: Pair, weigh: Array, theta: Array) -> tuple[Array, Array]:
 
 
 def _minimise(rows: Callable[[Array], tuple[Array, Array]], theta: Array) -> tuple[Array, bool]:
-    """Levenberg-Marquardt with columns scaled to length 1; whether the last step was below the tolerance."""
+    """Levenberg-Marquardt with columns scaled to length 1; whether the last step was below the tolerance.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The parameters run away.
+    """
     residuals, jacobian = rows(theta)
     cost, damping = float(residuals @ residuals), _DAMPING
     for _ in range(_STEPS):
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
         scaled = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(len(theta))])
+        if not (np.isfinite(scaled).all() and np.isfinite(residuals).all()):
+            raise np.linalg.LinAlgError("the fit runs away")
         step = np.linalg.lstsq(scaled, -np.append(residuals, np.zeros(len(theta))), rcond=None)[0] / scale
         with np.errstate(all="ignore"):
             new, slope = rows(theta + step)
@@ -242,10 +250,9 @@ def _minimise(rows: Callable[[Array], tuple[Array, Array]], theta: Array) -> tup
     return theta, False
 
 
-def information_of(joint: Joint) -> tuple[Array, Array]:
-    """Return the weighted Jacobian of the solution, and its weights, ones: what observability is judged by."""
-    jacobian = _rows(joint.pair, joint.found, joint.theta, _root(joint.information))[1]
-    return jacobian, np.ones(len(jacobian))
+def weighted_jacobian(joint: Joint) -> Array:
+    """Return the Jacobian of the solution over the standard deviations of its rows, with those of the prior."""
+    return _rows(joint.pair, joint.found, joint.theta, _root(joint.information))[1]
 
 
 def _covariance(pair: Pair, found: Invariants, information: Array) -> Array:
