@@ -68,8 +68,23 @@ def test_each_filter_grows_as_white_noise_and_walk_do(record, sensor, g, b):
         assert steps * of_bias == pytest.approx(walk**2 * t, rel=1e-6), name
 
 
+def test_the_variance_for_ros_is_that_of_the_samples_where_the_noise_is_slow_too():
+    """1/f noise makes the white noise of a filter larger, but not the variance of a sample."""
+    names = [f"gyro_{axis}" for axis in "xyz"]
+    columns = {name: samples(40 + k, white=1e-3, flicker=1e-3) for k, name in enumerate(names)}
+    columns["time"] = np.arange(len(columns["gyro_x"])) / RATE
+    units = dict.fromkeys(names, "rad/s") | {"time": "s"}
+    found = il.fit_noise(il.Recording(columns, units)).calibration
+    u = max(found.fit["bias_uncertainty"][name]["standard_uncertainty"]["value"][-1] for name in names)
+    measured = max(float(columns[name].var()) for name in names)
+    stated = noise_for(found, "ros")["angular_velocity_covariance"] - u**2
+    assert stated == pytest.approx(measured, rel=0.08)  # the mean is taken off, and 1/f noise has a variance as well
+    assert noise_for(found, "gtsam")["gyroscopeCovariance"] * RATE > 1.5 * stated
+
+
 def test_the_variance_of_a_ros_sample_and_matlab_sizes(record):
-    white, walk = sizes(record, "gyro")
+    _, walk = sizes(record, "gyro")
+    white = max(record.value(f"gyro_{axis}_white") for axis in "xyz")
     u = max(record.fit["bias_uncertainty"][f"gyro_{a}"]["standard_uncertainty"]["value"][-1] for a in "xyz")
     assert noise_for(record, "ros")["angular_velocity_covariance"] == pytest.approx(white**2 * RATE + u**2)
     matlab = noise_for(record, "matlab")

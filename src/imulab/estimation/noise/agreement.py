@@ -171,7 +171,7 @@ def trusted(spectrum: Spectrum, highest: float, tolerance: float) -> Spectrum:
     """Return a spectrum whose octaves up to `highest`, Hz, count no more than a change of size by `tolerance` needs.
 
     The ratio of two octaves of ``1/tolerance^2`` coefficients is known to twice the tolerance, that of the sizes to the
-    tolerance: what changes by less is not held against the second.
+    tolerance. Octaves and logs still add up: many long logs together find a change that is smaller.
     """
     if not tolerance > 0:
         return spectrum

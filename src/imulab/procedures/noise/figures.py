@@ -118,11 +118,11 @@ def _for_filters(fit: Fit) -> ReportTable:
         )
     return ReportTable(
         "For filters, and means at rest",
-        f"A filter knows white noise N and a random walk K alone. N in unit/√Hz and K in unit/√s are such that over "
-        f"{fit.horizon.value:g} s without aiding it predicts what the fitted noise does; with the 95 % interval of K. "
-        "Then the standard uncertainty of a mean over so many seconds at rest as a measure of the bias. Vibration is "
-        "not in a log at rest.",
-        ["column", "N", "K", "95 % of K", "unit", *(f"u, {t:.3g} s" for t in times), "unit of u"],
+        f"A filter knows white noise and a random walk alone. N_h in unit/√Hz and K_h in unit/√s are such that over "
+        f"{fit.horizon.value:g} s without aiding it predicts what the fitted noise does; the 95 % interval is that of "
+        "K_h. Then the standard uncertainty of a mean over so many seconds at rest as a measure of the bias. "
+        "Vibration is not in a log at rest.",
+        ["column", "N_h", "K_h", "95 % of K_h", "unit", *(f"u, {t:.3g} s" for t in times), "unit of u"],
         rows,
     )
 

@@ -21,12 +21,16 @@ STEPS = {"px4": 0.010, "ardupilot": 0.012}
 
 @dataclass(frozen=True)
 class Sizes:
-    """Noise of a sensor in SI: white N and walk K for a filter, 1/f noise B, uncertainty u of a bias from a mean."""
+    """Noise of a sensor in SI: white N_h and walk K_h for a filter, 1/f noise B, uncertainty u of a bias from a mean.
+
+    `density` is the white noise N by itself, of which the variance of a sample is made.
+    """
 
     white: float
     walk: float
     flicker: float
     bias: float
+    density: float
 
 
 def _continuous(s: Sizes, gyro: bool, rate: float, step: float) -> dict[str, float]:
@@ -59,16 +63,16 @@ def _gtsam(s: Sizes, gyro: bool, rate: float, step: float) -> dict[str, float]:
 
 def _ros(s: Sizes, gyro: bool, rate: float, step: float) -> dict[str, float]:
     name = "angular_velocity_covariance" if gyro else "linear_acceleration_covariance"
-    return {name: s.white**2 * rate + s.bias**2}
+    return {name: s.density**2 * rate + s.bias**2}
 
 
 def _matlab(s: Sizes, gyro: bool, rate: float, step: float) -> dict[str, float]:
     sensor, long = ("gyroparams", "Gyroscope") if gyro else ("accelparams", "Accelerometer")
     return {
-        f"{sensor}.NoiseDensity": s.white,
+        f"{sensor}.NoiseDensity": s.density,
         f"{sensor}.BiasInstability": s.flicker,
         f"{sensor}.RandomWalk": s.walk,
-        f"insfilterMARG.{long}Noise": s.white**2 * rate,
+        f"insfilterMARG.{long}Noise": s.density**2 * rate,
         f"insfilterMARG.{long}BiasNoise": s.walk**2 / rate,
     }
 
@@ -136,12 +140,16 @@ def noise_for(
 
 
 def _largest(record: Calibration, fit: Fit, names: list[str]) -> Sizes:
-    flicker = [record.parameters[key].value for name in names if (key := f"{name}_flicker") in record.parameters]
+    def largest(term: str) -> float:
+        keys = [f"{name}_{term}" for name in names]
+        return max((record.parameters[key].value for key in keys if key in record.parameters), default=0.0)
+
     return Sizes(
         max(fit.filter_white[name].value for name in names),
         max(fit.filter_walk[name].value for name in names),
-        max(flicker, default=0.0),
+        largest("flicker"),
         max(fit.bias_uncertainty[name].standard_uncertainty.value[-1] for name in names),
+        largest("white"),
     )
 
 

@@ -69,7 +69,9 @@ def _residuals(record: Calibration, data: Fields) -> Figure:
                     hovertemplate="%{text}<br>%{y:+.2f} deg<extra></extra>", name="dip"),
         ],
         layout={
-            "xaxis": axis("attitude", dtick=max(1, round(len(data.number) / 20)), anchor="y"),
+            "xaxis": axis(
+                "attitude", dtick=max(1, round(len(data.number) / 20)), anchor="y", range=[0.4, max(data.number) + 0.6]
+            ),
             "yaxis": axis("dip, deg", domain=[0, 0.46], zeroline=True),
             "yaxis2": axis("|m|, %", domain=[0.54, 1], zeroline=True),
             "showlegend": False,
