@@ -8,6 +8,9 @@ import os
 import queue
 import re
 import shlex
+import signal
+import subprocess
+import sys
 import threading
 import time
 import zipfile
@@ -32,6 +35,7 @@ from imulab.live.page.bench import Workbench
 from imulab.live.page.files import Files, checked
 from imulab.live.page.forms import forms
 from imulab.live.page.jobs import Jobs
+from imulab.live.page.parts import to_json
 
 COMMANDS = dict(commands_of(command()))
 FORMS = forms(COMMANDS.items())
@@ -393,4 +397,35 @@ def test_what_cannot_be_is_answered_by_a_sentence(bench, tmp_path, path, body, s
 def test_open_refuses_by_a_sentence(imulab, tmp_path, arguments, said):
     ran = imulab("open", "--no-browser", *arguments)
     assert (ran.returncode, ran.stdout, ran.stderr) == (2, "", f"imulab: {said}\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_another_session_removed_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    files = Files(Path("session"))
+    Path("session").rmdir()
+    assert files.entries() == []
+    assert Path(files.new("rec.csv")).parent.is_dir()
+
+
+def test_a_command_that_cannot_be_started_leaves_no_job(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    jobs = Jobs(lambda job: None)
+    with pytest.raises(il.ImulabError, match="cannot be started"):
+        jobs.run("tumble fit", ["tumble", "fit", "a\0b"], [])
+    assert jobs.jobs == {}
+
+
+def test_a_message_with_half_a_character_still_is_one():
+    assert to_json({"text": "found \ud800"}) == '{"text":"found ?"}'
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGHUP")
+def test_closing_the_terminal_ends_the_workbench(tmp_path):
+    words = [sys.executable, "-m", "imulab", "open", "--no-browser"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert "token=" in process.stdout.readline()
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(20) == 0
     assert list(tmp_path.iterdir()) == []

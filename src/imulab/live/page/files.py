@@ -64,7 +64,8 @@ class Files:
 
     def entries(self) -> list[Entry]:
         """Return the files there are now, those of the command line first, then by name."""
-        own = sorted(str(path) for path in self.folder.iterdir() if _plain(path.name) and path.name[0] != ".")
+        there = self.folder.iterdir() if self.folder.is_dir() else ()  # another program may have removed it
+        own = sorted(str(path) for path in there if _plain(path.name) and path.name[0] != ".")
         found = (self._entry(name) for name in dict.fromkeys([*self._given, *own]))
         return [entry for entry in found if entry is not None]
 
@@ -89,6 +90,7 @@ class Files:
         OptionError
             The name leads elsewhere, or the file is there already.
         """
+        self.folder.mkdir(exist_ok=True)
         path = checked(self.folder, name)
         if os.path.lexists(path):
             raise OptionError(f"{name}: is there already; expected another name")
@@ -96,6 +98,7 @@ class Files:
 
     def unused(self, name: str, taken: Collection[str] = ()) -> str:
         """Return the path of a file to be made, numbered where one of that name is there, or is in `taken`."""
+        self.folder.mkdir(exist_ok=True)
         stem, dot, rest = name.partition(".")
         path, number = checked(self.folder, name), 1
         while os.path.lexists(path) or str(path) in taken:

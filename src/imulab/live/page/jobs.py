@@ -15,6 +15,8 @@ from pathlib import Path
 from time import time
 from typing import IO
 
+from imulab.errors import OptionError
+
 _LONGEST, _MOST_LINES, _LONGEST_LINE = 1 << 20, 1000, 4000
 _GRACE = 5.0
 _WINDOWS = sys.platform == "win32"
@@ -67,21 +69,17 @@ class Jobs:
         self._watches: dict[int, threading.Thread] = {}
 
     def run(self, path: str, words: Sequence[str], outputs: Sequence[str]) -> Job:
-        """Begin to run a command in the working folder."""
+        """Begin to run a command in the working folder.
+
+        Raises
+        ------
+        OptionError
+            It cannot be started.
+        """
         number = len(self.jobs) + 1
-        job = self.jobs[number] = Job(number, path, shlex.join(["imulab", *words]), list(words), list(outputs))
-        # -P: the working folder is no place to import from.
-        self._processes[number] = process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "imulab", *words],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            env={**os.environ, "PYTHONUTF8": "1", "NO_COLOR": "1"},
-            start_new_session=not _WINDOWS,
-        )
+        job = Job(number, path, shlex.join(["imulab", *words]), list(words), list(outputs))
+        process = _started(words)
+        self.jobs[number], self._processes[number] = job, process
         self._watches[number] = threading.Thread(target=self._watch, args=(job, process), daemon=True)
         self._watches[number].start()
         self._tell(job)
@@ -146,3 +144,23 @@ def _signal(process: subprocess.Popen[str], number: int) -> None:
             process.terminate()
         else:
             os.killpg(process.pid, number)
+
+
+def _started(words: Sequence[str]) -> subprocess.Popen[str]:
+    """Start a command in a process; raises OptionError where that fails."""
+    try:
+        # -P: the working folder is no place to import from.
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "imulab", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env={**os.environ, "PYTHONUTF8": "1", "NO_COLOR": "1"},
+            start_new_session=not _WINDOWS,
+        )
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "a text that is none"
+        raise OptionError(f"imulab {words[0]}: cannot be started: {reason}") from None

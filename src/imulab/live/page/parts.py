@@ -117,8 +117,9 @@ class Line:
 
 
 def to_json(message: object) -> str:
-    """Return a message as JSON; dataclasses as objects, numbers that are none as null."""
-    return json.dumps(_plain(message), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    """Return a message as JSON; dataclasses as objects, numbers that are none as null, lone surrogates as ``?``."""
+    text = json.dumps(_plain(message), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def _plain(value: Any) -> Any:

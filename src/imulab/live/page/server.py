@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import signal
 import socket
 import sys
+import threading
 import webbrowser
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
 from importlib.resources import files
 from typing import Any
 
@@ -138,9 +140,23 @@ def serve(
     if browser:
         _open(address)
     try:
-        server.run(sockets=[listening])
+        with _hung_up(stop):
+            server.run(sockets=[listening])
     finally:
         listening.close()
+
+
+@contextmanager
+def _hung_up(stop: Callable[[], None]) -> Iterator[None]:
+    """End the server as by Ctrl-C where its terminal is closed, so that nothing that it runs is left behind."""
+    if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, lambda *_: stop())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def _open(address: str) -> None:
