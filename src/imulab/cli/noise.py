@@ -167,7 +167,7 @@ def check(
     record: RecordFile,
     files: Annotated[list[str], typer.Argument(metavar="LOG...", help="Logs at rest, of the record's rate.")],
     *,
-    tolerance: Annotated[str, typer.Option(help="Change of size that an octave of one log cannot find.")] = "1 %",
+    tolerance: Annotated[str, typer.Option(help="Change of size that is not held against the log.")] = "1 %",
     false_alarm: Annotated[
         str, typer.Option("--false-alarm", help="Share of logs of unchanged noise that fail.")
     ] = "5 %",

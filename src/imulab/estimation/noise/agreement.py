@@ -35,20 +35,30 @@ class Octaves:
         Of the mean squares, each over the common model, shape (..., o).
     freedom
         Coefficients in both, shape (2, o).
+    tolerance
+        Relative change of size that is not held against the second set.
     """
 
     low: Array
     high: Array
     ratio: Array
     freedom: Array
+    tolerance: float = 0.0
+
+    @property
+    def allowed(self) -> Array:
+        """The part of the ratio that the tolerance explains, shape (..., o)."""
+        most = (1 + self.tolerance) ** 2
+        return np.clip(self.ratio, 1 / most, most)
 
     @property
     def scores(self) -> Array:
-        """Standard normal where both are of the same noise, shape (..., o)."""
+        """Of what the tolerance leaves; without one, standard normal where both are of the same noise, (..., o)."""
         from imulab.estimation.special import fdtrc, ndtri
 
-        upper = fdtrc(self.freedom[1], self.freedom[0], self.ratio)
-        lower = fdtrc(self.freedom[0], self.freedom[1], 1 / self.ratio)
+        left = self.ratio / self.allowed
+        upper = fdtrc(self.freedom[1], self.freedom[0], left)
+        lower = fdtrc(self.freedom[0], self.freedom[1], 1 / left)
         tail = np.maximum(np.minimum(upper, lower), 1e-300)
         return np.asarray(np.where(upper < lower, 1.0, -1.0) * -ndtri(tail))
 
@@ -95,20 +105,24 @@ def agreement(
     second: Sequence[Spectrum],
     highest: float,
     *,
+    tolerance: float = 0.0,
     candidates: tuple[str, ...] = CANDIDATES,
     full_band: bool = False,
 ) -> Agreement:
-    """Test whether two sets of spectra, of one sampling rate, are of the same noise.
+    """Test whether two sets of spectra, of one sampling rate, are of the same noise but for a tolerance.
 
+    Among all changes within the tolerance, octave by octave, the tests are of the one that brings the sets closest.
     Spectra drawn from the common model tell the mean of the likelihood ratio, and how many independent tests the two
     tests count for, between one and two.
 
     Parameters
     ----------
     first, second
-        Their bins count what they are to be trusted with.
+        All of a set are of one noise.
     highest
         Up to which frequency, Hz.
+    tolerance
+        Relative change of the size of the noise of an octave that is not held against the second.
     candidates, full_band
         For the choice of the common model, as for `choose`.
     """
@@ -123,18 +137,19 @@ def agreement(
     variance = bins.variances(values[None])[0]
     used = np.maximum(bins.freedom, 1e-9)
     drawn = variance * np.random.default_rng(1).chisquare(used, (_DRAWS, len(used))) / used
-    power = np.concatenate([bins.power[None], drawn])
-    ratios = _likelihood_ratios(bins, own, values, limits, power)
+    octaves = _octaves(spectra, own, np.concatenate([bins.power[None], drawn]) / variance, highest)
+    held = replace(octaves, ratio=octaves.ratio[0], tolerance=tolerance)
+    eased = np.where(own, bins.power, bins.power / _allowed(spectra, held, highest))
+    ratios = _likelihood_ratios(bins, own, values, limits, np.concatenate([eased[None], drawn]))
     count = int(np.count_nonzero(values > 0))
     by_terms = chdtrc(count, count * ratios / max(float(ratios[1:].mean()), 1e-9))
-    octaves = _octaves(spectra, own, power / variance, highest)
-    least = np.minimum(by_terms, octaves.probability)
+    least = np.minimum(by_terms, np.concatenate([held.probability[None], octaves.probability[1:]]))
     # The least of m independent probabilities p has -ln(1 - p) of mean 1/m.
     tests = float(np.clip(-1 / np.mean(np.log1p(-np.minimum(least[1:], 1 - 1e-16))), 1, 2))
     return Agreement(
         model,
         float(by_terms[0]),
-        replace(octaves, ratio=octaves.ratio[0]),
+        held,
         float(-np.expm1(tests * np.log1p(-min(least[0], 1 - 1e-16)))),
     )
 
@@ -162,20 +177,14 @@ def _octaves(spectra: Sequence[Spectrum], own: Flags, relative: Array, highest: 
     return Octaves(edge / 2, edge, mean[1] / mean[0], total[:, kept])
 
 
+def _allowed(spectra: Sequence[Spectrum], octaves: Octaves, highest: float) -> Array:
+    """The part of the ratio of each bin's octave that the tolerance explains, shape (b,); 1 where there is no ratio."""
+    below = np.concatenate([_octave(each, highest) for each in spectra])
+    factor = np.ones(int(below.max()) + 1)
+    factor[np.rint(np.log2(highest / octaves.high)).astype(np.int64)] = octaves.allowed
+    return np.asarray(factor[below])
+
+
 def _octave(spectrum: Spectrum, highest: float) -> NDArray[np.int64]:
     """Which octave below `highest`, Hz, each bin is in, from 0, shape (b,)."""
     return np.floor(np.log2(highest / np.minimum(frequencies(spectrum), highest))).astype(np.int64)
-
-
-def trusted(spectrum: Spectrum, highest: float, tolerance: float) -> Spectrum:
-    """Return a spectrum whose octaves up to `highest`, Hz, count no more than a change of size by `tolerance` needs.
-
-    The ratio of two octaves of ``1/tolerance^2`` coefficients is known to twice the tolerance, that of the sizes to the
-    tolerance. Octaves and logs still add up: many long logs together find a change that is smaller.
-    """
-    if not tolerance > 0:
-        return spectrum
-    below = _octave(spectrum, highest)
-    total = np.bincount(below, spectrum.freedom)
-    share = np.minimum(1.0, 1 / tolerance**2 / np.maximum(total, 1e-9))
-    return replace(spectrum, freedom=spectrum.freedom * share[below])

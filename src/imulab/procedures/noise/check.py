@@ -11,7 +11,7 @@ from typing import ClassVar, Unpack
 import numpy as np
 
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
-from imulab.estimation.noise.agreement import Agreement, agreement, trusted
+from imulab.estimation.noise.agreement import Agreement, agreement
 from imulab.estimation.noise.band import within
 from imulab.estimation.noise.choice import CANDIDATES
 from imulab.estimation.noise.cosine import frequencies
@@ -171,8 +171,8 @@ def check_noise(
     data
         A log of the same sampling rate, or a list of logs, as for `fit_noise`.
     tolerance
-        Relative change of the size of the noise, in an octave, that is not held against the log: no sensor keeps its
-        noise to better than about 1 %, and long logs would show less. 0: none.
+        Relative change of the size of the noise, in an octave, that is not held against the log, however long it is:
+        no sensor keeps its noise to better than about 1 %. 0: none.
     false_alarm
         Share of logs of unchanged noise that fail; with a tolerance, at most.
     reading
@@ -272,12 +272,10 @@ def _checked(record: Calibration, log: Calibration, name: str, tolerance: float)
     column, highest = fit_of(record).columns[name], fit_of(record).band[name].value
     first, off = _spectra(record, name)
     second, _ = _spectra(log, name)
-    before, after = (
-        [trusted(_used(each, highest, off), highest, tolerance) for each in part] for part in (first, second)
-    )
+    before, after = ([_used(each, highest, off) for each in part] for part in (first, second))
     chosen = str(record.options.get("terms", "auto"))
     candidates = CANDIDATES if chosen == "auto" else (chosen,)
-    found = agreement(before, after, highest, candidates=candidates, full_band=column.full_band)
+    found = agreement(before, after, highest, tolerance=tolerance, candidates=candidates, full_band=column.full_band)
     return ColumnCheck(name, column.unit, found, _changes((before, after), column))
 
 
