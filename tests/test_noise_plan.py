@@ -135,3 +135,9 @@ def test_the_command_plans_and_refuses_in_one_line(record, tmp_path, capsys):
         captured = capsys.readouterr()
         assert (captured.out, captured.err.count("\n")) == ("", 1)
         assert message in captured.err
+
+
+def test_a_record_of_another_procedure_is_refused_by_the_name_of_the_option(tmp_path, capsys):
+    il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81).save(tmp_path / "t.json")
+    assert main(["noise", "plan", "--from", str(tmp_path / "t.json")]) == 2
+    assert "--from: a tumble record; expected one of noise fit" in capsys.readouterr().err

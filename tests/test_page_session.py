@@ -16,9 +16,8 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("starlette", reason="the page needs imulab[live]")
-sync_api = pytest.importorskip("playwright.sync_api", reason="the browser tests need playwright")
 
-from imulab.cli import main  # noqa: E402
+from imulab.cli import main
 
 SLOW = 60_000
 """What takes longer than this many ms hangs."""
@@ -60,33 +59,6 @@ class Live:
         for stream in (self.process.stdout, self.process.stderr):
             assert stream is not None
             stream.close()
-
-
-@pytest.fixture(scope="module")
-def browser(chromium) -> Iterator[object]:
-    with sync_api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
-        yield found
-        found.close()
-
-
-@pytest.fixture
-def new_page(browser) -> Iterator[object]:
-    """A function that opens a page; at the end none may have reported a fault."""
-    context = browser.new_context(viewport={"width": 1280, "height": 900})
-    context.set_default_timeout(SLOW)
-    faults: list[str] = []
-
-    def opened(address: str):
-        page = context.new_page()
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.on("console", lambda said: faults.append(said.text) if "Content Security" in said.text else None)
-        page.goto(address)
-        return page
-
-    yield opened
-    context.close()
-    assert not faults
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 
-from imulab.errors import OptionError, UnitError, quoted
+from imulab.errors import OptionError, RecordError, UnitError, quoted
 from imulab.units import parse_unit, to_si
 
 _BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
@@ -197,12 +197,12 @@ def labelled(label: str, names: Iterable[str]) -> Iterator[None]:
     """Put an option's label before a refusal that begins with its bare name; `label` is ``"--{}"`` or the like."""
     try:
         yield
-    except OptionError as error:
+    except (OptionError, RecordError) as error:
         word = str(error).partition(" ")[0].rstrip(":")
         if word not in names:
             raise
         shown = word.strip("_").replace("_", "-") if label.startswith("--") else word
-        raise OptionError(label.format(shown) + str(error)[len(word) :]) from None
+        raise type(error)(label.format(shown) + str(error)[len(word) :]) from None
 
 
 def number(text: str, option: str) -> float:

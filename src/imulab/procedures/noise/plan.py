@@ -261,7 +261,7 @@ def plan_noise(
         own = None
     else:
         for name, value in {**terms, "rate": rate}.items():
-            if value:
+            if value not in (None, (), []):
                 raise OptionError(f"{name}: the record says that already; expected either terms or a record")
         noise, own = _of_record(as_record(from_, "plan_noise"), columns)
     return _planned(noise, wanted, seconds or own)

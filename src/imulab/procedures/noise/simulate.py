@@ -91,7 +91,7 @@ def noise_log(
         hertz = in_si(RATE if rate is None else rate, "rate", "frequency", "Hz")
     else:
         for name, value in terms.items():
-            if value:
+            if value not in (None, (), []):
                 raise OptionError(f"{name}: the record says that already; expected either terms or a record")
         record = as_record(from_, "simulate_noise")
         values, units, own = terms_of(record, names)
