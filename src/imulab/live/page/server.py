@@ -135,12 +135,12 @@ def serve(
 
     app.state.hub.stop = stop
     address = f"http://{LOCAL}:{listening.getsockname()[1]}/?token={app.state.token}"
-    tell(address)
-    sys.stdout.flush()
-    if browser:
-        _open(address)
     try:
         with _hung_up(stop):
+            tell(address)
+            sys.stdout.flush()
+            if browser:
+                _open(address)
             server.run(sockets=[listening])
     finally:
         listening.close()
