@@ -1,5 +1,6 @@
 """A procedure that nobody knows but the registry goes all the way: fit, record, report, apply, show and a fleet."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from imulab.procedures.run import run_task
 from imulab.procedures.tumble.apply import apply_gyro
 from imulab.procedures.tumble.device import golden_gyroscopes
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.records.triads import Accelerometers, Triads
 from imulab.report import elements
 
 RATE = (0.01, -0.02, 0.03)
@@ -117,6 +119,24 @@ def test_its_record_corrects_recordings(record):
     assert main(["export", "--to", "blob", "1.json", "-o", "fw"]) == 0
     assert main(["apply", "fw/unit.blob", "1.csv", "-o", "by_blob.csv"]) == 0
     np.testing.assert_allclose(il.read("by_blob.csv").column("gyro_x"), corrected.column("gyro_x"), atol=1e-8)
+
+
+def test_its_record_is_exported_where_its_entry_states_triads(record, monkeypatch, capsys):
+    assert main(["export", "--to", "ros", "1.json", "-o", "ros"]) == 2
+    reason = "ros: a drift record cannot be exported: it states no accelerometers; use --to c or --to blob"
+    assert reason in capsys.readouterr().err
+    accel = Accelerometers(np.full(3, 2.0), np.eye(3), np.ones(3), np.array([[0.1, 0, 0]]), np.zeros(3), "m/s^2")
+    monkeypatch.setitem(PROCEDURES, "drifts", replace(MADE_UP, triads=lambda record: Triads(accel, None)))
+    assert main(["export", "--to", "ros", "1.json", "-o", "ros", "--lossy"]) == 0
+    said = capsys.readouterr().err
+    assert "k2_x" in said
+    assert "bias, scale factor and misalignment are those of the whole model" in said
+    assert Path("ros/imu_calib.yaml").read_text().splitlines()[-14:] == [
+        "SM:",
+        *(f"  - {value}" for value in np.diag([0.5] * 3).ravel()),
+        "bias:",
+        *["  - 1.0"] * 3,
+    ]
 
 
 def test_a_fleet_runs_it(here, capsys):

@@ -1,8 +1,4 @@
-"""A tumble record as matrices, what a target leaves out of it, and what that costs.
-
-Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyroscopes: ``M = S (T w + G f + b)``.
-Outputs M are in SI, or in counts or volts.
-"""
+"""The one record whose triads a target takes, what the target leaves out of it, and what that costs."""
 
 from __future__ import annotations
 
@@ -18,61 +14,15 @@ from imulab.atomic_write import write_text
 from imulab.errors import OptionError, RecordError
 from imulab.exporters import ExportOptions
 from imulab.printable import printable
-from imulab.procedures.registry import procedure_of
-from imulab.procedures.tumble.sections import data_of, fit_of, model_of
+from imulab.procedures.registry import PROCEDURES, procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import plain_number
-from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
+from imulab.records.triads import CROSS_TERMS, NOT_FITTED, Accelerometers, Gyroscopes, text_in_g
+from imulab.units import STANDARD_GRAVITY
 
 AXES = "xyz"
-_CROSS = ("k_xy", "k_yz", "k_zx")
 _NEGLIGIBLE = 1e-6
 _GRID = np.linspace(-STANDARD_GRAVITY, STANDARD_GRAVITY, 21)
-
-
-@dataclass(frozen=True)
-class Gyroscopes:
-    """``M = S (T w + G f + b)``: scale factor (3,), matrix T (3, 3), g-sensitivity G (3, 3), bias (3,), unit of M."""
-
-    scale: Array
-    matrix: Array
-    sensitivity: Array
-    bias: Array
-    unit: str
-
-    @property
-    def gain(self) -> Array:
-        """``S T``: output per rate, shape (3, 3)."""
-        return self.scale[:, None] * self.matrix
-
-
-@dataclass(frozen=True)
-class Accelerometers:
-    """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M.
-
-    With cross terms k_xy, k_yz, k_zx (3,) in A.
-    """
-
-    scale: Array
-    matrix: Array
-    bias: Array
-    nonlinearity: Array
-    cross: Array
-    unit: str
-
-    @property
-    def gain(self) -> Array:
-        """``S T``: output per specific force, shape (3, 3)."""
-        return self.scale[:, None] * self.matrix
-
-    def output(self, force: Array) -> Array:
-        """Return the outputs for specific forces, m/s^2, shape (n, 3)."""
-        sensed = force @ self.matrix.T
-        reading = sensed + sum(k * sensed ** (power + 2) for power, k in enumerate(self.nonlinearity))
-        reading = reading + self.cross * sensed * np.roll(sensed, -1, axis=1)
-        output: Array = self.scale * (reading + self.bias)
-        return output
 
 
 @dataclass(frozen=True)
@@ -95,7 +45,7 @@ class UnitModel:
 
 
 def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
-    """Return the triads of the one tumble record among the records.
+    """Return the triads of the one record among the records, of a procedure that states triads.
 
     Raises
     ------
@@ -104,66 +54,23 @@ def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
     RecordError
         The record lacks a parameter.
     """
+    found = []
     for record in records:
-        reason = procedure_of(record).elsewhere
-        if reason is not None:
-            instead = "; use --to c or --to blob" if procedure_of(record).sections else ""
-            raise OptionError(
-                f"{target}: a {record.procedure} record cannot be exported: {reason.format(target=target)}{instead}"
-            )
+        entry = procedure_of(record)
+        if entry.triads is None:
+            reason = (entry.elsewhere or "it states no accelerometers").format(target=target)
+            instead = "; use --to c or --to blob" if entry.sections else ""
+            raise OptionError(f"{target}: a {record.procedure} record cannot be exported: {reason}{instead}")
+        found.append((record, entry.triads))
     if len(records) != 1:
-        raise OptionError(f"{target}: expected one tumble record, found {len(records)}")
-    (record,) = records
+        known = " or ".join(entry.name for entry in PROCEDURES.values() if entry.triads is not None)
+        raise OptionError(f"{target}: expected one {known} record, found {len(records)}")
+    ((record, triads_of),) = found
     try:
-        return UnitModel(record, _accelerometers(record), _gyroscopes(record))
+        triads = triads_of(record)
     except RecordError as error:
         raise RecordError(f"{target}: {error}") from None
-
-
-def _accelerometers(record: Calibration) -> Accelerometers:
-    model = model_of(record)
-    factor, kept = _to_si(model.output_unit, "m/s^2")
-    matrix = np.eye(3)
-    for i, j in ((1, 0), (2, 0), (2, 1)):
-        matrix[i, j] = record.value(f"misalignment_{AXES[i]}{AXES[j]}")
-    order = model.order
-    terms = [[record.value(f"k{power}_{axis}") for axis in AXES] for power in range(2, order + 1)]
-    return Accelerometers(
-        scale=np.array([record.value(f"scale_factor_{axis}") for axis in AXES]) * factor,
-        matrix=matrix,
-        bias=np.array([record.value(f"bias_{axis}") for axis in AXES]),
-        nonlinearity=np.array(terms).reshape(-1, 3),
-        cross=np.array([record.value(name) for name in _CROSS]) if _CROSS[0] in record.parameters else np.zeros(3),
-        unit=kept,
-    )
-
-
-def _gyroscopes(record: Calibration) -> Gyroscopes | None:
-    if "gyro_output_unit" not in record.model:
-        return None
-    factor, kept = _to_si(model_of(record).gyro_output_unit, "rad/s")
-    matrix, sensitivity = np.eye(3), np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            pair = AXES[i] + AXES[j]
-            if i != j:
-                matrix[i, j] = record.value(f"gyro_misalignment_{pair}")
-            if "gyro_g_sensitivity_xx" in record.parameters:
-                sensitivity[i, j] = record.value(f"gyro_g_sensitivity_{pair}")
-    return Gyroscopes(
-        scale=np.array([record.value(f"gyro_scale_factor_{axis}") for axis in AXES]) * factor,
-        matrix=matrix,
-        sensitivity=sensitivity,
-        bias=np.array([record.value(f"gyro_bias_{axis}") for axis in AXES]),
-        unit=kept,
-    )
-
-
-def _to_si(unit: str, si: str) -> tuple[float, str]:
-    """Return the factor from outputs to SI, and the unit that they then have; counts and volts stay."""
-    if parse_unit(unit).quantity == "output":
-        return 1.0, parse_unit(unit).symbol
-    return conversion_factor(unit, si), si
+    return UnitModel(record, triads.accel, triads.gyro)
 
 
 def refuse_raw(unit: UnitModel, target: str) -> None:
@@ -221,29 +128,10 @@ def held_accelerometers(
     if error <= _NEGLIGIBLE * STANDARD_GRAVITY:
         return accel, error, []
     what = "bias, scale factor and misalignment" if misalignment else "bias and scale factor"
-    refit = procedure_of(unit.record).refit
-    record = None if refit is None else refit(unit.record, misalignment=misalignment)
-    if record is None:
-        there = data_of(unit.record).attitudes
-        why = (
-            f"the record's {len(there.mean)} attitudes are too few, or not the ones, to fit them to anew"
-            if there is not None
-            else "the record holds no attitudes to fit them to anew"
-        )
-        return accel, error, [f"{what} are those of the whole model: {why}"]
-    held = _accelerometers(record)
-    uncertain = {name: p.standard_uncertainty or 0.0 for name, p in record.parameters.items()}
-    bias = max(uncertain[f"bias_{axis}"] for axis in AXES)
-    scale = max(uncertain[f"scale_factor_{axis}"] / record.value(f"scale_factor_{axis}") for axis in AXES)
-    return (
-        held,
-        accel_loss(accel, correction(held)),
-        [
-            f"{what} were fitted anew to the record's {fit_of(record).attitudes} attitudes, without what is left out: "
-            f"|f| - g there is {_in_g(fit_of(record).rms.value)} rms, {_in_g(fit_of(unit.record).rms.value)} by "
-            f"the whole model; standard uncertainties up to {_in_g(bias)} and {plain_number(1e6 * scale, 3)} ppm"
-        ],
-    )
+    linear_fit = procedure_of(unit.record).linear_fit
+    fit = NOT_FITTED if linear_fit is None else linear_fit(unit.record, misalignment=misalignment)
+    held = fit.accel or accel
+    return held, accel_loss(accel, correction(held)), [f"{what} {fit.remark}"]
 
 
 def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
@@ -257,7 +145,7 @@ def accel_terms(accel: Accelerometers, *, misalignment: bool) -> list[str]:
         for axis, k in zip(AXES, row, strict=True)
         if k
     ]
-    names += [name for name, k in zip(_CROSS, accel.cross, strict=True) if k]
+    names += [name for name, k in zip(CROSS_TERMS, accel.cross, strict=True) if k]
     return names
 
 
@@ -315,7 +203,7 @@ def settle_losses(
     names, costs = list(gyro[0]), list(gyro[1])
     if accel[0] and accel[1] > _NEGLIGIBLE * STANDARD_GRAVITY:
         names = accel[0] + names
-        costs.insert(0, f"up to {_in_g(accel[1])} within +-1 g")
+        costs.insert(0, f"up to {text_in_g(accel[1])} within +-1 g")
     if not costs:
         return []
     what = f"{' '.join(names)}, which changes outputs by {', '.join(costs)}"
@@ -325,11 +213,6 @@ def settle_losses(
     for comment in comments:
         options.tell(f"{target}: {comment}")
     return comments
-
-
-def _in_g(error: float) -> str:
-    g = error / STANDARD_GRAVITY
-    return f"{1e3 * g:.3g} mg" if g >= 1e-3 else f"{1e6 * g:.3g} ug"
 
 
 # --- writing -------------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
+    from imulab.records.triads import LinearFit, Triads
     from imulab.report.elements import Exhibits
 
 
@@ -157,8 +158,14 @@ class Procedure:
         Record to what exporters make noise keys of, in the form of ``allan --json``; None where it states no noise.
     sections
         The kinds of these tables.
+    triads
+        Record to its accelerometers and gyroscopes as matrices, which other programs' files are made from; None where
+        it states none.
+    linear_fit
+        Record (and whether to keep the misalignment) to its accelerometers fitted anew without nonlinearity, for
+        programs that hold none; None where they cannot be.
     elsewhere
-        Why another program's file cannot hold its records; ``{target}`` is that program. None where they can.
+        Why another program's file cannot hold its records, where they state no triads; ``{target}`` is that program.
     not_applied
         Why its records correct no recording by `apply`, and what takes them; None where they do.
     rows
@@ -174,8 +181,6 @@ class Procedure:
         among them, m/s^2; None where no such limit is known.
     beyond_message
         Record, that number and that force to what a user should know.
-    refit
-        Record (and whether to keep the misalignment) to one without nonlinearity, or None where it cannot be.
     """
 
     name: str
@@ -189,6 +194,8 @@ class Procedure:
     sections: tuple[Section, ...]
     fusion: Callable[[Calibration, str | None, str | None], Fusion] | None = None
     noise: Callable[[Calibration], Mapping[str, Any]] | None = None
+    triads: Callable[[Calibration], Triads] | None = None
+    linear_fit: Callable[..., LinearFit] | None = None
     elsewhere: str | None = None
     not_applied: str | None = None
     rows: Callable[[Calibration], Sequence[Row]] | None = None
@@ -197,7 +204,6 @@ class Procedure:
     same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
     beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None
     beyond_message: Callable[[Calibration, int, float], str] | None = None
-    refit: Callable[..., Calibration | None] | None = None
 
     def section(self, kind: str) -> Section:
         """Return one of its kinds of section."""

@@ -13,6 +13,7 @@ from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.sections import model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.records.triads import CROSS_TERMS
 from imulab.units import STANDARD_GRAVITY
 
 _AXES = "xyz"
@@ -42,7 +43,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     ).reshape(-1, 3)
     ends = np.array([monotone_range(nonlinearity[:, axis]) for axis in range(3)])
     largest = float(np.finfo(np.float32).max)
-    crossed = "k_xy" in record.parameters
+    crossed = CROSS_TERMS[0] in record.parameters
     table = DeviceTable(
         "tumble",
         (
@@ -53,7 +54,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
             Field("low", np.clip(ends[:, 0], -largest, largest)),
             Field("high", np.clip(ends[:, 1], -largest, largest)),
             Field("nonlinearity", nonlinearity),
-            *([Field("cross", values_of(record, ["k_xy", "k_yz", "k_zx"], "1/(m/s^2)"))] if crossed else []),
+            *([Field("cross", values_of(record, CROSS_TERMS, "1/(m/s^2)"))] if crossed else []),
         ),
         {"output_unit": output},
     )

@@ -40,5 +40,6 @@ ENTRY = Procedure(
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
     beyond=deferred(f"{_HERE}.apply:beyond_test"),
     beyond_message=deferred(f"{_HERE}.apply:beyond_message"),
-    refit=deferred(f"{_HERE}.refit:refit_linear"),
+    triads=deferred(f"{_HERE}.triads:triads_of"),
+    linear_fit=deferred(f"{_HERE}.triads:linear_fit"),
 )

@@ -23,11 +23,11 @@ from imulab.estimation.ranked import medians
 from imulab.procedures.tumble import _model
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Motion
 from imulab.recording import Array
+from imulab.records.triads import CROSS_TERMS
 
 AXES = ("x", "y", "z")
 MISALIGNMENTS = ("yx", "zx", "zy")
 _UNUSUAL = 3.0
-CROSS_TERMS = ("k_xy", "k_yz", "k_zx")
 _NEXT = [1, 2, 0]
 _CROSS_PASSES = 30
 GAUGE = "x input axis along body x, y input axis in the body xy plane"

@@ -18,9 +18,10 @@ import numpy as np
 from imulab.estimation.least_squares import f_test
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
-from imulab.procedures.tumble.model import AXES, CROSS_TERMS, MISALIGNMENTS
+from imulab.procedures.tumble.model import AXES, MISALIGNMENTS
 from imulab.procedures.tumble.solve import Problem, Solution, forces
 from imulab.recording import Array
+from imulab.records.triads import CROSS_TERMS
 
 FALSE_ALARM = 0.01
 """Share of tests without any pattern in which one is named: 1 % for direction, 1 % for time."""

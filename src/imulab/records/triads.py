@@ -1,0 +1,97 @@
+"""The triads of a unit as matrices, as other programs hold them: what a procedure makes of its record for exporters.
+
+Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyroscopes: ``M = S (T w + G f + b)``.
+Outputs M are in SI, or in counts or volts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.recording import Array
+from imulab.units import STANDARD_GRAVITY, conversion_factor, parse_unit
+
+CROSS_TERMS = ("k_xy", "k_yz", "k_zx")
+"""Parameters of the products of two axes."""
+
+
+@dataclass(frozen=True)
+class Gyroscopes:
+    """``M = S (T w + G f + b)``: scale factor (3,), matrix T (3, 3), g-sensitivity G (3, 3), bias (3,), unit of M."""
+
+    scale: Array
+    matrix: Array
+    sensitivity: Array
+    bias: Array
+    unit: str
+
+    @property
+    def gain(self) -> Array:
+        """``S T``: output per rate, shape (3, 3)."""
+        return self.scale[:, None] * self.matrix
+
+
+@dataclass(frozen=True)
+class Accelerometers:
+    """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M.
+
+    With cross terms `CROSS_TERMS` (3,) in A.
+    """
+
+    scale: Array
+    matrix: Array
+    bias: Array
+    nonlinearity: Array
+    cross: Array
+    unit: str
+
+    @property
+    def gain(self) -> Array:
+        """``S T``: output per specific force, shape (3, 3)."""
+        return self.scale[:, None] * self.matrix
+
+    def output(self, force: Array) -> Array:
+        """Return the outputs for specific forces, m/s^2, shape (n, 3)."""
+        sensed = force @ self.matrix.T
+        reading = sensed + sum(k * sensed ** (power + 2) for power, k in enumerate(self.nonlinearity))
+        reading = reading + self.cross * sensed * np.roll(sensed, -1, axis=1)
+        output: Array = self.scale * (reading + self.bias)
+        return output
+
+
+@dataclass(frozen=True)
+class Triads:
+    """The accelerometers of a unit, and its gyroscopes, None where the record has none."""
+
+    accel: Accelerometers
+    gyro: Gyroscopes | None
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """Accelerometers fitted anew without nonlinearity, None where they cannot be, and what is said of it.
+
+    `remark` goes on from the parameters that were fitted: ``are those of the whole model: ...``.
+    """
+
+    accel: Accelerometers | None
+    remark: str
+
+
+NOT_FITTED = LinearFit(None, "are those of the whole model")
+"""Of a procedure that fits nothing anew."""
+
+
+def output_to_si(unit: str, si: str) -> tuple[float, str]:
+    """Return the factor from outputs to SI, and the unit that they then have; counts and volts stay."""
+    if parse_unit(unit).quantity == "output":
+        return 1.0, parse_unit(unit).symbol
+    return conversion_factor(unit, si), si
+
+
+def text_in_g(force: float) -> str:
+    """Return a specific force, m/s^2, in mg or ug as people read it."""
+    g = force / STANDARD_GRAVITY
+    return f"{1e3 * g:.3g} mg" if g >= 1e-3 else f"{1e6 * g:.3g} ug"
