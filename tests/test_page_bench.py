@@ -103,8 +103,10 @@ def test_no_text_of_a_form_is_a_file_without_being_called_one():
         ("export", {"records": ["r.json"], "to": "c", "output": True}, "export r.json --to c -o folder/found"),
         ("tumble plan", {"attitudes": "9", "distinct_verticals": False},
          "tumble plan --attitudes 9 --repeated-verticals"),
-        ("array simulate", {"fault": "dead:1 stuck:2", "output": True},
+        ("array simulate", {"fault": ["dead:1", "stuck:2", ""], "output": True},
          "array simulate -o folder/found.csv --fault dead:1 --fault stuck:2"),
+        ("noise simulate", {"gm": ["20 deg/h:300 s", " 2 deg/h:9 s"], "output": True},
+         "noise simulate -o folder/found.csv --gm '20 deg/h:300 s' --gm '2 deg/h:9 s'"),
         ("warmup fit", {"files": ["a.csv"], "temperatures": "-40,0"}, "warmup fit a.csv --temperatures=-40,0"),
     ],
 )  # fmt: skip
@@ -311,7 +313,7 @@ def test_from_the_recording_to_the_firmware(bench, tmp_path):
     bench.ask("open", {"file": name, "reading": {}})
     about = until(lambda: "attitudes" in (found := bench.ask("open", {"file": name}).json()) and found)
     assert len(about["attitudes"]) == 12
-    shown = bench.ask(f"curves?file={quote(name)}&width=200").json()
+    shown = bench.ask(f"curves?opening={about['opening']}&width=200").json()
     assert len(shown["low"]["accel_x"]) == len(shown["at"]) == 200
     said = bench.ask(
         "command", {"command": "tumble fit", "values": {"file": name, "output": True, "report": True}}
@@ -373,8 +375,12 @@ def test_an_upload_beyond_the_limit_is_refused_and_leaves_nothing(bench, tmp_pat
         ("open", {"file": "/etc/passwd"}, "not among the files"),
         ("open", {"file": "none.csv"}, "not among the files"),
         ("open", {"file": 5, "reading": 7}, "not among the files|reading: expected"),
-        ("curves?file=none", None, "is not open"),
-        ("curves?file=none&from=x", None, "from 'x': expected a number"),
+        ("curves?opening=7", None, "is not open any more"),
+        ("curves?opening=x", None, "opening 'x': expected a number"),
+        ("curves?opening=7&from=x", None, "from 'x': expected a number"),
+        ("curves?opening=7&width=nan", None, "width 'nan': expected a number"),
+        ("curves?opening=inf", None, "opening 'inf': expected a number"),
+        ("command", b'{"command": "' + b"x" * (1 << 20) + b'"}', "expected a JSON object of at most 1024 KiB"),
         ("command", {"command": "live", "values": []}, "not among those offered"),
         ("jobs", {"command": "tumble fit", "values": {"file": "/etc/passwd"}}, "not among the files"),
         ("jobs", {"command": "tumble simulate", "values": {"output": "../x.csv"}}, "expected the name of a file"),
@@ -389,9 +395,121 @@ def test_what_cannot_be_is_answered_by_a_sentence(bench, tmp_path, path, body, s
     assert list(tmp_path.iterdir()) == [tmp_path / "session"]
 
 
+def test_two_pages_read_one_file_each_in_its_own_way(bench):
+    """A layout of one page is none of the other."""
+    Path("session/l.toml").write_text('[columns]\naccel_x = { from = "a", unit = "g" }\n')
+    il.write_csv(il.simulate_tumble(attitudes=6, gravity=9.81), "session/rec.csv")
+    Path("session/rec.csv").write_text("a [g],b [g]\n1,2\n3,4\n")
+    ways = [{"file": "session/rec.csv"}, {"file": "session/rec.csv", "reading": {"layout": "session/l.toml"}}]
+    numbers = [bench.ask("open", way).json()["opening"] for way in ways]
+    until(lambda: all("attitudes" in bench.ask("open", way).json() or "error" in bench.ask("open", way).json()
+                      for way in ways))  # fmt: skip
+    assert [bench.ask("open", way).json()["opening"] for way in ways] == numbers
+    assert len(set(numbers)) == 2
+
+
+def test_a_name_that_is_being_written_is_not_given_twice(bench):
+    values = {"output": "own.csv", "attitudes": "200"}
+    job = bench.ask("jobs", {"command": "tumble simulate", "values": values}).json()
+    again = bench.ask("jobs", {"command": "tumble simulate", "values": values})
+    assert again.status == 400
+    assert "own.csv: is" in again.json()["error"]
+    until(lambda: bench.part._jobs.jobs[job["number"]].ended)
+
+
+MANIFEST = """radius = {{ value = 2.0, unit = "m" }}
+rates = {{ unit = "deg/s" }}
+[[run]]
+file = {file!r}
+power_cycle = 1
+role = "static"
+"""
+
+
+@pytest.mark.parametrize("file", ["/etc/passwd", "../secret.csv", "sub/rec.csv", "link.csv"])
+def test_a_manifest_that_was_dropped_names_no_file_outside_the_folder(bench, file):
+    Path("secret.csv").write_text("time [s],fog [deg/s]\n0,1\n")
+    Path("session/link.csv").symlink_to("../secret.csv")
+    bench.ask("files/m.csv", MANIFEST.format(file=file).encode(), "PUT")
+    values = {"manifest": "session/m.csv", "output": True}
+    for what in ("command", "jobs"):
+        answer = bench.ask(what, {"command": "centrifuge reduce", "values": values})
+        assert answer.status == 400
+        assert answer.json()["error"].startswith(f"session/m.csv: {file!r}: expected the name of a file in the session")
+    assert bench.part._jobs.jobs == {}
+
+
+def test_a_manifest_of_the_command_line_names_files_where_they_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("m.toml").write_text(MANIFEST.format(file="/data/one.csv"))
+    files = Files(Path("session"), ["m.toml"])
+    files.check_manifest("m.toml")
+    Path("session/own.toml").write_text(MANIFEST.format(file="one.csv"))
+    files.check_manifest("session/own.toml")
+    Path("session/none.toml").write_text("[[")
+    files.check_manifest("session/none.toml")  # what is wrong with it the command says
+
+
+@pytest.mark.parametrize("name", ["con.csv", "NUL", "com1.txt", "lpt² .csv", "a?.csv", "rec.csv.", "rec "])
+def test_names_that_windows_does_not_take_are_refused_there(tmp_path, monkeypatch, name):
+    monkeypatch.setattr("imulab.live.page.files._WINDOWS", True)
+    with pytest.raises(OptionError, match="Windows does not take"):
+        checked(tmp_path, name)
+    for good in ("console.csv", "com.csv", "a.con", "rec 1.csv"):
+        assert checked(tmp_path, good) == tmp_path / good
+
+
+def test_a_command_that_says_much_is_told_of_in_few_messages(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told: list[int] = []
+    jobs = Jobs(lambda job: told.append(len(job.said)))
+    lines = subprocess.Popen([sys.executable, "-c", "print('line\\n' * 900)"], stdout=subprocess.PIPE, text=True)
+    job = jobs.run("show", ["show", "--formats"], [])
+    until(lambda: job.ended)
+    told.clear()
+    job.ended = None
+    jobs._listen(job, lines.stdout)
+    lines.wait()
+    until(lambda: told and told[-1] >= 900)
+    assert len(told) < 20
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no process groups")
+def test_ctrl_c_twice_leaves_no_command_behind(tmp_path):
+    il.write_csv(il.simulate_tumble(attitudes=24, gravity=9.81), tmp_path / "rec.csv")
+    words = [sys.executable, "-m", "imulab", "open", "--no-browser", "rec.csv"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        host, _, token = process.stdout.readline().strip().removeprefix("http://").partition("/?token=")
+        connection = http.client.HTTPConnection(host, timeout=30)
+        values = {"file": "rec.csv", "order": "2", "monte_carlo": "900000"}
+        body = json.dumps({"command": "tumble fit", "values": values})
+        connection.request("POST", "/api/workbench/jobs", body, {"x-imulab-token": token})
+        assert json.loads(connection.getresponse().read())["state"] == "running"
+        before = until(lambda: children(process.pid))
+        stuck = http.client.HTTPConnection(host, timeout=30)  # an upload that hangs holds the first Ctrl-C up
+        stuck.putrequest("PUT", "/api/workbench/files/slow.csv")
+        stuck.putheader("content-length", "100")
+        stuck.putheader("x-imulab-token", token)
+        stuck.endheaders(b"begin")
+        time.sleep(0.3)
+        for _ in range(3):
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.1)
+        process.wait(20)
+        stuck.close()
+        connection.close()
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in before), 5)
+
+
+def children(pid: int) -> list[str]:
+    found = Path(f"/proc/{pid}/task").glob("*/children")
+    return [each for path in found for each in path.read_text().split()]
+
+
 @pytest.mark.parametrize(("arguments", "said"), [
     (["--port", "x"], "--port 'x': expected a whole number"),
-    (["--port", "70000"], "--port 70000: expected 0 to 65535"),
+    (["--port", "70000"], "--port 70000: expected 0 (a free one) to 65535"),
     (["none.csv"], "none.csv: no such file"),
 ])  # fmt: skip
 def test_open_refuses_by_a_sentence(imulab, tmp_path, arguments, said):

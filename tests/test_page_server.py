@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("starlette", reason="the page needs imulab[live]")
 from starlette.requests import Request
-from starlette.responses import JSONResponse
+from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import Route
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from imulab.errors import OptionError
 from imulab.live.page import server
 from imulab.live.page.parts import Hub, Line, Part, to_json
-from imulab.live.page.security import inside, receive_file
+from imulab.live.page.security import Guard, inside, receive_file
 
 LIMIT = 1000
 
@@ -108,12 +108,58 @@ def test_the_address_leads_to_the_page_and_its_token_into_a_cookie(running):
     assert "HttpOnly" in cookie
     assert "SameSite=strict" in cookie
     page = running.ask("/", cookie=cookie.partition(";")[0])
+    assert running.token not in cookie
     assert page.status == 200
     assert b'<div id="session"' in page.body
     policy = page.headers["content-security-policy"]
     assert "unsafe" not in policy
     assert "default-src 'none'" in policy
     assert page.headers["x-content-type-options"] == "nosniff"
+
+
+def test_the_address_that_a_browser_is_started_with_opens_once(tmp_path, monkeypatch):
+    """Every user of the machine sees the words that a program was started with."""
+    opened: queue.Queue[str] = queue.Queue()
+    monkeypatch.setattr("webbrowser.open", opened.put)
+    part, lines = Echo(tmp_path), queue.Queue()
+    options = {"limit": LIMIT, "tell": lines.put}
+    thread = threading.Thread(target=server.serve, args=([part],), kwargs=options, daemon=True)
+    thread.start()
+    address, words = lines.get(timeout=10), opened.get(timeout=10)
+    host, _, rest = words.removeprefix("http://").partition("/")
+    assert address.partition("token=")[2] not in words
+    found = []
+    for _ in range(2):
+        connection = http.client.HTTPConnection(host, timeout=10)
+        connection.request("GET", f"/{rest}")
+        found.append(connection.getresponse().status)
+        connection.close()
+    assert found == [303, 403]
+    part.hub.stop()
+    thread.join(10)
+
+
+@pytest.mark.parametrize(("port", "host", "status"), [
+    (80, "127.0.0.1", 200), (80, "localhost", 200), (80, "127.0.0.1:80", 200), (80, "evil.example", 421),
+    (8080, "127.0.0.1", 421),
+])  # fmt: skip
+def test_the_usual_port_may_be_left_out_of_the_host(port, host, status):
+    sent: list[dict] = []
+
+    async def app(scope, receive, send):
+        await PlainTextResponse("in")(scope, receive, send)
+
+    async def receive():
+        return {"type": "http.request", "body": b""}
+
+    async def send(message):
+        sent.append(message)
+
+    headers = [(b"host", host.encode()), (b"origin", f"http://{host}".encode()), (b"x-imulab-token", b"secret")]
+    scope = {"type": "http", "method": "GET", "path": "/x", "query_string": b"", "headers": headers,
+             "server": ("127.0.0.1", port)}  # fmt: skip
+    asyncio.run(Guard(app, "secret", LIMIT)(scope, receive, send))
+    assert sent[0]["status"] == status
 
 
 @pytest.mark.parametrize("path", ["/", "/static/app.js", "/static/plotly.js", "/api/files/x", "/?token=wrong"])

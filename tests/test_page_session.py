@@ -169,6 +169,9 @@ def test_a_wrong_token_and_another_page_get_nothing(live, new_page, elsewhere):
 def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page):
     running = live(f"{UNIT},speed=5", "--follow", *FIT, "--save", "rec.csv")
     page = new_page(running.address)
+    growing = page.evaluate("fetch('/api/session/recording').then(answer => answer.json())")
+    assert growing == {"error": "the recording still grows, and there is no record yet: finish the session first"}
+    assert page.locator("#session").get_attribute("role") == "region"  # one area alone is no tab
     page.get_by_role("button", name="Finish now").click()
     page.wait_for_selector("#said .bad")
     assert "attitudes" in page.locator("#said").inner_text()

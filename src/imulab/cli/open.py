@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from imulab.cli.options import note, whole_number
+from imulab.cli.live_page import NoBrowser, PagePort, port_number
+from imulab.cli.options import note
 from imulab.errors import OptionError
 
 FOLDER = "imulab-files"
-_LAST_PORT = 65535
 _NOT_OFFERED = ("live", "open", "demo", "fleet ")
 
 
@@ -19,8 +19,8 @@ def open(  # noqa: A001 -- the name of the command
     files: Annotated[
         list[str] | None, typer.Argument(metavar="[FILE...]", help="Recordings and records to begin with.")
     ] = None,
-    port: Annotated[str, typer.Option("--port", metavar="N", help="Port on this machine; 0 takes a free one.")] = "0",
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open no browser.")] = False,
+    port: PagePort = None,
+    no_browser: NoBrowser = False,
 ) -> None:
     """Open the workbench in the browser: drop a recording, see it, calibrate it, take record, report and firmware.
 
@@ -30,9 +30,7 @@ def open(  # noqa: A001 -- the name of the command
     from imulab.cli.app import command
     from imulab.cli.common import commands_of
 
-    number = whole_number(port, "--port")
-    if not 0 <= number <= _LAST_PORT:
-        raise OptionError(f"--port {number}: expected 0 to {_LAST_PORT}")
+    number = port_number(port)
     try:
         from imulab.live.page.bench import Workbench
         from imulab.live.page.files import Files

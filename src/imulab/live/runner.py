@@ -153,4 +153,4 @@ class Runner:
             return []
         self._silent = True
         text = f"nothing has come from {self.source.name} for {_SILENT:.0f} s: is the unit on, and does it send?"
-        return [Event("warning", text, self.recorder.last)]
+        return [Event("silent", text, self.recorder.last)]

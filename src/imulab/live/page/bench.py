@@ -8,6 +8,7 @@ would run), ``jobs`` (POST runs it, DELETE cancels it). Messages to pages: ``fil
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
 import zipfile
@@ -34,6 +35,8 @@ from imulab.live.page.security import receive_file, report_response
 from imulab.procedures.options import ELEMENT, READING
 
 _WIDEST = 4000
+_LONGEST = 1 << 20
+"""Bytes of a JSON object."""
 _READING = tuple(option.name for option in (*READING, ELEMENT))
 _HERE = "/api/workbench"
 
@@ -103,7 +106,7 @@ class Workbench(Part):
 
     async def _receive(self, request: Request) -> Response:
         used = {path for job in self._jobs.jobs.values() for path in job.outputs}  # a report is one that was drawn
-        name = self._files.unused(request.path_params["name"], used | self._coming)
+        name = self._files.unused(request.path_params["name"], self._coming | used)
         self._coming.add(name)
         try:
             await receive_file(request, Path(name))
@@ -115,7 +118,7 @@ class Workbench(Part):
     async def _remove(self, request: Request) -> Response:
         name = self._files.path(request.path_params["name"])
         path = Path(name)
-        if path.parent != self._files.folder or not path.is_file():
+        if not self._files.owns(name) or not path.is_file():
             raise OptionError(f"{name}: is not in the session's folder")
         path.unlink()
         self._hub.tell(self._list_message())
@@ -158,8 +161,8 @@ class Workbench(Part):
 
     async def _curves(self, request: Request) -> Response:
         query = request.query_params
-        start, stop, width = (_number(query.get(key), key) for key in ("from", "to", "width"))
-        opening = self._openings.known(query.get("file", ""))
+        start, stop, width, number = (_number(query.get(key), key) for key in ("from", "to", "width", "opening"))
+        opening = self._openings.known(int(number or 0))
         shown = await run_in_threadpool(
             self._openings.view, opening, start, stop, int(min(max(width or 1000, 10), _WIDEST))
         )
@@ -173,17 +176,24 @@ class Workbench(Part):
             raise OptionError(f"command {quoted(given.get('command'))}: not among those offered")
         inputs = [Path(each) for field in form.fields if not field.flag for each in _listed(values.get(field.name))]
         outputs: list[str] = []
-        taken = {path for job in self._jobs.jobs.values() if job.state == "running" for path in job.outputs}
+        running = {path for job in self._jobs.jobs.values() if job.state == "running" for path in job.outputs}
+        taken = running | self._coming
 
         def output(name: str, ending: str) -> str:
             """Name what is made after the last file, and after what is done where that alone would not tell."""
             stem = inputs[-1].name.partition(".")[0] if inputs else form.path.replace(" ", "-")
             done = str(values.get("to") or form.path.split()[-1])
             told = f"{stem}-{done}{ending}" if ending in ("", *(each.suffix for each in inputs)) else f"{stem}{ending}"
-            outputs.append(self._files.new(name) if name else self._files.unused(told, taken.union(outputs)))
+            outputs.append(
+                self._files.new(name, taken.union(outputs)) if name else self._files.unused(told, taken.union(outputs))
+            )
             return outputs[-1]
 
-        return form, form.words(values, self._files.path, output), outputs
+        words = form.words(values, self._files.path, output)
+        for field in form.fields:
+            for name in _listed(values.get(field.name)) if field.shows == "MANIFEST" else ():
+                self._files.check_manifest(name)
+        return form, words, outputs
 
     async def _command(self, request: Request) -> Response:
         _, words, outputs = self._made(await _object(request))
@@ -212,19 +222,30 @@ def _job_message(job: Job) -> Message:
 
 
 def _opening_message(opening: Opening) -> Message:
-    return {"type": "opening", "file": opening.name, "reading": opening.reading, **opening.about}
+    own = {"file": opening.name, "reading": opening.reading, "opening": opening.number}
+    return {"type": "opening", **own, **opening.about}
 
 
 def _number(text: str | None, key: str) -> float | None:
+    if not text:
+        return None
     try:
-        return None if text in (None, "") else float(text)
+        found = float(text)
     except ValueError:
-        raise OptionError(f"{key} {quoted(text)}: expected a number") from None
+        found = math.nan
+    if not math.isfinite(found):
+        raise OptionError(f"{key} {quoted(text)}: expected a number")
+    return found
 
 
 async def _object(request: Request) -> dict[str, Any]:
+    text = bytearray()
+    async for piece in request.stream():
+        text += piece
+        if len(text) > _LONGEST:
+            raise OptionError(f"expected a JSON object of at most {_LONGEST >> 10} KiB")
     try:
-        found = json.loads(await request.body())
+        found = json.loads(text)
     except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):

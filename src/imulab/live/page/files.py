@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +14,13 @@ from imulab.errors import ImulabError, OptionError, quoted
 from imulab.live.page.security import inside
 from imulab.printable import has_hidden
 from imulab.records.recognition import is_json
+from imulab.toml import load_toml
 
 _LONGEST = 200
+_WINDOWS = sys.platform == "win32"
+_NO_WINDOWS_NAME = re.compile(
+    r"(?i)^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$) *(\.|$)|[<>\"|?*]|[. ]$"
+)
 _KINDS = {".html": "report", ".htm": "report", ".toml": "manifest", ".zip": "other", ".pdf": "other", ".png": "other"}
 
 
@@ -21,7 +28,8 @@ _KINDS = {".html": "report", ".htm": "report", ".toml": "manifest", ".zip": "oth
 class Entry:
     """One file: what the command line calls it, its own name, its kind, bytes, and when it was changed, s.
 
-    The kind is ``recording``, ``record``, ``report``, ``manifest``, ``folder`` or ``other``.
+    The kind is ``recording``, ``record``, ``report``, ``manifest``, ``folder`` or ``other``; `own` is whether
+    it lies in the session's folder.
     """
 
     name: str
@@ -29,6 +37,7 @@ class Entry:
     kind: str
     size: int
     modified: float
+    own: bool = False
 
 
 class Files:
@@ -82,16 +91,43 @@ class Files:
             raise OptionError(f"{quoted(name)}: not among the files of this session")
         return name
 
-    def new(self, name: str) -> str:
+    def owns(self, name: str) -> bool:
+        """Whether a file lies in the session's folder, and was not named by the command line."""
+        return name not in self._given and Path(name).parent == self.folder
+
+    def check_manifest(self, name: str) -> None:
+        """Check that a manifest in the session's folder names no file elsewhere; one of the command line may.
+
+        Raises
+        ------
+        OptionError
+            It does; the message says which.
+        """
+        if not self.owns(name):
+            return
+        try:
+            runs = load_toml(name, name, "manifest").get("run")
+        except ImulabError:  # the command says so itself
+            return
+        for run in runs if isinstance(runs, list) else ():
+            if isinstance(run, dict) and isinstance(file := run.get("file"), str):
+                try:
+                    inside(self.folder, file)
+                except OptionError as error:
+                    raise OptionError(f"{name}: {error}") from None
+
+    def new(self, name: str, taken: Collection[str] = ()) -> str:
         """Return the path of a file to be made in the session's folder.
 
         Raises
         ------
         OptionError
-            The name leads elsewhere, or the file is there already.
+            The name leads elsewhere, or the file is there already, or is in `taken`.
         """
         self.folder.mkdir(exist_ok=True)
         path = checked(self.folder, name)
+        if str(path) in taken:
+            raise OptionError(f"{name}: is being written; expected another name")
         if os.path.lexists(path):
             raise OptionError(f"{name}: is there already; expected another name")
         return str(path)
@@ -115,7 +151,7 @@ class Files:
         key = name, status.st_mtime_ns, status.st_size
         if key not in self._kinds:
             self._kinds[key] = _kind(path)
-        return Entry(name, path.name, self._kinds[key], status.st_size, status.st_mtime)
+        return Entry(name, path.name, self._kinds[key], status.st_size, status.st_mtime, self.owns(name))
 
     def end(self) -> bool:
         """Remove the folder where nothing is in it; return whether something is."""
@@ -132,9 +168,11 @@ def checked(folder: Path, name: str) -> Path:
     Raises
     ------
     OptionError
-        The name leads elsewhere, is hidden, holds control characters, or is too long.
+        The name leads elsewhere, is hidden, holds control characters, is too long, or is none on this system.
     """
     path = inside(folder, name)
+    if _WINDOWS and _NO_WINDOWS_NAME.search(name):
+        raise OptionError(f"{quoted(name)}: expected the name of a file, found one that Windows does not take")
     if not _plain(name) or name.startswith(".") or len(name.encode("utf-8")) > _LONGEST:
         raise OptionError(
             f"{quoted(name)}: expected the name of a file of at most {_LONGEST} bytes, without control characters "

@@ -29,7 +29,7 @@ class Field:
         As typed; empty for an argument. `unflag` is what turns a switch off that is neither way by default.
     kind
         ``file`` or ``files`` of the session, ``output``, ``switch``, ``either`` (on, off or neither), ``text``, or
-        ``texts``, separated by spaces.
+        ``texts``: any number of them, the option once for each.
     shows
         What the help has in the place of the value.
     help
@@ -79,8 +79,8 @@ class Form:
         Parameters
         ----------
         values
-            By the names of fields: a text, a list of texts for files, or a truth value, which says of an output that it
-            is to be written under a name to be found. Empty ones count as not given.
+            By the names of fields: a text, a list of texts for files and texts, or a truth value, which says of an
+            output that it is to be written under a name to be found. Empty ones count as not given.
         file
             Name of a file of the session to what the command line calls it.
         output
@@ -181,7 +181,7 @@ def _words(field: Field, value: Any, file: Callable[[str], str], output: Callabl
     if field.kind == "files":
         return [file(text) for text in texts]
     if field.kind == "texts":
-        return [word for text in texts for each in text.split() for word in _option(field.flag, each)]
+        return [word for text in texts for word in _option(field.flag, text.strip())]
     (text,) = texts[:1]
     if field.kind == "file":
         text = _file_or_word(field, text, file)

@@ -110,7 +110,8 @@ class GuidedPart(Part):
     def end(self) -> None:
         """End the session; what is recorded is kept."""
         self._stop.set()
-        self._thread.join(_PATIENCE)
+        if self._thread.ident is not None:
+            self._thread.join(_PATIENCE)
 
     def _drop(self, message: Message) -> None:
         number = message.get("attitude")
@@ -181,7 +182,7 @@ class GuidedPart(Part):
     def _told(self, event: Event) -> None:
         if event.kind == "again":
             self._silent = ""
-        elif event.text.startswith("nothing has come"):
+        elif event.kind == "silent":
             self._silent = event.text
         if event.kind != "state":
             self._events.append({"type": "event", **asdict(event)})
@@ -228,11 +229,12 @@ class GuidedPart(Part):
 
     def _file(self, request: Request) -> Response:
         kind = request.path_params["kind"]
+        if not self._done:
+            raise OptionError("the recording still grows, and there is no record yet: finish the session first")
+        assert self.record is not None
         if kind == "recording":
             path = self._runner.recorder.path
             return FileResponse(path, filename=Path(path).name, media_type="text/csv")
-        if self.record is None:
-            raise OptionError("there is no record yet: finish the session first")
         if kind == "report":
             return report_response(rendered(self.record))
         if kind == "record":

@@ -18,7 +18,7 @@ from typing import IO
 from imulab.errors import OptionError
 
 _LONGEST, _MOST_LINES, _LONGEST_LINE = 1 << 20, 1000, 4000
-_GRACE = 5.0
+_GRACE, _EVERY = 5.0, 0.1
 _WINDOWS = sys.platform == "win32"
 
 
@@ -67,6 +67,7 @@ class Jobs:
         self._tell = tell
         self._processes: dict[int, subprocess.Popen[str]] = {}
         self._watches: dict[int, threading.Thread] = {}
+        self._due: set[int] = set()
 
     def run(self, path: str, words: Sequence[str], outputs: Sequence[str]) -> Job:
         """Begin to run a command in the working folder.
@@ -125,7 +126,20 @@ class Jobs:
             for line in stream:
                 if len(job.said) < _MOST_LINES:
                     job.said.append(line.rstrip()[:_LONGEST_LINE])
-                    self._tell(job)
+                    self._soon(job)
+
+    def _soon(self, job: Job) -> None:
+        """Tell of a job in a moment, with what it says until then: many lines are not told one by one."""
+        if job.number not in self._due:
+            self._due.add(job.number)
+            timer = threading.Timer(_EVERY, self._tell_due, (job,))
+            timer.daemon = True
+            timer.start()
+
+    def _tell_due(self, job: Job) -> None:
+        self._due.discard(job.number)
+        if job.ended is None:
+            self._tell(job)
 
 
 def _read(stream: IO[str]) -> str:

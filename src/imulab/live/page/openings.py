@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from imulab.errors import OptionError, quoted
+from imulab.errors import OptionError
 from imulab.live.page.curves import Head, View, view
 
 _MOST = 6
@@ -29,6 +29,8 @@ class Opening:
 
     Attributes
     ----------
+    number
+        Of this session, from 1.
     name, reading, stamp
         The file, the options of reading, and its size and time of change.
     folder
@@ -37,6 +39,7 @@ class Opening:
         What is known of it: all that `contents` has yielded, in one.
     """
 
+    number: int
     name: str
     reading: dict[str, str]
     stamp: tuple[int, int]
@@ -57,7 +60,7 @@ class Openings:
 
     def __init__(self, tell: Callable[[Opening], object]) -> None:
         self._tell = tell
-        self._open: dict[str, Opening] = {}
+        self._open: dict[str, Opening] = {}  # by file and options, those looked at lately last
         self._place = Path(tempfile.mkdtemp(prefix="imulab-curves-"))
         self._number = 0
 
@@ -74,9 +77,10 @@ class Openings:
         except OSError as error:
             raise OptionError(f"{name}: cannot be read: {error.strerror}") from None
         stamp, given = (status.st_size, status.st_mtime_ns), {key: text for key, text in reading.items() if text}
-        known = self._open.pop(name, None)
-        if known is not None and (known.stamp, known.reading) == (stamp, given):
-            self._open[name] = known
+        key = json.dumps([name, given], sort_keys=True)
+        known = self._open.pop(key, None)
+        if known is not None and known.stamp == stamp:
+            self._open[key] = known
             return known
         if known is not None:
             _close(known)
@@ -85,7 +89,7 @@ class Openings:
         self._number += 1
         folder = self._place / str(self._number)
         folder.mkdir()
-        found = self._open[name] = Opening(name, given, stamp, folder)
+        found = self._open[key] = Opening(self._number, name, given, stamp, folder)
         found.process = subprocess.Popen(
             [sys.executable, "-P", "-m", "imulab.live.page.contents", name, str(folder), json.dumps(given)],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, encoding="utf-8",
@@ -93,18 +97,18 @@ class Openings:
         threading.Thread(target=self._listen, args=(found,), daemon=True).start()
         return found
 
-    def known(self, name: str) -> Opening:
-        """Return a file that is open.
+    def known(self, number: int) -> Opening:
+        """Return a file that is open, by the number of its opening.
 
         Raises
         ------
         OptionError
             It is not, or not any more.
         """
-        try:
-            return self._open[name]
-        except KeyError:
-            raise OptionError(f"{quoted(name)}: is not open; choose it again") from None
+        for found in self._open.values():
+            if found.number == number:
+                return found
+        raise OptionError("this recording is not open any more: choose it again")
 
     def view(self, opening: Opening, start: float | None, stop: float | None, width: int) -> View:
         """Return the curves of a range; errors as for `view` of `curves`."""

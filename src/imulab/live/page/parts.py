@@ -12,6 +12,7 @@ import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, is_dataclass
 from typing import Any, ClassVar
 
@@ -50,7 +51,7 @@ class Part:
         return ()
 
     def end(self) -> None:
-        """End what runs beside the server."""
+        """End what runs beside the server; it may be called again."""
 
 
 class Hub:
@@ -70,8 +71,9 @@ class Hub:
     def tell(self, message: Message, *, latest: bool = False) -> None:
         """Tell every page, from any thread; with `latest`, in place of what still waits of the same type."""
         text = to_json(message)
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._put, str(message["type"]), text, latest)
+        if self._loop is not None:
+            with suppress(RuntimeError):  # the server has ended
+                self._loop.call_soon_threadsafe(self._put, str(message["type"]), text, latest)
 
     def begin(self, loop: asyncio.AbstractEventLoop) -> None:
         """Begin to pass messages on."""

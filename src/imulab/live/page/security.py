@@ -21,6 +21,7 @@ from imulab.errors import OptionError, quoted
 TOKEN_HEADER = "x-imulab-token"
 LOCAL = "127.0.0.1"
 _NAMES = (LOCAL, "localhost")
+_HTTP_PORT = 80
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -52,13 +53,18 @@ class Guard:
     app
         What is guarded.
     token
-        Given once in the address of ``/``, then in a cookie; programs give it in the header ``X-Imulab-Token``.
+        Given in the address of ``/``, which a cookie of its own then stands for; programs give it in the header
+        ``X-Imulab-Token``.
     limit
         Bytes that one request may bring.
+    once
+        Given in the address in place of the token, a single time: other users of the machine see the address that a
+        browser is started with.
     """
 
-    def __init__(self, app: ASGIApp, token: str, limit: int) -> None:
-        self._app, self._token, self._limit = app, token, limit
+    def __init__(self, app: ASGIApp, token: str, limit: int, once: str = "") -> None:
+        self._app, self._token, self._limit, self._once = app, token, limit, once
+        self._key = new_token()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or hand it on."""
@@ -87,6 +93,8 @@ class Guard:
         """Return the answer to a request that goes no further; None for the others."""
         headers, port = Headers(scope=scope), scope["server"][1]
         here = [f"{name}:{port}" for name in _NAMES]
+        if port == _HTTP_PORT:  # which browsers leave out
+            here += _NAMES
         host = headers.get("host", "")
         if host not in here:
             return PlainTextResponse(_STRANGER, 421)
@@ -100,16 +108,20 @@ class Guard:
                 return PlainTextResponse(f"Too large: at most {self._limit >> 20} MiB at once.", 413)
         cookie = f"imulab_{port}"
         given = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-        if scope["type"] == "http" and scope["path"] == "/" and self._is_token(given):
+        if scope["type"] == "http" and scope["path"] == "/" and self._opens(given):
             answer = RedirectResponse("/", 303)
-            answer.set_cookie(cookie, self._token, httponly=True, samesite="strict", path="/")
+            answer.set_cookie(cookie, self._key, httponly=True, samesite="strict", path="/")
             return answer
-        if self._is_token(headers.get(TOKEN_HEADER, "")) or self._is_token(_cookie(headers, cookie)):
+        if _same(headers.get(TOKEN_HEADER, ""), self._token) or _same(_cookie(headers, cookie), self._key):
             return None
         return PlainTextResponse(_STRANGER, 403)
 
-    def _is_token(self, text: str) -> bool:
-        return secrets.compare_digest(text.encode("utf-8"), self._token.encode("utf-8"))
+    def _opens(self, given: str) -> bool:
+        """Whether what an address holds lets its browser in."""
+        if self._once and _same(given, self._once):
+            self._once = ""
+            return True
+        return _same(given, self._token)
 
     def _counted(self, receive: Receive) -> Receive:
         """Return `receive` for a body that ends with an error where it is longer than is taken."""
@@ -125,6 +137,10 @@ class Guard:
             return message
 
         return counted
+
+
+def _same(one: str, other: str) -> bool:
+    return secrets.compare_digest(one.encode("utf-8"), other.encode("utf-8"))
 
 
 def _cookie(headers: Headers, name: str) -> str:

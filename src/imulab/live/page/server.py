@@ -39,8 +39,8 @@ _GRACE = 2
 
 
 def application(token: str, parts: Sequence[Part], *, limit: int = UPLOAD_LIMIT) -> Starlette:
-    """Return the application of a page with these parts; its `state` has `hub` and `token`."""
-    hub = Hub()
+    """Return the application of a page with these parts; its `state` has `hub`, `token` and `once`."""
+    hub, once = Hub(), new_token()
     known = {kind: take for part in parts for kind, take in part.hears.items()}
     hello = {"type": "hello", "areas": [part.name for part in parts], "version": VERSION}
 
@@ -82,10 +82,10 @@ def application(token: str, parts: Sequence[Part], *, limit: int = UPLOAD_LIMIT)
     app = Starlette(
         routes=routes,
         lifespan=alive,
-        middleware=[Middleware(Guard, token=token, limit=limit)],
+        middleware=[Middleware(Guard, token=token, limit=limit, once=once)],
         exception_handlers={ImulabError: _refused},
     )
-    app.state.hub, app.state.token = hub, token
+    app.state.hub, app.state.token, app.state.once = hub, token, once
     return app
 
 
@@ -134,16 +134,18 @@ def serve(
         server.should_exit = True
 
     app.state.hub.stop = stop
-    address = f"http://{LOCAL}:{listening.getsockname()[1]}/?token={app.state.token}"
+    address = f"http://{LOCAL}:{listening.getsockname()[1]}/?token="
     try:
         with _hung_up(stop):
-            tell(address)
+            tell(address + app.state.token)
             sys.stdout.flush()
             if browser:
-                _open(address)
+                _open(address + app.state.once)
             server.run(sockets=[listening])
     finally:
         listening.close()
+        for part in parts:  # a second Ctrl-C ends the server before it has done so
+            part.end()
 
 
 @contextmanager

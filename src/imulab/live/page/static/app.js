@@ -1,7 +1,7 @@
 // The page: its socket, its areas and what is said above them.
 //
-// An area is a module with `title`, `mount(place, page)`, which is called once, and `hear(message)`, which gets every
-// message of the socket. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
+// An area is a module with `title`, `mount(place, page)`, which is called once, `hear(message)`, which gets every
+// message of the socket, and `kept()`, which says what stays when the program has ended. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
 // (kind: "note" or "bad"; no text takes it away).
 
 import { h, put, show } from "./dom.js";
@@ -10,7 +10,7 @@ import * as workbench from "./workbench.js";
 
 const AREAS = { session, workbench };
 const AGAIN = 1000;
-const GONE = "The program has ended, or cannot be reached any more. What it recorded is kept: what it said last stands in its terminal.";
+const GONE = "The program has ended, or cannot be reached any more.";
 const tabs = document.getElementById("tabs");
 const mounted = {};
 let socket = null;
@@ -26,7 +26,7 @@ const page = {
   say,
   send(message) {
     if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
-    else say(GONE, "bad");
+    else say(gone(), "bad");
   },
   // Says that the program ends by itself now, and why: that it is gone is then no news.
   end(text, kind) {
@@ -34,6 +34,9 @@ const page = {
     say(text, kind);
   },
 };
+
+// That it has gone, and what each area keeps.
+const gone = () => [GONE, ...Object.keys(mounted).map(name => AREAS[name].kept())].join(" ");
 
 function choose(name) {
   for (const [each, tab] of Object.entries(mounted)) {
@@ -62,7 +65,14 @@ function begin(names) {
     tabs.append(mounted[name]);
     AREAS[name].mount(document.getElementById(name), page);
   }
-  show(tabs, Object.keys(mounted).length > 1);
+  const several = Object.keys(mounted).length > 1;
+  show(tabs, several);
+  for (const [name, tab] of Object.entries(mounted)) {
+    const place = document.getElementById(name);
+    place.setAttribute("role", several ? "tabpanel" : "region");
+    if (several) place.setAttribute("aria-labelledby", tab.id);
+    else place.setAttribute("aria-label", AREAS[name].title);
+  }
   follow();
 }
 
@@ -88,7 +98,7 @@ function connect() {
   socket.onclose = () => {
     document.documentElement.dataset.connected = "no";
     if (ended) return;
-    say(GONE, "bad");
+    say(gone(), "bad");
     setTimeout(connect, AGAIN);
   };
   socket.onopen = () => { document.documentElement.dataset.connected = "yes"; };

@@ -66,6 +66,8 @@ export function hear(message) {
   else if (message.type === "failed") failed(message);
 }
 
+export const kept = () => "The recording is kept: the terminal says how the session ended, and how to go on.";
+
 const duration = seconds => (seconds < 60 ? "" : `${Math.floor(seconds / 60)} min `) + `${Math.floor(seconds % 60)} s`;
 const sentence = text => text.charAt(0).toUpperCase() + text.slice(1) + (/[.?!]$/.test(text) ? "" : ".");
 

@@ -2,7 +2,7 @@
 
 import { h } from "./dom.js";
 
-const TONES = { accepted: [880, 0.15], knocked: [220, 0.4], enough: [1320, 0.5], warning: [220, 0.4] };
+const TONES = { accepted: [880, 0.15], knocked: [220, 0.4], enough: [1320, 0.5], warning: [220, 0.4], silent: [220, 0.4] };
 let context = null;
 
 export function soundButton() {

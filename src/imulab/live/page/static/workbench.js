@@ -50,6 +50,8 @@ export function mount(place, given) {
 
 const fail = error => page.say(error.message, "bad");
 
+export const kept = () => `${folder && files.some(each => each.own) ? `What was dropped and made is in the folder ${folder}. ` : ""}Start imulab again, and open the address that it prints.`;
+
 export function hear(message) {
   if (message.type === "files") listed(message);
   else if (message.type === "opening" && message.file === chosen?.name && JSON.stringify(message.reading) === JSON.stringify(reading)) opened(message);
@@ -111,7 +113,7 @@ function choose(name) {
 const heading = () => h("div", { class: "heading" }, h("h2", {}, chosen.short),
   h("span", { class: "actions" },
     h("a", { class: "button", href: address(chosen.kind === "folder" ? "zip" : "files", chosen.name), download: "" }, chosen.kind === "folder" ? "Save as zip" : "Save"),
-    chosen.name.startsWith(folder) && chosen.kind !== "folder" ? h("button", { type: "button", onclick: remove }, "Remove") : null));
+    chosen.own && chosen.kind !== "folder" ? h("button", { type: "button", onclick: remove }, "Remove") : null));
 
 function remove() {
   if (confirm(`Remove ${chosen.short} from the folder ${folder}?`)) {

@@ -110,6 +110,7 @@ function field(of, files, value, changed) {
     };
   }
   if (of.kind === "files") return several(of, id, title, options, value, changed, help);
+  if (of.kind === "texts") return texts(of, common, title, value, changed, help);
   if (of.kind === "file" && !of.other) {
     const select = h("select", common, options(value, of.required ? "choose a file" : "none"));
     return built(select, () => select.value, { refresh() { select.replaceChildren(...options(select.value, of.required ? "choose a file" : "none").filter(Boolean)); } });
@@ -126,6 +127,23 @@ function field(of, files, value, changed) {
     placeholder: of.default || (/^(VALUE|NUMBER|QUANTITY)$/.test(of.shows) ? "" : of.shows),
   });
   return built(h("span", { class: "input" }, input, list), () => input.value.trim());
+}
+
+// Texts, each of which becomes an option of its own; an empty one follows the last.
+function texts(of, common, title, value, changed, help) {
+  const rows = h("span", { class: "several" });
+  const add = text => rows.append(h("input", {
+    ...common, id: rows.children.length ? null : common.id, "aria-label": rows.children.length ? `another of ${title}` : null,
+    type: "text", spellcheck: "false", autocomplete: "off", value: text, placeholder: of.shows, oninput: () => { fill(); changed(); },
+  }));
+  const fill = () => { if (!rows.lastChild || rows.lastChild.value) add(null); };
+  for (const each of value || []) add(each);
+  fill();
+  return {
+    of,
+    read: () => [...rows.children].map(each => each.value.trim()).filter(Boolean),
+    element: h("div", { class: "field texts" }, h("label", { for: common.id }, title), rows, help),
+  };
 }
 
 // Files in the order in which the command gets them.

@@ -80,7 +80,7 @@ export function plots(place) {
   async function fetch() {
     asked?.abort();
     const own = asked = new AbortController();
-    const query = new URLSearchParams({ file: known.file, width: Math.round(area.clientWidth || 800) });
+    const query = new URLSearchParams({ opening: known.opening, width: Math.round(area.clientWidth || 800) });
     if (range[0] !== null) { query.set("from", range[0]); query.set("to", range[1]); }
     const began = performance.now();
     try {
@@ -245,7 +245,7 @@ export function plots(place) {
 
   return {
     open(message) {
-      const other = known?.file !== message.file || JSON.stringify(known.reading) !== JSON.stringify(message.reading);
+      const other = known?.opening !== message.opening;
       const more = other || known.head?.rows !== message.head?.rows;
       known = message;
       if (other) { range = [null, null]; shown = null; area.replaceChildren(); put(status, ""); }
