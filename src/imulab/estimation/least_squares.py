@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.ranked import median, medians
+from imulab.estimation.ranked import MAD_TO_SIGMA, median, medians
 from imulab.recording import Array
 
 Model = Callable[[Array], tuple[Array, Array]]
@@ -277,7 +277,7 @@ def robust_scale(standardised: Array, size: int) -> Array:
     As many residuals as there are parameters are near zero by construction: the median is that of the others.
     """
     largest = np.sort(np.abs(standardised), axis=1)[:, min(size, standardised.shape[1] - 1) :]
-    scale: Array = 1.4826 * medians(largest)
+    scale: Array = MAD_TO_SIGMA * medians(largest)
     return scale
 
 

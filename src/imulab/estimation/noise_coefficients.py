@@ -17,13 +17,12 @@ from imulab.estimation.noise.choice import average
 from imulab.estimation.noise.cosine import frequencies
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, letters
 from imulab.estimation.noise.use import bias_square
-from imulab.estimation.ranked import distinct
+from imulab.estimation.ranked import NORMAL_95, distinct
 from imulab.recording import Array
 
 COEFFICIENTS = ("angle_random_walk", "bias_instability", "rate_random_walk", "quantisation")
 _UNFIT = 0.01
 """Probability of the test of fit below which the model is not that of the record."""
-_NORMAL = 1.96
 _EDGE, _SHARE = 1.5, 0.003
 """Of the shortest time constant, and of the record: what is as fast is a filter, where the band has no level end."""
 _LEVELS = 0.01
@@ -151,7 +150,7 @@ def _read(
 def _widened(found: Coefficient, relative: float) -> Coefficient:
     """A coefficient with a further relative standard uncertainty."""
     value, more = found.value, relative * found.value
-    sides = [math.hypot(end - value, _NORMAL * more) for end in found.interval]
+    sides = [math.hypot(end - value, NORMAL_95 * more) for end in found.interval]
     return _coefficient(value, value - sides[0], value + sides[1])
 
 
@@ -162,7 +161,7 @@ def _level(found: Analysis) -> Coefficient:
     top = np.where(f > highest / 4, found.bins.freedom, 0.0)
     value = math.sqrt(float((top * found.bins.power).sum() / top.sum()) * found.interval)
     u = value * math.hypot(_LEVELS, math.sqrt(1 / (2 * float(top.sum()))))
-    return Coefficient(value, u, (value - _NORMAL * u, value + _NORMAL * u))
+    return Coefficient(value, u, (value - NORMAL_95 * u, value + NORMAL_95 * u))
 
 
 def _markov(found: Analysis) -> str:
@@ -172,7 +171,7 @@ def _markov(found: Analysis) -> str:
 
 
 def _coefficient(value: float, low: float, high: float) -> Coefficient:
-    return Coefficient(value, max(high - value, value - low) / _NORMAL, (low, high))
+    return Coefficient(value, max(high - value, value - low) / NORMAL_95, (low, high))
 
 
 def _none(reason: str) -> Coefficient:

@@ -1,4 +1,4 @@
-"""Medians, quantiles and distinct values.
+"""Medians, quantiles, distinct values, root mean squares.
 
 NumPy's own load its package for masked arrays, which takes 0.03 s of processor time, a tenth of a short command.
 """
@@ -8,9 +8,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from imulab.recording import Array
+
+NORMAL_95 = 1.96
+"""Standard deviations of a normal distribution from its mean to the ends of its 95 %."""
+MAD_TO_SIGMA = 1.4826
+"""Median absolute deviation to the standard deviation of a normal distribution, as the literature rounds it."""
 
 
 def median(values: NDArray[Any]) -> float:
@@ -63,3 +68,14 @@ def distinct(values: NDArray[Any]) -> NDArray[Any]:
     """
     ordered = np.sort(values, axis=None)
     return np.asarray(ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]])
+
+
+def rms(values: ArrayLike) -> float:
+    """Return the root mean square of values.
+
+    Examples
+    --------
+    >>> rms([3.0, -4.0])
+    3.5355339059327378
+    """
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -7,14 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from imulab.estimation.ranked import median
+from imulab.estimation.ranked import MAD_TO_SIGMA, median
 from imulab.recording import Array
 
 _BLOCKS, _SMALLEST = 256, 16
 _LIMITS = {4: 5.5, 8: 5.8, 16: 7.0}
 """Blocks on each side of a step to how many times the usual difference it must be: white noise, 1/f noise, random walk
 and sums of them reach one of these in 4 of 1000 recordings at most."""
-_TO_SIGMA = 1.4826
 _WHITE = 5.0
 _REACHES = (8, 16, 32, 64)
 """Blocks on each side of a step over which it is held against smooth drifts."""
@@ -54,7 +53,7 @@ def find_step(samples: Array) -> Step | None:
         change = (total[place + width] - 2 * total[place] + total[place - width]) / width
         index = int(np.argmax(np.abs(change)))
         others = np.abs(np.delete(change, np.s_[max(0, index - 2 * width) : index + 2 * width + 1]))
-        least = max(limit * _TO_SIGMA * median(others), _WHITE * white / np.sqrt(width))
+        least = max(limit * MAD_TO_SIGMA * median(others), _WHITE * white / np.sqrt(width))
         if least > 0 and abs(change[index]) > best * least:
             best = abs(change[index]) / least
             found = Step(float(change[index]), int(place[index]) * length, 4 * length)

@@ -17,7 +17,7 @@ from imulab.fleet.work import Summary
 from imulab.recording import Array
 from imulab.records.calibration import Parameter
 
-_MAD_TO_SIGMA = 1.482602218505602
+_MAD_TO_SIGMA = 1.482602218505602  # unrounded, as these numbers are shown in full
 _MEAN_TO_SIGMA = 1.2533141373155001
 _FEWEST_FOR_OUTLIERS = 8
 _SIZES = (8, 10, 12, 15, 20, 30, 50, 100, 300, 1000, 10000)

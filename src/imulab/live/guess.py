@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from imulab.columns import triad
+from imulab.readers.text import is_number
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY
 
@@ -47,8 +48,8 @@ def guess_layout(lines: list[str], seconds: float) -> Guess | None:
     rows = [split(line) for line in lines]
     prefix = _prefix(rows)
     rows = [row[1:] for row in rows if row[0] == prefix] if prefix else rows
-    titles = next((row for row in rows if not any(map(_is_number, row))), None)
-    numbers = [row for row in rows if all(map(_is_number, row))]
+    titles = next((row for row in rows if not any(map(is_number, row))), None)
+    numbers = [row for row in rows if all(map(is_number, row))]
     width = max(map(len, numbers), default=0)
     table = np.array([list(map(float, row)) for row in numbers if len(row) == width])
     if len(table) < _FEWEST or width < 3:
@@ -124,13 +125,5 @@ def _triad(stem: str, names: list[str | int], start: int, unit: str) -> list[str
 def _prefix(rows: list[list[str]]) -> str:
     """Return the first field that most lines share where it is no number."""
     first = [row[0] for row in rows if len(row) > 1]
-    pairs = [one for one, other in pairwise(first) if one == other and not _is_number(one)]
+    pairs = [one for one, other in pairwise(first) if one == other and not is_number(one)]
     return max(set(pairs), key=pairs.count) if len(pairs) > len(first) / 2 else ""
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -56,6 +56,20 @@ class Option:
         return "--" + self.name.replace("_", "-")
 
 
+def names_of_columns(text: str, option: str) -> list[str]:
+    """Return ``gyro_x,gyro_y`` as names.
+
+    Raises
+    ------
+    OptionError
+        It is no such list.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if not all(names) or len(set(names)) < len(names):
+        raise OptionError(f"{option} {text!r}: expected names of columns, each once, such as gyro_x,gyro_y")
+    return names
+
+
 def text_option(name: str, help: str, **more: Any) -> Option:  # noqa: A002
     """Return an option that stays a text."""
     return Option(name, help, lambda text, _: text, **more)

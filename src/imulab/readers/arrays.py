@@ -94,6 +94,11 @@ def sliced(
     return rows, lambda array, start, stop: array[start:stop, number]
 
 
+def floats_of_rows(rows: Callable[[Any, int, int], Any], source: Any, where: str, start: int, stop: int) -> Array:
+    """Return rows `start` to `stop` of what a file holds; `rows` cuts them out, errors as for `to_floats`."""
+    return to_floats(rows(source, start, stop), where)
+
+
 def to_floats(values: Any, where: str) -> Array:
     """Return an array as float64.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from imulab.errors import ReadError
-from imulab.readers.arrays import origins, recordings, sliced, to_floats
+from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.formats import library
 from imulab.readers.layout import Layout
 from imulab.readers.unpacking import Budget
@@ -58,7 +58,7 @@ def _recordings(h5py: Any, file: Any, name: str, layout: Layout | None) -> Itera
         counted.add(dataset.id)
         lengths[column], rows = sliced(dataset.shape or (), number, "MATLAB_class" in dataset.attrs, where)
         source = dataset if member is None else dataset.fields(member)
-        take[column] = partial(_floats, rows, source, where)
+        take[column] = partial(floats_of_rows, rows, source, where)
     yield from recordings(take, lengths, layout, name)
 
 
@@ -71,10 +71,6 @@ def _unpacked(dataset: Any) -> int:
     """Return the bytes that a dataset has in memory, or one of its chunks if that is more."""
     chunk = prod(dataset.chunks) * dataset.dtype.itemsize if dataset.chunks else 0
     return max(int(dataset.nbytes), chunk)
-
-
-def _floats(rows: Callable[[Any, int, int], Any], source: Any, where: str, start: int, stop: int) -> Array:
-    return to_floats(rows(source, start, stop), where)
 
 
 def _dataset(h5py: Any, file: Any, variable: str) -> tuple[Any, str | None]:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from imulab.errors import ReadError
-from imulab.readers.arrays import origins, recordings, sliced, to_floats
+from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.layout import Layout
 from imulab.readers.unpacking import Budget, unpack
 from imulab.recording import Array, Recording
@@ -81,14 +81,8 @@ def blocks(path: Path, name: str, layout: Layout | None) -> Iterator[Recording]:
         where = f"{name}: {layout.name} takes {column} from {path_there!r}"
         array = _numbers(variables, path_there, where)
         lengths[column], rows = sliced(array.shape, number, False, where)
-        take[column] = partial(_floats, rows, array, where)
+        take[column] = partial(floats_of_rows, rows, array, where)
     yield from recordings(take, lengths, layout, name)
-
-
-def _floats(
-    rows: Callable[[np.ndarray, int, int], np.ndarray], array: np.ndarray, where: str, start: int, stop: int
-) -> Array:
-    return to_floats(rows(array, start, stop), where)
 
 
 def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarray:

@@ -172,7 +172,7 @@ class TextFile:
             raise ReadError(f"{self._name}: expected a recording, found JSON (a calibration record?)")
         if line.startswith("FMT,"):
             raise ReadError(f"{self._name}: an ArduPilot log as text; expected the binary log (.bin) it was made from")
-        if all(_is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
+        if all(is_number(field) for field in line.replace(",", " ").replace(";", " ").split()):
             raise ReadError(
                 f"{self._name}: line {self._lines.before}: expected titles such as 'time [s],accel_x [m/s^2]', "
                 "found numbers; describe a foreign file with --layout FILE.toml (imulab show --formats has an example)"
@@ -378,7 +378,8 @@ def is_native(line: str) -> bool:
     return all(_TITLE.fullmatch(title.strip().strip('"')) for title in line.lstrip("\ufeff").split(","))
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Return whether a text is one number, as Python reads it."""
     try:
         float(text)
     except ValueError:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.recording import Array
 from imulab.report.elements import BAD
 
@@ -50,7 +51,7 @@ def bulk(values: Array, usual: NDArray[np.bool_] | None = None, room: float = 0.
         return None
     if usual is None:
         distance = np.abs(values - np.median(values[finite]))
-        usual = distance <= _FAR * 1.4826 * float(np.median(distance[finite]))
+        usual = distance <= _FAR * MAD_TO_SIGMA * float(np.median(distance[finite]))
         if np.count_nonzero(finite & ~usual) > _MOST_OUT * len(values):
             return None
     inside = values[finite & usual]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from imulab.estimation.noise.likelihood import Flags, score, with_a_little
 from imulab.estimation.noise.terms import LINEAR, SIGMA, TIME, Bins
+from imulab.estimation.ranked import NORMAL_95
 from imulab.recording import Array
 
 _LEVEL = 3.84
@@ -48,7 +49,7 @@ def profile(
     spread = np.sqrt(best.covariance[row, parameter, parameter])
     start[absent, parameter[absent]], spread[absent] = ends.just_visible(best.values[row[absent]], absent), _FIRST
     found = np.full((2, *values.shape), np.nan)
-    found[(side > 0).astype(int), row, parameter] = ends.find(start, np.clip(1.96 * spread, 1e-6, _FIRST))
+    found[(side > 0).astype(int), row, parameter] = ends.find(start, np.clip(NORMAL_95 * spread, 1e-6, _FIRST))
     return found[0], found[1]
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imulab.errors import DataError
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.centrifuge.cells import COLUMNS, CONSTANT, Cells, TooSlowError, compress
 from imulab.procedures.centrifuge.channels import Channels
 from imulab.procedures.centrifuge.manifest import Manifest, Run
@@ -110,7 +111,7 @@ def _step(cells: Cells, names: tuple[str, ...]) -> str | None:
     slope = time @ means / max(float(time @ time), 1e-300)
     flat = means - time[:, None] * slope
     left = np.abs(flat - np.median(flat, axis=0))
-    steps = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(flat, axis=0)), axis=0) if len(flat) > 3 else 0.0
+    steps = MAD_TO_SIGMA / np.sqrt(2) * np.median(np.abs(np.diff(flat, axis=0)), axis=0) if len(flat) > 3 else 0.0
     limit = np.maximum(np.maximum(_STEP_SIGMA * within, _STEP_STEPS * steps), _STEP)
     if (left > limit).any():
         cell, channel = np.unravel_index(int(np.argmax(left / limit)), left.shape)

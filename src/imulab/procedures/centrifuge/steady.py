@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.centrifuge.cells import Cells
 from imulab.procedures.centrifuge.regress import LINE, Complex, refine, scatter, solve
 from imulab.procedures.centrifuge.spectra import FAINT, PEAK, SEARCH, even_series, in_degrees, search_line
@@ -79,7 +80,7 @@ def _steady_encoder(cells: Cells, place: str) -> tuple[int, int]:
             f"{place}: column table_angle turns at {in_degrees(found)}, expected table_rate "
             f"{in_degrees(cells.table_rate)}{sense}"
         )
-    spread = 1.4826 * float(np.median(np.abs(rate - usual)))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(rate - usual)))
     limit = max(_RATE_CHANGE * abs(cells.table_rate), 6 * spread)
     good = np.abs(rate - usual) <= limit
     runs = good[:-2] & good[1:-1] & good[2:] if count >= 5 else good

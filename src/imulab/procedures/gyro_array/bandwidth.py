@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
 from imulab.procedures.gyro_array.model import Elements, array_calibration
 from imulab.recording import Array
@@ -15,7 +16,6 @@ from imulab.records.calibration import Calibration
 _PROBE_SAMPLES = 16_384
 _SEGMENT = 256
 _HALF_POWER = math.sqrt(0.5)
-_TO_SIGMA = 1.4826
 _FROZEN, _UNUSUAL = 0.5, 20.0  # s; times as long as usual
 _FOLLOWED = 0.95
 _FEWEST_PAIRS = 4
@@ -91,7 +91,7 @@ def _noise(step: Array) -> Array:
     found = np.ones(step.shape[1])
     for a in range(step.shape[1]):
         sizes = [np.median(np.abs(column[np.isfinite(column)])) for column in step[:, a].T if np.isfinite(column).any()]
-        size = _TO_SIGMA * float(np.median(sizes)) / math.sqrt(2) if sizes else 0.0
+        size = MAD_TO_SIGMA * float(np.median(sizes)) / math.sqrt(2) if sizes else 0.0
         found[a] = size if size > 0 else 1.0
     return found
 

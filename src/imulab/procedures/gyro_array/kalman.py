@@ -10,13 +10,13 @@ import math
 
 import numpy as np
 
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.recording import Array
 
 RATE_WALK = math.radians(1.4)
 """Default process noise, rad/s/sqrt(s): follows 12.5 deg/s at 0.1 Hz, sampled at 50 Hz, without a visible lag."""
 _BIAS_WALK = 0.004
 _LOWEST = 0.05
-_TO_SIGMA = 1.4826
 
 
 def steady_gain(white: Array, walk: Array, rate_walk: float, step: float) -> Array:
@@ -68,7 +68,7 @@ def noise_about_mean(readings: Array) -> Array:
         residual = rows - rows.mean(axis=1, keepdims=True)
         # Successive differences: a scale factor that differs shows in motion, but hardly from sample to sample.
         # The median of their size, so that spikes do not count.
-        m = (_TO_SIGMA * np.median(np.abs(np.diff(residual, axis=0)), axis=0)) ** 2 / 2
+        m = (MAD_TO_SIGMA * np.median(np.abs(np.diff(residual, axis=0)), axis=0)) ** 2 / 2
         variance = n / (n - 2) * (m - m.sum() / (n * (n - 1)))
         if variance.mean() > 0:
             found[a] = np.sqrt(np.maximum(variance, _LOWEST * variance.mean()))

@@ -19,6 +19,7 @@ from imulab.estimation.noise.likelihood import fit, time_limits
 from imulab.estimation.noise.spectrum import Spectrum
 from imulab.estimation.noise.terms import NAMES, prepare
 from imulab.estimation.noise.use import edge_as_white
+from imulab.estimation.ranked import NORMAL_95
 from imulab.procedures.inputs import Data, Reading, as_record, as_recording
 from imulab.procedures.noise.engineering import label
 from imulab.procedures.noise.fit import fit_recordings
@@ -33,7 +34,6 @@ from imulab.verdict import Note
 
 FALSE_ALARM, TOLERANCE = "5 %", "1 %"
 _SAME_RATE = 0.01
-_NORMAL = 1.96
 _HALF, _CERTAIN = 0.5, 0.05
 
 
@@ -49,7 +49,7 @@ class TermChange:
     @property
     def score(self) -> float:
         """In standard uncertainties of the logarithm."""
-        return abs(math.log(self.ratio)) / (math.log(self.high / self.low) / 2 / _NORMAL)
+        return abs(math.log(self.ratio)) / (math.log(self.high / self.low) / 2 / NORMAL_95)
 
 
 @dataclass(frozen=True)
@@ -313,5 +313,5 @@ def _changes(sets: Sequence[Sequence[Spectrum]], column: Column) -> tuple[TermCh
     for k, term in enumerate(NAMES):
         if before[k] > 0 and after[k] > 0:
             ratio, u = float(after[k] / before[k]), float(np.sqrt(covariance[k, k] + other[k, k]))
-            changes.append(TermChange(term, ratio, ratio * math.exp(-_NORMAL * u), ratio * math.exp(_NORMAL * u)))
+            changes.append(TermChange(term, ratio, ratio * math.exp(-NORMAL_95 * u), ratio * math.exp(NORMAL_95 * u)))
     return tuple(sorted(changes, key=lambda each: -each.score))

@@ -14,6 +14,7 @@ from imulab.estimation.noise.moments import allan_of_bins
 from imulab.estimation.noise.rest import Rest
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, allan_variance, letters, terms
 from imulab.estimation.noise.use import bias_square, edge_as_white, letters_inside, walk_square, white_square
+from imulab.estimation.ranked import NORMAL_95
 from imulab.procedures.noise.findings import findings
 from imulab.recording import Array, Source
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from imulab.procedures.noise.fit import ColumnModel
 
 _DIGITS = 7
-_TAILS, _NORMAL = (0.025, 0.975), 1.96
+_TAILS = (0.025, 0.975)
 _SLOW = ("flicker", "walk")
 """Terms that have a limit where the chosen model has not got them."""
 _PART = 10.0
@@ -121,7 +122,9 @@ def _parameters(
         for drift in column.drifts:
             if drift.covariate == "time" and (drift.found.follows or drift.taken):
                 b, u = drift.slope, drift.standard_uncertainty
-                found[f"{name}_ramp"] = Parameter(b, u, unit_of("ramp", unit), interval_95=(b - 1.96 * u, b + 1.96 * u))
+                found[f"{name}_ramp"] = Parameter(
+                    b, u, unit_of("ramp", unit), interval_95=(b - NORMAL_95 * u, b + NORMAL_95 * u)
+                )
                 names.append(f"{name}_ramp")
                 blocks.append(np.array([[u**2]]))
     return found, names, blocks
@@ -135,7 +138,7 @@ def _intervals(analysis: Analysis, more: Flags, values: Array, covariance: Array
     if values[TIME[0]] == analysis.values[TIME[1]]:
         for ends in (low, high):
             ends[[SIGMA[0], TIME[0]]] = ends[[SIGMA[1], TIME[1]]]
-    reach = np.exp(_NORMAL * np.sqrt(covariance[0, 0]))
+    reach = np.exp(NORMAL_95 * np.sqrt(covariance[0, 0]))
     low[0], high[0] = values[0] / reach, values[0] * reach
     return low, high
 

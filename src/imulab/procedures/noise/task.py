@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import OptionError
 from imulab.procedures.noise.choices import COVARIATES, HORIZON, STEPS, check_terms
-from imulab.procedures.options import ELEMENT, READING, Option, choice, measure, part_of, read_options
+from imulab.procedures.options import ELEMENT, READING, Option, choice, measure, names_of_columns, part_of, read_options
 from imulab.procedures.procedure import Files, Task, source_of
 
 if TYPE_CHECKING:
@@ -23,20 +22,6 @@ def _fit(
     sources = (source for name in files if (source := source_of(access, name)) is not None)
     fit = {name: values[name] for name in ("terms", "horizon", "band", "regress", "columns", "steps")}
     return fit_recordings(recordings, sources=sources, **fit).calibration
-
-
-def names_of_columns(text: str, option: str) -> list[str]:
-    """Return ``gyro_x,gyro_y`` as names.
-
-    Raises
-    ------
-    OptionError
-        It is no such list.
-    """
-    names = [name.strip() for name in text.split(",")]
-    if not all(names) or len(set(names)) < len(names):
-        raise OptionError(f"{option} {text!r}: expected names of columns, each once, such as gyro_x,gyro_y")
-    return names
 
 
 OPTIONS = (

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.ranked import median
+from imulab.estimation.ranked import median, rms
 from imulab.procedures.tumble.engineering import micro_g, small_g
 from imulab.procedures.tumble.mag.figures import mag_facts, mag_figures, mag_headline
 from imulab.procedures.tumble.model import AXES
@@ -41,7 +41,7 @@ def exhibits(record: Calibration) -> Exhibits:
     facts = [
         ("attitudes", str(len(good))),
         ("order", str(model_of(record).order)),
-        (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", small_g(_rms(used))),
+        (f"rms, {len(used)} of {len(good)}" if bad else "rms of |f| − g", small_g(rms(used))),
         ("leave-one-out", small_g(left_out.value) if left_out else "not computed"),
         ("worst u(scale factor)", f"{plain_number(worst, 2)} ppm" if worst is not None else "not stated"),
         ("condition number", plain_number(fit.condition_number, 3)),
@@ -70,7 +70,7 @@ def exhibits(record: Calibration) -> Exhibits:
         aside += f"; {mag_headline(record)}"
     return Exhibits(
         headline=f"After calibration the specific force of {len(used)} attitudes has magnitude g within "
-        f"{small_g(_rms(used))} rms (before: {small_g(_rms(data.residual_before))}){aside}.",
+        f"{small_g(rms(used))} rms (before: {small_g(rms(data.residual_before))}){aside}.",
         facts=facts,
         items=items,
     )
@@ -85,10 +85,6 @@ def gyro_headline(record: Calibration) -> str:
 
 def _held_back(record: Calibration) -> str:
     return "set aside" if fit_of(record).set_aside else "down-weighted"
-
-
-def _rms(values: list[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _worst_scale_uncertainty(record: Calibration) -> float | None:
@@ -113,7 +109,7 @@ def _residuals(record: Calibration) -> Figure:
     scale = {} if beyond is None else {"range": [beyond.low, beyond.high]}
     return Figure(
         title="Residual |f| − g of each attitude",
-        message=f"Before: {small_g(_rms(data.residual_before))} rms. After: the largest of the attitudes that count "
+        message=f"Before: {small_g(rms(data.residual_before))} rms. After: the largest of the attitudes that count "
         f"is {small_g(data.residual[worst])}, attitude {worst + 1}.",
         caption="Above, grey bars: with the nominal sensor (for counts and volts: the span of each axis). Below, "
         "points: calibrated"
@@ -219,13 +215,13 @@ def _turns(data: Turns, aside: list[TurnAside]) -> Figure:
     angle = [float(from_si(turn[2], "deg")) for turn in turns]
     number = list(range(1, len(angle) + 1))
     text = [f"{a:.1f} to {b:.1f} s" for a, b, *_ in turns]
-    rms = float(from_si(_rms(data.residual), "deg"))
+    left = float(from_si(rms(data.residual), "deg"))
     beyond = bulk(np.array(angle))
     marks = [] if beyond is None else edge_marks(beyond, np.array(angle), number, [f"{v:.3g} deg" for v in angle])
     return Figure(
         title="What the gyroscopes miss in each turn",
         message=f"Largest: {max(angle):.3g} deg, in turn {number[int(np.argmax(angle))]}; rms of those that count "
-        f"{rms:.3g} deg.",
+        f"{left:.3g} deg.",
         caption="Angle between the direction of gravity as the gyroscopes carry it and the one found after the turn. "
         "A few high bars: very fast turns, or a unit that moved while it was taken to be at rest."
         + (" Hatched and red: set aside." if aside else "")

@@ -15,6 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.tumble.gyroturns import Segments
 from imulab.procedures.tumble.rotation import frame_rotations
 from imulab.recording import Array
@@ -27,7 +28,7 @@ _LAGS = np.linspace(-2.0, 2.0, 21)  # s
 _STEPS = 6
 _CLEAR = 2.58
 _CLEAR_DELAY = 4.0
-_OUTLIER = 4.0 * 1.4826
+_OUTLIER = 4.0 * MAD_TO_SIGMA
 _FEWEST = 6
 _LATENCY = 5e-3  # s
 _JITTER, _COUNTED = 0.02, 1e-6  # of a step
@@ -139,7 +140,7 @@ def evened(time: Array) -> tuple[Array, float] | None:
     """
     step = np.diff(time)
     middle = float(np.median(step))
-    gap = step > 1.5 * float(step.mean()) + 8 * 1.4826 * float(np.median(np.abs(step - middle)))
+    gap = step > 1.5 * float(step.mean()) + 8 * MAD_TO_SIGMA * float(np.median(np.abs(step - middle)))
     even = time.copy()
     edges = np.concatenate([[0], np.flatnonzero(gap) + 1, [len(time)]])
     for start, stop in pairwise(edges.tolist()):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from imulab.errors import DataError
 from imulab.estimation.least_squares import f_test
+from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.recording import Array
 
@@ -20,7 +21,6 @@ _EDGE = 0.1  # s back into the 0.3 s of each hold that segmentation drops
 _STILL = 5.0
 _MARGIN = 0.1  # s
 _DEEPEST = 2.0  # s
-_MAD = 1.4826
 _SIGNIFICANT = 0.01
 _QUIET = 0.75
 _FLAT_TOP = 4  # readings in a row
@@ -74,7 +74,7 @@ def find_holds(attitudes: Attitudes, time: Array, output: Array, name: str) -> H
         raise DataError(f"{name}: no samples during {label}: do the two recordings share one clock?")
     median = np.array([np.median(output[a:b], axis=0) for a, b in zip(start, stop, strict=True)])
     spread = [np.median(np.abs(output[a:b] - m), axis=0) for a, b, m in zip(start, stop, median, strict=True)]
-    sigma = np.maximum(_MAD * np.median(spread, axis=0), _resolution(output))
+    sigma = np.maximum(MAD_TO_SIGMA * np.median(spread, axis=0), _resolution(output))
     first = np.searchsorted(time, attitudes.start - _EDGE)
     last = np.minimum(np.searchsorted(time, attitudes.stop + _EDGE), len(time) - 1)
     rate = float((stop - start).sum()) / max(float((time[stop - 1] - time[start]).sum()), 1e-9)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import OptionError
 from imulab.procedures.options import (
     ELEMENT,
     READING,
@@ -13,6 +12,7 @@ from imulab.procedures.options import (
     choice,
     finite,
     measure,
+    names_of_columns,
     part_of,
     read_options,
     switch,
@@ -43,13 +43,6 @@ def _fit(
     return fit_warmup([cycle(name) for name in files], **values["fit"]).calibration
 
 
-def _names(text: str, option: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
-    if not all(names) or len(set(names)) < len(names):
-        raise OptionError(f"{option} {text!r}: expected names of columns, each once, such as gyro_x,gyro_y")
-    return names
-
-
 OPTIONS = (
     choice("model", "How the bias goes with time; auto compares them.", ("auto", *MODELS), "auto"),
     Option("temperatures", "Calibration temperatures, degC, ascending.", temperature_list, TEMPERATURES, "T,T,..."),
@@ -60,7 +53,7 @@ OPTIONS = (
     measure("taper_time", "How long a taper takes, s.", "time", "s", "60 s", shows="TIME"),
     choice("pool", "unit, or type: several units share one table.", POOLS, "unit"),
     choice("beyond", "Beyond the outer temperatures: zero (no correction) or hold (as there).", BEYOND, "zero"),
-    Option("axes", "Columns to fit; all if not given.", _names, shows="A,A,..."),
+    Option("axes", "Columns to fit; all if not given.", names_of_columns, shows="A,A,..."),
     measure("latest_start", "A first sample later after power-on, s, is refused.", "time", "s", "5 s", shows="TIME"),
     switch("temperature_column", "Take a missing power-on temperature from the first row's column."),
     *READING,

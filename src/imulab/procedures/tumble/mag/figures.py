@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.estimation.ranked import rms
 from imulab.procedures.tumble.sections import Fields, MagFit, data_of, fit_of, model_of
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Figure, plain_number
@@ -59,7 +60,7 @@ def _residuals(record: Calibration, data: Fields) -> Figure:
     return Figure(
         title="Residual magnitude and dip of each attitude",
         message=f"The dip of attitude {data.number[worst]} is off most: {dip[worst]:+.2g} deg; rms "
-        f"{_rms(dip[used]):.2g} deg, and {_rms(magnitude[used]):.2g} % of the field.",
+        f"{rms(dip[used]):.2g} deg, and {rms(magnitude[used]):.2g} % of the field.",
         caption="Above: |m| less the field's magnitude, in per cent. Below: dip of each attitude less the common dip. "
         f"A disturbance such as iron near shows in both, a unit that moved in the dip alone.{aside}",
         traces=[
@@ -118,7 +119,3 @@ def _sphere(record: Calibration, data: Fields) -> Figure:
         layout={**layout, "legend": LEGEND},
         height=430,
     )
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from imulab.estimation.least_squares import coverage_factor
+from imulab.estimation.ranked import rms
 from imulab.procedures.tumble.mag.judge import Disturbed, Seen, heading_uncertainty, leave_one_out
 from imulab.procedures.tumble.mag.model import mag_names
 from imulab.procedures.tumble.mag.scaling import Ready
@@ -143,8 +144,8 @@ def _fit(
     heading, reading = heading_uncertainty(joint)
     return {
         "attitudes": len(residuals),
-        "magnitude": {"rms": _rms(residuals[:, 1]), "leave_one_out": predicted.rms(1)},
-        "dip": {"rms": _rms(residuals[:, 2]), "leave_one_out": predicted.rms(2)},
+        "magnitude": {"rms": rms(residuals[:, 1]), "leave_one_out": predicted.rms(1)},
+        "dip": {"rms": rms(residuals[:, 2]), "leave_one_out": predicted.rms(2)},
         "noise": "estimated from the residuals" if joint.pair.noise is None else "known",
         "sigma_magnitude": float(joint.sigma[0]),
         "sigma_dip": {"value": float(joint.sigma[1]), "unit": "rad"},
@@ -157,10 +158,6 @@ def _fit(
         },
         "moved": dict(moved),
     }
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, Any]:
@@ -183,7 +180,7 @@ def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, A
 
 def _scatter(joint: Joint) -> list[str]:
     """Say if |m| or dip scatter so much that the triads do not belong together, or the field was not steady."""
-    magnitude, dip = _rms(joint.found.residuals[:, 1]), _rms(joint.found.residuals[:, 2])
+    magnitude, dip = rms(joint.found.residuals[:, 1]), rms(joint.found.residuals[:, 2])
     worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
     if worst <= 1:
         return []
