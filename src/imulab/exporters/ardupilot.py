@@ -11,18 +11,10 @@ from pathlib import Path
 
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
-from imulab.exporters.magnetometer import ardupilot_rows, magnetometers, settle
-from imulab.exporters.model import (
-    AXES,
-    accel_terms,
-    gyro_terms,
-    held_accelerometers,
-    one_unit,
-    refuse_raw,
-    settle_losses,
-    single_precision,
-    write_one,
-)
+from imulab.exporters.autopilot import corrections
+from imulab.exporters.magnetometer import ardupilot_rows
+from imulab.exporters.model import AXES, single_precision, write_one
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
 _LARGEST_OFFSET = 3.5
@@ -37,13 +29,31 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     OptionError
         ArduPilot cannot hold the record.
     """
-    unit = one_unit(records, "ardupilot")
-    refuse_raw(unit, "ardupilot")
-    gyro = unit.gyro
-    accel, error, how = held_accelerometers(
-        unit, lambda held: lambda output: (output - held.scale * held.bias) / held.scale, misalignment=False
-    )
-    scale, offset = 1 / accel.scale, accel.scale * accel.bias
+    held = corrections(records, "ardupilot", options, _check)
+    rows = [(f"INS_ACCOFFS_{a}", v) for a, v in zip("XYZ", held.offset, strict=True)]
+    rows += [(f"INS_ACCSCAL_{a}", v) for a, v in zip("XYZ", held.scale, strict=True)]
+    if held.rest is not None:
+        rows += [(f"INS_GYROFFS_{a}", v) for a, v in zip("XYZ", held.rest, strict=True)]
+    if held.mag is not None:
+        rows += ardupilot_rows(held.mag, options)
+    comments = [
+        "ArduPilot parameters, " + held.unit.origin[0],
+        held.unit.origin[1],
+        "for Copter 3.4, Plane 3.5 and later: corrected = (raw - OFFS) * SCAL, m/s^2; older versions scale first",
+        "gyroscopes: raw - OFFS, rad/s; ArduPilot measures these again at each start unless INS_GYR_CAL is 0",
+        "no axes are turned: the record's axes are taken as ArduPilot's body axes (FRD, after the board's rotation)",
+        *(
+            ["magnetometers: corrected = K (raw + OFS) after ORIENT, mgauss; for 4.2 and later"]
+            if held.mag is not None
+            else []
+        ),
+        *held.lost,
+    ]
+    lines = [f"# {line}" for line in comments] + [f"{name},{single_precision(value)}" for name, value in rows]
+    return write_one(folder, "imulab.param", lines)
+
+
+def _check(offset: Array, scale: Array) -> None:
     for axis, s, o in zip(AXES, scale, offset, strict=True):
         if not _SCALES[0] <= s <= _SCALES[1]:
             raise OptionError(
@@ -53,33 +63,3 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
             raise OptionError(
                 f"ardupilot: offset of axis {axis} is {o:.4g} m/s^2; ArduPilot takes at most {_LARGEST_OFFSET}"
             )
-    lost = settle_losses(
-        "ardupilot",
-        (accel_terms(unit.accel, misalignment=True), error),
-        gyro_terms(gyro, bias=False) if gyro is not None else ([], []),
-        how=how,
-        options=options,
-    )
-    rows = [(f"INS_ACCOFFS_{a.upper()}", v) for a, v in zip(AXES, offset, strict=True)]
-    rows += [(f"INS_ACCSCAL_{a.upper()}", v) for a, v in zip(AXES, scale, strict=True)]
-    if gyro is not None:
-        rows += [(f"INS_GYROFFS_{a.upper()}", v) for a, v in zip(AXES, gyro.scale * gyro.bias, strict=True)]
-    mag = magnetometers(unit.record, "ardupilot")
-    if mag is not None:
-        lost += settle(mag, "ardupilot", options, turned=options.mag_mount == "external")
-        rows += ardupilot_rows(mag, options)
-    comments = [
-        "ArduPilot parameters, " + unit.origin[0],
-        unit.origin[1],
-        "for Copter 3.4, Plane 3.5 and later: corrected = (raw - OFFS) * SCAL, m/s^2; older versions scale first",
-        "gyroscopes: raw - OFFS, rad/s; ArduPilot measures these again at each start unless INS_GYR_CAL is 0",
-        "no axes are turned: the record's axes are taken as ArduPilot's body axes (FRD, after the board's rotation)",
-        *(
-            ["magnetometers: corrected = K (raw + OFS) after ORIENT, mgauss; for 4.2 and later"]
-            if mag is not None
-            else []
-        ),
-        *lost,
-    ]
-    lines = [f"# {line}" for line in comments] + [f"{name},{single_precision(value)}" for name, value in rows]
-    return write_one(folder, "imulab.param", lines)
