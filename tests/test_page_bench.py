@@ -134,6 +134,7 @@ def test_a_word_in_the_place_of_a_file_names_no_file_outside(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     Path("secret").write_text("x")
     files = Files(Path("session"))
+    files.make()
 
     def made(layout: str) -> list[str]:
         return FORMS["convert"].words(
@@ -166,6 +167,7 @@ def test_a_session_lists_its_files_with_their_kinds(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     il.write_csv(il.simulate_tumble(attitudes=12, gravity=9.81), "-given.csv")
     files = Files(Path("session"), ["-given.csv"])
+    files.make()
     il.fit_tumble("-given.csv", order=1, gravity=9.81).save("session/r.json")
     Path("session/r.html").write_text("x")
     Path("session/fw").mkdir()
@@ -187,7 +189,12 @@ def test_a_session_lists_its_files_with_their_kinds(tmp_path, monkeypatch):
 
 def test_an_empty_folder_goes_with_its_session(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert not Files(Path("session")).end()
+    files = Files(Path("session"), later=["rec.csv"])
+    assert not files.end()
+    files.make()
+    assert Path("session").is_dir()
+    assert files.entries() == []
+    assert not files.end()
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(OptionError, match=r"none\.csv: no such file"):
         Files(Path("session"), ["none.csv"])
@@ -277,7 +284,8 @@ def bench(tmp_path, monkeypatch) -> Iterator[SimpleNamespace]:
     """A workbench that runs, and a way to ask it."""
     monkeypatch.chdir(tmp_path)
     lines: queue.Queue[str] = queue.Queue()
-    part = Workbench(Files(Path("session")), FORMS)
+    part = Workbench(files := Files(Path("session")), FORMS)
+    files.make()
     options = {"browser": False, "limit": 10**7, "tell": lines.put}
     thread = threading.Thread(target=server.serve, args=([part],), kwargs=options, daemon=True)
     thread.start()
@@ -443,6 +451,7 @@ def test_a_manifest_of_the_command_line_names_files_where_they_are(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     Path("m.toml").write_text(MANIFEST.format(file="/data/one.csv"))
     files = Files(Path("session"), ["m.toml"])
+    files.make()
     files.check_manifest("m.toml")
     Path("session/own.toml").write_text(MANIFEST.format(file="one.csv"))
     files.check_manifest("session/own.toml")
@@ -511,6 +520,8 @@ def children(pid: int) -> list[str]:
     (["--port", "x"], "--port 'x': expected a whole number"),
     (["--port", "70000"], "--port 70000: expected 0 (a free one) to 65535"),
     (["none.csv"], "none.csv: no such file"),
+    (["--host", "192.0.2.7"], "warning: whoever reaches 192.0.2.7 and has the address below can use the page; it is "
+     "not encrypted\nimulab: --host 192.0.2.7: cannot be listened at: Cannot assign requested address"),
 ])  # fmt: skip
 def test_open_refuses_by_a_sentence(imulab, tmp_path, arguments, said):
     ran = imulab("open", "--no-browser", *arguments)
@@ -521,7 +532,6 @@ def test_open_refuses_by_a_sentence(imulab, tmp_path, arguments, said):
 def test_a_folder_that_another_session_removed_is_made_again(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     files = Files(Path("session"))
-    Path("session").rmdir()
     assert files.entries() == []
     assert Path(files.new("rec.csv")).parent.is_dir()
 

@@ -6,6 +6,7 @@ import asyncio
 import http.client
 import json
 import queue
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -139,11 +140,24 @@ def test_the_address_that_a_browser_is_started_with_opens_once(tmp_path, monkeyp
     thread.join(10)
 
 
+@pytest.mark.parametrize(("listened", "host", "status"), [
+    ("0.0.0.0", "192.168.1.5:8000", 200), ("0.0.0.0", "evil.example:8000", 421), ("box", "BOX:8000", 200),
+    ("10.0.0.2", "10.0.0.2:8000", 200), ("10.0.0.2", "10.0.0.3:8000", 421), ("10.0.0.2", "10.0.0.2:1", 421),
+])  # fmt: skip
+def test_a_page_for_others_still_answers_to_its_own_address_alone(listened, host, status):
+    assert guarded(8000, host, listened) == status
+
+
 @pytest.mark.parametrize(("port", "host", "status"), [
     (80, "127.0.0.1", 200), (80, "localhost", 200), (80, "127.0.0.1:80", 200), (80, "evil.example", 421),
     (8080, "127.0.0.1", 421),
 ])  # fmt: skip
 def test_the_usual_port_may_be_left_out_of_the_host(port, host, status):
+    assert guarded(port, host) == status
+
+
+def guarded(port: int, host: str, listened: str = "127.0.0.1") -> int:
+    """Return what the guard answers to a request with the token."""
     sent: list[dict] = []
 
     async def app(scope, receive, send):
@@ -158,8 +172,8 @@ def test_the_usual_port_may_be_left_out_of_the_host(port, host, status):
     headers = [(b"host", host.encode()), (b"origin", f"http://{host}".encode()), (b"x-imulab-token", b"secret")]
     scope = {"type": "http", "method": "GET", "path": "/x", "query_string": b"", "headers": headers,
              "server": ("127.0.0.1", port)}  # fmt: skip
-    asyncio.run(Guard(app, "secret", LIMIT)(scope, receive, send))
-    assert sent[0]["status"] == status
+    asyncio.run(Guard(app, "secret", LIMIT, host=listened)(scope, receive, send))
+    return sent[0]["status"]
 
 
 @pytest.mark.parametrize("path", ["/", "/static/app.js", "/static/plotly.js", "/api/files/x", "/?token=wrong"])
@@ -272,6 +286,17 @@ def test_a_slow_page_gets_the_latest_view_and_every_word():
 
 def test_numbers_that_are_none_are_null():
     assert to_json({"type": "x", "a": float("inf"), "b": (1.5, float("nan"))}) == '{"type":"x","a":null,"b":[1.5,null]}'
+
+
+def test_a_page_for_others_tells_an_address_that_they_reach():
+    listening = server._listen(0, "0.0.0.0")
+    address = server._reached("0.0.0.0"), listening.getsockname()[1]
+    with socket.create_connection(address, timeout=5):
+        pass
+    listening.close()
+    assert server._reached("10.1.2.3") == "10.1.2.3"
+    with pytest.raises(OptionError, match=r"--host 192\.0\.2\.7: cannot be listened at"):
+        server.serve([], host="192.0.2.7", browser=False)
 
 
 def test_a_port_that_is_taken_is_one_sentence():

@@ -107,9 +107,16 @@ def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_p
         page.get_by_text("Open the report").click()
     opened.value.wait_for_selector("html[data-drawn]")
     assert opened.value.evaluate("origin") == "null"  # a page of its own, which reaches nothing of the session
+    page.get_by_text("Firmware and other formats").click()  # the workbench beside the session has its files
+    page.locator("[data-name='sn42.json']").click()
+    page.get_by_role("button", name="Firmware (zip)").wait_for()
+    page.locator("[data-name='rec.csv']").click()
+    page.get_by_text("attitudes at rest (shaded)").wait_for()
+    page.get_by_role("tab", name="Session").click()
     page.get_by_role("button", name="End the session").click()
     assert "can be closed" in page.locator("#said").inner_text()
     assert running.end()[0] == 0
+    assert not (tmp_path / "imulab-files").exists()
     assert main(["tumble", "fit", "rec.csv", *FIT, "-o", "fit.json"]) == 0
     assert content(tmp_path / "sn42.json") == content(tmp_path / "fit.json")
 
@@ -171,7 +178,7 @@ def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page)
     page = new_page(running.address)
     growing = page.evaluate("fetch('/api/session/recording').then(answer => answer.json())")
     assert growing == {"error": "the recording still grows, and there is no record yet: finish the session first"}
-    assert page.locator("#session").get_attribute("role") == "region"  # one area alone is no tab
+    assert page.locator("#session").get_attribute("role") == "tabpanel"
     page.get_by_role("button", name="Finish now").click()
     page.wait_for_selector("#said .bad")
     assert "attitudes" in page.locator("#said").inner_text()
@@ -270,6 +277,7 @@ def test_nothing_overflows_sideways(live, new_page, width):
         (["--page", "--plain"], "--page together with --plain"),
         (["--port", "8000"], "--port: expected --page with it"),
         (["--no-browser"], "--no-browser: expected --page with it"),
+        (["--host", "0.0.0.0"], "--host: expected --page with it"),
         (["--page", "--port", "70000"], "--port 70000: expected 0 (a free one) to 65535"),
         (["--page", "--port", "x"], "--port 'x'"),
     ],

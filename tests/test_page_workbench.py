@@ -94,6 +94,7 @@ def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder
     drop(page, "unit 7.csv", text)
     page.get_by_text("12 attitudes at rest (shaded)").wait_for()
     page.locator("svg.plot").first.wait_for()
+    assert page.locator("#workbench").get_attribute("role") == "region"  # one area alone is no tab
     assert page.locator("svg.plot").count() == 4
     assert page.locator("svg.plot >> nth=0 >> rect.attitude").count() == 12
     page.get_by_label("gravity", exact=True).fill("9.81")

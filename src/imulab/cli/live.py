@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from imulab.cli.fit_options import with_options
-from imulab.cli.live_page import NoBrowser, PagePort, again, checked_page, on_page
+from imulab.cli.live_page import NoBrowser, PageHost, PagePort, again, checked_page, on_page
 from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, whole_number
 from imulab.errors import OptionError
 from imulab.procedures.options import FLAG, LAYOUT
@@ -50,6 +50,7 @@ def live(
     ] = None,
     page: Annotated[bool, typer.Option("--page", help="Show it in a browser on this machine.")] = False,
     port: PagePort = None,
+    host: PageHost = None,
     no_browser: NoBrowser = False,
     plain: Annotated[bool, typer.Option("--plain", help="A line for each event; ends when it is enough.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file of --save.")] = False,
@@ -70,7 +71,7 @@ def live(
     if source == "serial:":
         _list_ports()
         return
-    listened = checked_page(page, port, no_browser=no_browser, plain=plain)
+    listened = checked_page(page, port, host, no_browser=no_browser, plain=plain)
     if save is None:
         raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
     layout = options["layout"]
@@ -97,8 +98,8 @@ def live(
     with _offering(), closing(runner):
         try:
             if listened is not None:
-                name = output or "record.json"
-                on_page(runner, made, partial(again, save, fitted, output), name, port=listened, browser=not no_browser)
+                said = partial(again, save, fitted, output)
+                on_page(runner, made, said, (output, report), port=listened, host=host, browser=not no_browser)
                 return
             (_plain if plain else _drawn)(runner, typed=source != "-")
             runner.recorder.close()

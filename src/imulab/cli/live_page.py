@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from imulab.cli.options import note, whole_number
+from imulab.cli.speech import warn
 from imulab.errors import OptionError
 
 if TYPE_CHECKING:
+    from imulab.live.page.bench import Workbench
+    from imulab.live.page.files import Files
     from imulab.live.runner import Runner
     from imulab.records.calibration import Calibration
 
+FOLDER = "imulab-files"
+_NOT_OFFERED = ("live", "open", "demo", "fleet ")
 PagePort = Annotated[str | None, typer.Option("--port", metavar="N", help="Port of the page; a free one if not given.")]
+PageHost = Annotated[
+    str | None,
+    typer.Option("--host", metavar="ADDRESS", help="Address of this machine to listen at, for others; 0.0.0.0: all."),
+]
 NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Print the address of the page, and open no browser.")]
 
 
@@ -28,11 +37,19 @@ def port_number(text: str | None) -> int:
     return port
 
 
-def checked_page(page: bool, port: str | None, *, no_browser: bool, plain: bool) -> int | None:
+def checked_host(text: str | None) -> str | None:
+    """Return the address to listen at, with a warning where others reach it; None, this machine alone, of None."""
+    if text is not None and not text.startswith("127."):
+        warn(f"whoever reaches {text} and has the address below can use the page; it is not encrypted")
+    return text
+
+
+def checked_page(page: bool, port: str | None, host: str | None, *, no_browser: bool, plain: bool) -> int | None:
     """Return the port of the page, None where there is to be none."""
     if not page:
-        if port is not None or no_browser:
-            raise OptionError(f"{'--no-browser' if port is None else '--port'}: expected --page with it")
+        for given, name in ((port, "--port"), (host, "--host"), (no_browser or None, "--no-browser")):
+            if given is not None:
+                raise OptionError(f"{name}: expected --page with it")
         return None
     if plain:
         raise OptionError("--page together with --plain: expected one or the other")
@@ -53,16 +70,32 @@ def again(save: str, texts: Mapping[str, str | None], output: str | None, record
     return f"{shlex.join([*fit, '-o', 'accel.json'])} && {shlex.join(gyro)}"
 
 
+def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, Files]:
+    """Return the workbench and its files: those of its folder, those given, and those that may come later."""
+    from imulab.cli.app import command
+    from imulab.cli.common import commands_of
+    from imulab.live.page.bench import Workbench
+    from imulab.live.page.files import Files
+    from imulab.live.page.forms import forms
+
+    offered = [(path, each) for path, each in commands_of(command()) if not path.startswith(_NOT_OFFERED)]
+    files = Files(Path(FOLDER), given, later)
+    return Workbench(files, forms(offered)), files
+
+
 def on_page(
     runner: Runner,
     made: Callable[[], Calibration],
     command: Callable[[Calibration], str],
-    output: str,
+    outputs: Sequence[str | None],
     *,
     port: int,
+    host: str | None,
     browser: bool,
 ) -> None:
-    """Show a session on the page until it is ended there or by Ctrl-C.
+    """Show a session on the page, the workbench beside it, until it is ended there or by Ctrl-C.
+
+    `outputs` are the names of the record, None where none was given, and of the other files to be written.
 
     Raises
     ------
@@ -74,14 +107,17 @@ def on_page(
     from imulab.live.page.guided import GuidedPart
     from imulab.live.page.server import serve
 
-    part = GuidedPart(runner, made, command, Path(output).name)
+    part = GuidedPart(runner, made, command, Path(outputs[0] or "record.json").name)
+    bench, files = workbench(later=[name for name in (runner.recorder.path, *outputs) if name])
     try:
-        serve([part], port, browser=browser)
+        serve([part, bench], port, host=checked_host(host), browser=browser)
     except KeyboardInterrupt:
         if part.record is None:
             raise
     else:
         if part.record is None and part.error is None:
             note(runner.kept())
+    finally:
+        files.end()
     if part.error is not None:
         raise part.error

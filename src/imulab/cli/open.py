@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from imulab.cli.live_page import NoBrowser, PagePort, port_number
+from imulab.cli.live_page import FOLDER, NoBrowser, PageHost, PagePort, checked_host, port_number, workbench
 from imulab.cli.options import note
-from imulab.errors import OptionError
-
-FOLDER = "imulab-files"
-_NOT_OFFERED = ("live", "open", "demo", "fleet ")
 
 
 def open(  # noqa: A001 -- the name of the command
@@ -20,6 +15,7 @@ def open(  # noqa: A001 -- the name of the command
         list[str] | None, typer.Argument(metavar="[FILE...]", help="Recordings and records to begin with.")
     ] = None,
     port: PagePort = None,
+    host: PageHost = None,
     no_browser: NoBrowser = False,
 ) -> None:
     """Open the workbench in the browser: drop a recording, see it, calibrate it, take record, report and firmware.
@@ -27,21 +23,16 @@ def open(  # noqa: A001 -- the name of the command
     Prints one line with the address, which only this machine reaches. What is dropped or made is kept in the folder
     imulab-files. Ctrl-C ends it.
     """
-    from imulab.cli.app import command
-    from imulab.cli.common import commands_of
+    from imulab.live.page import require_server
 
     number = port_number(port)
+    require_server()
+    from imulab.live.page.server import serve
+
+    part, session = workbench(files or [])
+    session.make()
     try:
-        from imulab.live.page.bench import Workbench
-        from imulab.live.page.files import Files
-        from imulab.live.page.forms import forms
-        from imulab.live.page.server import serve
-    except ModuleNotFoundError as error:
-        raise OptionError(f"the page needs {error.name}, which is not here: pip install 'imulab[live]'") from None
-    offered = [(path, each) for path, each in commands_of(command()) if not path.startswith(_NOT_OFFERED)]
-    session = Files(Path(FOLDER), files or [])
-    try:
-        serve([Workbench(session, forms(offered))], number, browser=not no_browser)
+        serve([part], number, host=checked_host(host), browser=not no_browser)
     finally:
         if session.end():
             note(f"what was dropped and made is in {FOLDER}")

@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,14 +51,16 @@ class Files:
         shown is one that can be typed there.
     given
         Files that the command line named.
+    later
+        Such files that may not be there yet.
 
     Raises
     ------
     OptionError
-        The folder cannot be made, or a file is not there.
+        A file is not there.
     """
 
-    def __init__(self, folder: Path, given: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, given: Sequence[str] = (), later: Sequence[str] = ()) -> None:
         self.folder = folder
         self._kinds: dict[tuple[str, int, int], str] = {}
         for name in given:
@@ -65,11 +68,22 @@ class Files:
                 raise OptionError(f"{quoted(name)}: expected a file name without control characters")
             if not Path(name).exists():
                 raise OptionError(f"{name}: no such file")
-        self._given = [f"./{name}" if name.startswith("-") else name for name in dict.fromkeys(given)]
+        self._given = [f"./{name}" if name.startswith("-") else name for name in dict.fromkeys([*given, *later])]
+
+    def make(self) -> None:
+        """Make the folder where it is not there.
+
+        Raises
+        ------
+        OptionError
+            It cannot be made.
+        """
         try:
-            folder.mkdir(exist_ok=True)
+            self.folder.mkdir(exist_ok=True)
         except OSError as error:
-            raise OptionError(f"{folder}: cannot be made: {error.strerror}; start in a folder of your own") from None
+            raise OptionError(
+                f"{self.folder}: cannot be made: {error.strerror}; start in a folder of your own"
+            ) from None
 
     def entries(self) -> list[Entry]:
         """Return the files there are now, those of the command line first, then by name."""
@@ -124,7 +138,7 @@ class Files:
         OptionError
             The name leads elsewhere, or the file is there already, or is in `taken`.
         """
-        self.folder.mkdir(exist_ok=True)
+        self.make()
         path = checked(self.folder, name)
         if str(path) in taken:
             raise OptionError(f"{name}: is being written; expected another name")
@@ -134,7 +148,7 @@ class Files:
 
     def unused(self, name: str, taken: Collection[str] = ()) -> str:
         """Return the path of a file to be made, numbered where one of that name is there, or is in `taken`."""
-        self.folder.mkdir(exist_ok=True)
+        self.make()
         stem, dot, rest = name.partition(".")
         path, number = checked(self.folder, name), 1
         while os.path.lexists(path) or str(path) in taken:
@@ -155,11 +169,9 @@ class Files:
 
     def end(self) -> bool:
         """Remove the folder where nothing is in it; return whether something is."""
-        try:
+        with suppress(OSError):
             self.folder.rmdir()
-        except OSError:
-            return True
-        return False
+        return self.folder.exists()
 
 
 def checked(folder: Path, name: str) -> Path:

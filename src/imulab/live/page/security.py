@@ -1,7 +1,7 @@
 """Who may speak to the server, what the browser may do with its answers, and which files it reaches.
 
-The server listens on this machine only. That alone does not keep other pages of the same browser out, so every request
-also needs the token of this run, the address as its Host, and this page as its Origin.
+The server listens on this machine only, unless it is told otherwise. That alone does not keep other pages of the same
+browser out, so every request also needs the token of this run, the address as its Host, and this page as its Origin.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from imulab.errors import OptionError, quoted
 
 TOKEN_HEADER = "x-imulab-token"
-LOCAL = "127.0.0.1"
+LOCAL, ANY = "127.0.0.1", "0.0.0.0"
 _NAMES = (LOCAL, "localhost")
 _HTTP_PORT = 80
 POLICY = (
@@ -60,9 +60,12 @@ class Guard:
     once
         Given in the address in place of the token, a single time: other users of the machine see the address that a
         browser is started with.
+    host
+        The address that is listened at.
     """
 
-    def __init__(self, app: ASGIApp, token: str, limit: int, once: str = "") -> None:
+    def __init__(self, app: ASGIApp, token: str, limit: int, once: str = "", host: str = LOCAL) -> None:
+        self._host = host
         self._app, self._token, self._limit, self._once = app, token, limit, once
         self._key = new_token()
 
@@ -92,11 +95,9 @@ class Guard:
     def _refusal(self, scope: Scope) -> Response | None:
         """Return the answer to a request that goes no further; None for the others."""
         headers, port = Headers(scope=scope), scope["server"][1]
-        here = [f"{name}:{port}" for name in _NAMES]
-        if port == _HTTP_PORT:  # which browsers leave out
-            here += _NAMES
         host = headers.get("host", "")
-        if host not in here:
+        name, colon, given = host.partition(":")
+        if not self._is_here(name) or given != ("" if port == _HTTP_PORT and not colon else str(port)):
             return PlainTextResponse(_STRANGER, 421)
         if headers.get("origin", f"http://{host}") != f"http://{host}" or (
             headers.get("sec-fetch-site", "none") in ("cross-site", "same-site") and scope.get("path") != "/"
@@ -115,6 +116,12 @@ class Guard:
         if _same(headers.get(TOKEN_HEADER, ""), self._token) or _same(_cookie(headers, cookie), self._key):
             return None
         return PlainTextResponse(_STRANGER, 403)
+
+    def _is_here(self, name: str) -> bool:
+        """Whether a name is one of the address that is listened at: a foreign name may lead here, too."""
+        if self._host == ANY and name.replace(".", "").isdigit():
+            return True
+        return name.lower() in (*_NAMES, self._host.lower())
 
     def _opens(self, given: str) -> bool:
         """Whether what an address holds lets its browser in."""

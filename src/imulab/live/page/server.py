@@ -7,6 +7,7 @@ and what is said on the socket, is in `parts`.
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import signal
 import socket
@@ -30,7 +31,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from imulab._version import VERSION
 from imulab.errors import ImulabError, OptionError
 from imulab.live.page.parts import Hub, Line, Message, Part, to_json
-from imulab.live.page.security import LOCAL, Guard, new_token
+from imulab.live.page.security import ANY, LOCAL, Guard, new_token
 
 UPLOAD_LIMIT = 4 << 30
 """Bytes of one request, 4 GiB."""
@@ -38,8 +39,8 @@ _SOCKET_LIMIT = 1 << 16
 _GRACE = 2
 
 
-def application(token: str, parts: Sequence[Part], *, limit: int = UPLOAD_LIMIT) -> Starlette:
-    """Return the application of a page with these parts; its `state` has `hub`, `token` and `once`."""
+def application(token: str, parts: Sequence[Part], *, host: str = LOCAL, limit: int = UPLOAD_LIMIT) -> Starlette:
+    """Return the application of a page with these parts at an address; its `state` has `hub`, `token` and `once`."""
     hub, once = Hub(), new_token()
     known = {kind: take for part in parts for kind, take in part.hears.items()}
     hello = {"type": "hello", "areas": [part.name for part in parts], "version": VERSION}
@@ -82,7 +83,7 @@ def application(token: str, parts: Sequence[Part], *, limit: int = UPLOAD_LIMIT)
     app = Starlette(
         routes=routes,
         lifespan=alive,
-        middleware=[Middleware(Guard, token=token, limit=limit, once=once)],
+        middleware=[Middleware(Guard, token=token, limit=limit, once=once, host=host)],
         exception_handlers={ImulabError: _refused},
     )
     app.state.hub, app.state.token, app.state.once = hub, token, once
@@ -93,6 +94,7 @@ def serve(
     parts: Sequence[Part],
     port: int = 0,
     *,
+    host: str | None = None,
     browser: bool = True,
     limit: int = UPLOAD_LIMIT,
     tell: Callable[[str], object] = print,
@@ -104,7 +106,9 @@ def serve(
     parts
         Of the page.
     port
-        To listen at on this machine; 0 for a free one.
+        To listen at; 0 for a free one.
+    host
+        Address of this machine to listen at, ``0.0.0.0`` for all; None for the one that only this machine reaches.
     browser
         Whether to open a browser there.
     limit
@@ -115,10 +119,10 @@ def serve(
     Raises
     ------
     OptionError
-        The port is taken, or not permitted.
+        The port is taken, or not permitted, or the address is none of this machine.
     """
-    listening = _listen(port)
-    app = application(new_token(), parts, limit=limit)
+    listening = _listen(port, host or LOCAL)
+    app = application(new_token(), parts, host=host or LOCAL, limit=limit)
     config = uvicorn.Config(
         app,
         log_level="critical",
@@ -134,7 +138,7 @@ def serve(
         server.should_exit = True
 
     app.state.hub.stop = stop
-    address = f"http://{LOCAL}:{listening.getsockname()[1]}/?token="
+    address = f"http://{_reached(host or LOCAL)}:{listening.getsockname()[1]}/?token="
     try:
         with _hung_up(stop):
             tell(address + app.state.token)
@@ -167,15 +171,27 @@ def _open(address: str) -> None:
         webbrowser.open(address)
 
 
-def _listen(port: int) -> socket.socket:
+def _reached(host: str) -> str:
+    """Return the address by which others reach a server that listens at `host`."""
+    if host != ANY:
+        return host
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        probe.connect(("192.0.2.1", 9))  # of documents; nothing is sent, but the way there has an address of this end
+        return str(probe.getsockname()[0])
+    return LOCAL
+
+
+def _listen(port: int, host: str = LOCAL) -> socket.socket:
     listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     if sys.platform != "win32":  # there it would let two programs listen at once
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((LOCAL, port))
+        listening.bind((host, port))
         listening.listen()
     except OSError as error:
         listening.close()
+        if host != LOCAL and error.errno != errno.EADDRINUSE:
+            raise OptionError(f"--host {host}: cannot be listened at: {error.strerror}") from None
         raise OptionError(f"--port {port}: cannot be listened at: {error.strerror}; 0 takes a free one") from None
     return listening
 

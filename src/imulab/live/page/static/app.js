@@ -1,7 +1,8 @@
 // The page: its socket, its areas and what is said above them.
 //
 // An area is a module with `title`, `mount(place, page)`, which is called once, `hear(message)`, which gets every
-// message of the socket, and `kept()`, which says what stays when the program has ended. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
+// message of the socket, and `kept()`, which says what stays when the program has ended; `shown()`, where it has one, is
+// called whenever it comes into sight. `page.send(message)` answers, `page.say(text, kind)` says something above all areas
 // (kind: "note" or "bad"; no text takes it away).
 
 import { h, put, show } from "./dom.js";
@@ -29,6 +30,7 @@ const page = {
     else say(gone(), "bad");
   },
   // Says that the program ends by itself now, and why: that it is gone is then no news.
+  others: () => Object.keys(mounted),
   end(text, kind) {
     ended = true;
     say(text, kind);
@@ -45,6 +47,7 @@ function choose(name) {
     tab.setAttribute("aria-selected", chosen);
     tab.tabIndex = chosen ? 0 : -1;
   }
+  AREAS[name].shown?.();
 }
 
 function turn(event) {

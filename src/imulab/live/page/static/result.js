@@ -18,6 +18,7 @@ export class ResultArea {
     const files = message.files.map(file => h("a", {
       class: "button", href: file.href, ...(file.kind === "report" ? { target: "_blank", rel: "noopener" } : { download: file.name }),
     }, FILES[file.kind]));
+    if (this.page.others().includes("workbench")) files.push(h("a", { class: "button", href: "#workbench" }, "Firmware and other formats"));
     this.place.replaceChildren(h("section", { class: "result" },
       h("h2", {}, "The record"),
       h("p", { class: `said ${message.verdict}` }, h("strong", {}, `${HEADS[message.verdict]} `), message.headline,

@@ -11,6 +11,7 @@ const READING = ["layout", "topic", "instance", "window", "element"];
 const KINDS = { recording: "recording", record: "record", report: "report", manifest: "manifest or layout", folder: "folder", other: "file" };
 
 let page = null;
+let place = null;
 let files = [];
 let folder = "";
 let forms = [];
@@ -22,8 +23,9 @@ let last = null;
 const cards = new Map();
 const ui = {};
 
-export function mount(place, given) {
+export function mount(into, given) {
   page = given;
+  place = into;
   ui.input = h("input", { type: "file", multiple: true, id: "bench-files", class: "unseen", onchange: () => { take([...ui.input.files]); ui.input.value = ""; } });
   ui.drop = h("label", { class: "drop", for: "bench-files" }, h("strong", {}, "Drop recordings or records here"), h("span", {}, "or choose files"));
   ui.coming = h("ul", { class: "coming", "aria-live": "polite" });
@@ -58,6 +60,11 @@ export function hear(message) {
   else if (message.type === "job") worked(message);
 }
 
+// A file is not read before somebody looks, and a session beside this may have written others.
+export function shown() {
+  ask("files").then(listed).catch(fail);
+}
+
 async function take(given) {
   for (const file of given) {
     const part = h("progress", { max: 1, value: 0, "aria-label": `receiving ${file.name}` });
@@ -86,7 +93,7 @@ function listed(message) {
   show(ui.try, !files.some(each => each.kind === "recording"));
   put(ui.where, files.length ? `What is dropped or made is kept in the folder ${folder}.` : "");
   if (chosen && !files.some(each => each.name === chosen.name)) leave();
-  else if (!chosen && files.length) choose((files.find(each => each.kind === "recording") || files[0]).name);
+  else if (!chosen && files.length && !place.hidden) choose((files.find(each => each.kind === "recording") || files[0]).name);
   current?.refresh();
 }
 
