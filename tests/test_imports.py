@@ -131,3 +131,31 @@ def _names_procedures(tree: ast.Module) -> bool:
 def test_nobody_outside_tells_procedures_apart_by_name():
     outside = {name for name, tree in MODULES.items() if _room(name) not in {"cli", "demo", "procedures"}}
     assert {name for name in outside if _names_procedures(MODULES[name])} == KNOWN_NAMES
+
+
+def _lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """How many lines a function has, its docstring apart."""
+    end, first = function.end_lineno, function.body[0]
+    assert end is not None
+    assert first.end_lineno is not None
+    documented = ast.get_docstring(function) is not None
+    return end - function.lineno + 1 - (first.end_lineno - first.lineno + 1 if documented else 0)
+
+
+def test_no_function_is_longer_than_a_screen():
+    found = {
+        f"{name}.{node.name}": _lines_of(node)
+        for name, tree in MODULES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    }
+    assert len(found) > 1000
+    assert {name: lines for name, lines in found.items() if lines > 60} == {}
+
+
+def test_no_file_is_two_rooms():
+    lines = {
+        path.relative_to(SOURCE).as_posix(): len(path.read_text(encoding="utf-8").splitlines())
+        for path in (SOURCE / "imulab").rglob("*.py")
+    }
+    assert {name: count for name, count in lines.items() if count > 420} == {}

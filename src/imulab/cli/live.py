@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
@@ -60,13 +60,10 @@ def live(
 
     The recording is written out every second; at its end the record is that of `imulab tumble fit` on it.
     """
-    from imulab.cli.result import finish
-    from imulab.live.gyros import with_gyroscopes
     from imulab.live.runner import Runner
     from imulab.live.session import Session
     from imulab.live.sources import open_source
     from imulab.live.targets import read_targets
-    from imulab.procedures.run import run_task
 
     if source == "serial:":
         _list_ports()
@@ -76,39 +73,54 @@ def live(
         raise OptionError("--save: expected the name of the recording to write, such as --save rec.csv")
     layout = options["layout"]
     values = TASK.values({name: text for name, text in options.items() if text is not None}, FLAG)
-    planned = None if attitudes is None else whole_number(attitudes, "--attitudes")
-    if planned is not None and not 4 <= planned <= 200:
-        raise OptionError(f"--attitudes {planned}: expected 4 to 200")
-    if planned is not None and target is not None:
-        raise OptionError("--attitudes together with --target: expected one or the other")
+    planned = _number_of_attitudes(attitudes, target)
     session = Session(values["order"], values["gravity"], read_targets(target), planned)
-    replayed = [source.partition(":")[2].rpartition("@")[0] or source.partition(":")[2]]
-    check_outputs([save, output, report], [name for name in (*replayed, layout) if name])
-    known = _layout(layout)
+    check_outputs([save, output, report], [name for name in (_replayed(source), layout) if name])
     fitted = {**options, "layout": None}
+    known = _layout(layout)
     runner = Runner.open(lambda: open_source(source, layout, follow=follow), session, save, known, resume=resume)
-
-    def made() -> Calibration:
-        record, why = with_gyroscopes(run_task("tumble", [save], fitted, GivenFiles()), save)
-        finish(record, output, report, json=False)
-        _say_how(record, save, output, why)
-        return record
-
+    made = partial(_make_record, save, fitted, output, report)
     plain = plain or not sys.stdout.isatty()
     with _offering(), closing(runner):
         try:
             if listened is not None:
                 said = partial(again, save, fitted, output)
                 on_page(runner, made, said, (output, report), port=listened, host=host, browser=not no_browser)
-                return
-            (_plain if plain else _drawn)(runner, typed=source != "-")
-            runner.recorder.close()
-            record = made()
-            if not plain and source != "-":
-                _corrected(runner, record)
+            else:
+                _in_terminal(runner, made, plain=plain, typed=source != "-")
         except KeyboardInterrupt:
             note(runner.kept())
             raise
+
+
+def _make_record(save: str, fitted: dict[str, str | None], output: str | None, report: str | None) -> Calibration:
+    """Fit the recording, with its gyroscopes where it has them, write and show the record, and say how to make it."""
+    from imulab.cli.result import finish
+    from imulab.live.gyros import with_gyroscopes
+    from imulab.procedures.run import run_task
+
+    record, why = with_gyroscopes(run_task("tumble", [save], fitted, GivenFiles()), save)
+    finish(record, output, report, json=False)
+    _say_how(record, save, output, why)
+    return record
+
+
+def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool, typed: bool) -> None:
+    """Guide the test in the terminal, make its record, and show corrected readings until the end."""
+    (_plain if plain else _drawn)(runner, typed=typed)
+    runner.recorder.close()
+    record = made()
+    if not plain and typed:
+        _corrected(runner, record)
+
+
+def _number_of_attitudes(text: str | None, target: str | None) -> int | None:
+    number = None if text is None else whole_number(text, "--attitudes")
+    if number is not None and not 4 <= number <= 200:
+        raise OptionError(f"--attitudes {number}: expected 4 to 200")
+    if number is not None and target is not None:
+        raise OptionError("--attitudes together with --target: expected one or the other")
+    return number
 
 
 def _say_how(record: Calibration, save: str, output: str | None, why: str) -> None:
@@ -120,6 +132,12 @@ def _say_how(record: Calibration, save: str, output: str | None, why: str) -> No
     note(f"the recording is {save}; {same}")
     if why:
         note(why)
+
+
+def _replayed(source: str) -> str:
+    """Return the file, port or settings that a source names, without its speed."""
+    name = source.partition(":")[2]
+    return name.rpartition("@")[0] or name
 
 
 def _layout(name: str | None) -> Layout | None:

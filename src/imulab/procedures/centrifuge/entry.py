@@ -15,7 +15,7 @@ ENTRY = Procedure(
     task=TASK,
     check=deferred(f"{_HERE}.sections:check"),
     exhibits=deferred(f"{_HERE}.figures:exhibits"),
-    summary=deferred(f"{_HERE}.figures:summary"),
+    summary=deferred(f"{_HERE}.findings:summary"),
     tables=deferred(f"{_HERE}.device:tables_of"),
     sections=(
         Section(

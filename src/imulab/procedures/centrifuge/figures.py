@@ -8,10 +8,17 @@ import numpy as np
 
 from imulab.errors import RecordError
 from imulab.estimation.least_squares import coverage_factor
-from imulab.procedures.centrifuge.model import curve
+from imulab.procedures.centrifuge.findings import (
+    axis_label,
+    change_uncertainty,
+    curve_at,
+    facts,
+    headline,
+    numbers,
+    prefixes,
+)
 from imulab.procedures.centrifuge.sections import Centrifuge, centrifuge_of, force_of, level_of
 from imulab.procedures.centrifuge.tables import (
-    ENGINEERING,
     PER_G,
     budget_table,
     curve_table,
@@ -21,9 +28,8 @@ from imulab.procedures.centrifuge.tables import (
     relative,
     run_table,
 )
-from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, format_uncertain
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable
 from imulab.report.panels import axis_key, names
 from imulab.report.traces import SYMBOLS, axis, band, rounded, scatter
 from imulab.units import STANDARD_GRAVITY, from_si
@@ -57,123 +63,7 @@ def exhibits(record: Calibration) -> Exhibits:
         parameters_table(record, r.fit),
         run_table(r.runs),
     ]
-    return Exhibits(headline=_headline(record, sets[0]), facts=_facts(record, sets), items=items)
-
-
-def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
-    """Return the curve of each axis, and what it changes up to the highest level, with uncertainties."""
-    sets, top = prefixes(record), force_of(record, max(level.level for level in centrifuge_of(record).levels))
-    rows = []
-    for prefix in sets:
-        cells = []
-        for name in ("K0", "c1", "c2"):
-            factor, _ = ENGINEERING[name]
-            found = record.parameters.get(f"{prefix}{name}")
-            u = 0.0 if found is None else (found.standard_uncertainty or 0.0) * factor
-            cells.append("–" if found is None else " ± ".join(format_uncertain(found.value * factor, u)))
-        K, _ = curve_at(record, prefix, np.array([top]))
-        change = 100 * relative(float(K[0]), record.value(f"{prefix}K0"))
-        cells.append(" ± ".join(format_uncertain(change, 100 * _curve_change(record, prefix, top))))
-        rows.append([_label(prefix), *cells])
-    return [
-        "axis",
-        *(f"{name}, {ENGINEERING[name][1]}" for name in ("K0", "c1", "c2")),
-        f"change at {_g(top)}, %",
-    ], rows
-
-
-def prefixes(record: Calibration) -> list[str]:
-    """Return the sets of parameters that a record has: ``x_``, ``y_``, ``x_down_`` ..."""
-    return [p for p in ("x_", "y_", "x_down_", "y_down_") if f"{p}K0" in record.parameters]
-
-
-def numbers(record: Calibration, prefix: str) -> list[int]:
-    """Return the levels of a set, rising."""
-    return [row.level for row in centrifuge_of(record).levels if f"{prefix}K_{row.level}" in record.parameters]
-
-
-def _label(prefix: str) -> str:
-    return prefix[0].upper() + (", spin axis down" if "down" in prefix else "")
-
-
-def _headline(record: Calibration, prefix: str) -> str:
-    """Return the g-sensitivity in one sentence, and by how much it departs from the linear."""
-    levels = numbers(record, prefix)
-    last = levels[-1]
-    first, top = _g(force_of(record, levels[0])), _g(force_of(record, last))
-    if last == levels[0]:
-        return f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{last}')} at {first}."
-    zeta = record.parameter(f"{prefix}zeta_{last}")
-    measured = _change(zeta.value, zeta.standard_uncertainty)
-    curved = _curve_change(record, prefix, force_of(record, last))
-    if centrifuge_of(record).model.curve[prefix.rstrip("_")] == "constant":
-        return (
-            f"{_label(prefix)} drifts linearly with g, by {_per_g(record, f'{prefix}K0')} from {first} to {top}; the "
-            f"factor at {top} is {measured} than that at {first}."
-        )
-    K, _ = curve_at(record, prefix, np.array([force_of(record, last)]))
-    fitted = _change(relative(float(K[0]), record.value(f"{prefix}K0")), curved)
-    return (
-        f"{_label(prefix)} drifts by {_per_g(record, f'{prefix}K_{levels[0]}')} at {first}, its drift factor; "
-        f"at {top} the factor is {measured} measured directly against {first}, and {fitted} by the curve through all "
-        "levels."
-    )
-
-
-def _per_g(record: Calibration, name: str) -> str:
-    K = record.parameter(name)
-    value, u = format_uncertain(K.value * PER_G, (K.standard_uncertainty or 0.0) * PER_G)
-    return f"{value} ± {u} deg/h per g"
-
-
-def _change(share: float, uncertainty: float | None) -> str:
-    change, u = format_uncertain(100 * abs(share), 100 * (uncertainty or 0.0))
-    return f"{change} ± {u} % {'smaller' if share < 0 else 'larger'}"
-
-
-def _curve_change(record: Calibration, prefix: str, force: float) -> float:
-    """Standard uncertainty of K(a)/K0 - 1 from those of c1 and c2."""
-    names = [n for n in (f"{prefix}c1", f"{prefix}c2") if n in record.parameters]
-    if not names:
-        return 0.0
-    C = record.covariance.block(names)
-    gradient = np.array([force if n.endswith("c1") else force**2 for n in names])
-    return float(np.sqrt(max(gradient @ C @ gradient, 0.0)))
-
-
-def curve_at(record: Calibration, prefix: str, force: Array) -> tuple[Array, Array]:
-    """Return K(a), rad/s/(m/s^2), and its standard uncertainty at specific forces, m/s^2, shapes (n,)."""
-    terms = {
-        t: record.value(f"{prefix}{t}") if f"{prefix}{t}" in record.parameters else 0.0 for t in ("K0", "c1", "c2")
-    }
-    K = curve(force, **terms)
-    names = [n for n in ("K0", "c1", "c2") if f"{prefix}{n}" in record.parameters]
-    C = record.covariance.block([f"{prefix}{n}" for n in names])
-    gradient = {"K0": K / terms["K0"], "c1": terms["K0"] * force, "c2": terms["K0"] * force**2}
-    J = np.stack([gradient[n] for n in names], axis=1)
-    return K, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, C, J), 0.0))
-
-
-def _facts(record: Calibration, sets: list[str]) -> list[tuple[str, str]]:
-    facts = []
-    for prefix in sets[:2]:
-        K0 = record.parameter(f"{prefix}K0")
-        value, u = format_uncertain(K0.value * PER_G, (K0.standard_uncertainty or 0.0) * PER_G, digits=1)
-        digits = u.replace(".", "").lstrip("0")
-        facts.append((f"K0 {_label(prefix)}, deg/h/g", f"{value}({digits})"))
-    r = centrifuge_of(record)
-    loaded = [row for row in r.runs if row.role == "loaded"]
-    facts += [
-        ("curve", ", ".join(dict.fromkeys(r.model.curve.values()))),
-        ("levels", str(len(r.levels))),
-        ("loaded runs", str(len(loaded))),
-        ("highest level", _g(r.model.highest_specific_force.value)),
-    ]
-    return facts
-
-
-def _g(force: float) -> str:
-    return f"{from_si(force, 'g'):.3g} g"
+    return Exhibits(headline=headline(record, sets[0]), facts=facts(record, sets), items=items)
 
 
 def _scatter(x: Any, y: Any, name: str, mode: str, **more: Any) -> dict[str, Any]:
@@ -194,7 +84,7 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
         grid = np.linspace(0.0, 1.02 * force.max(), _POINTS)
         K0 = record.value(f"{prefix}K0")
         K, _ = curve_at(record, prefix, grid)
-        half = coverage_factor(None) * np.array([_curve_change(record, prefix, a) for a in grid])
+        half = coverage_factor(None) * np.array([change_uncertainty(record, prefix, a) for a in grid])
         x = grid / STANDARD_GRAVITY
         change = 100 * (K / K0 - 1)
         where = _place(number)
@@ -229,7 +119,7 @@ def _zeta(record: Calibration, sets: list[str]) -> Figure:
         "points are the same K_i against the curve's K0. Points off the band by more than their bars are not "
         "described by the curve.",
         traces=traces,
-        layout=_panels([f"{_label(p)}: change of K, %" for p in shown], "specific force, g"),
+        layout=_panels([f"{axis_label(p)}: change of K, %" for p in shown], "specific force, g"),
         height=430,
     )
 
@@ -299,7 +189,7 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
              "text": f"{force[index]:.3g} g", "arrowcolor": QUIET, "ax": 26, "ay": -24 if index else 24}
             for index in (0, len(rows) - 1)
         ]  # fmt: skip
-    layout = _panels([f"{_label(p)}: along Y, deg/h/g" for p in shown], "along X, deg/h/g", gap=0.13)
+    layout = _panels([f"{axis_label(p)}: along Y, deg/h/g" for p in shown], "along X, deg/h/g", gap=0.13)
     layout["annotations"] = annotations
     for number in range(len(shown)):
         x, y = names(number)

@@ -192,29 +192,50 @@ def plan_centrifuge(
         radius_uncertainty=radius_uncertainty, rate_uncertainty=rate_uncertainty, name="plan",
     )  # fmt: skip
     runs = cycles * (2 if both_senses else 1)
-    density = math.hypot(dtg_noise, fog_noise)
-    planned: list[PlannedLevel] = []
-    for force in sorted(levels):
-        arm = math.sqrt(force / radius)
-        table = arm - net_rate
-        if table <= 0:
-            raise OptionError(
-                f"level {from_si(force, 'g'):.4g} g: arm rate {_deg(arm)} is not above the net rate {_deg(net_rate)}; "
-                "expected a lower net rate, a smaller radius or a higher level"
-            )
-        noise = density * math.sqrt(2 / duration / runs) / (K * force)
-        rate = 2 * rate_uncertainty / arm / math.sqrt(runs)
-        relative = math.hypot(noise, rate)
-        first = planned[0].relative if planned else relative
-        margin = uncertainty**2 - rate**2
-        needed = duration * noise**2 / margin if margin > 0 else math.inf
-        zeta = math.hypot(relative, first) if planned else None
-        planned.append(PlannedLevel(force, arm, table, duration * table / (2 * math.pi), relative, zeta, needed))
+    test = _Test(radius, net_rate, duration, runs, K, math.hypot(dtg_noise, fog_noise), rate_uncertainty, uncertainty)
+    planned = _planned_levels(sorted(levels), test)
     total = cycles * static_duration + runs * len(levels) * duration
     return Plan(
         manifest, tuple(planned), duration, static_duration, total, uncertainty,
         tuple(_warnings(planned, net_rate, duration, runs, K, uncertainty, both_senses)),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Test:
+    """What is the same at all levels: `noise` is that of DTG and FOG together, rad/sqrt(s)."""
+
+    radius: float
+    net_rate: float
+    duration: float
+    runs: int
+    K: float
+    noise: float
+    rate_uncertainty: float
+    wanted: float
+
+
+def _planned_levels(levels: Sequence[float], test: _Test) -> list[PlannedLevel]:
+    """Return the arm and table rates of levels, m/s^2, ascending, and the uncertainties that K and zeta will have."""
+    planned: list[PlannedLevel] = []
+    for force in levels:
+        arm = math.sqrt(force / test.radius)
+        table = arm - test.net_rate
+        if table <= 0:
+            raise OptionError(
+                f"level {from_si(force, 'g'):.4g} g: arm rate {_deg(arm)} is not above the net rate "
+                f"{_deg(test.net_rate)}; expected a lower net rate, a smaller radius or a higher level"
+            )
+        noise = test.noise * math.sqrt(2 / test.duration / test.runs) / (test.K * force)
+        rate = 2 * test.rate_uncertainty / arm / math.sqrt(test.runs)
+        relative = math.hypot(noise, rate)
+        first = planned[0].relative if planned else relative
+        margin = test.wanted**2 - rate**2
+        needed = test.duration * noise**2 / margin if margin > 0 else math.inf
+        zeta = math.hypot(relative, first) if planned else None
+        periods = test.duration * table / (2 * math.pi)
+        planned.append(PlannedLevel(force, arm, table, periods, relative, zeta, needed))
+    return planned
 
 
 def read_levels(given: Sequence[float] | str) -> list[float]:

@@ -131,21 +131,25 @@ def simulate_array(
             f"{length:g} s at {rate:g} Hz of {elements * axes} gyros: expected 2 to {_MOST_READINGS:g} readings in all"
         )
     time = np.arange(count) / rate
-    unit_rng = np.random.default_rng([seed, 1])
+    unit_rng = np.random.default_rng([seed, 1])  # what is the same in all recordings of one array
     levels = noise.white * unit_rng.uniform(*noise.spread, (axes, elements))
     biases = noise.turn_on * unit_rng.standard_normal((axes, elements))
     sensing = _sensing(elements, axes, scale_spread, misalignment, mounting, unit_rng)
     rng = np.random.default_rng([seed, 2 + list(EXPERIMENTS).index(experiment), session])
     truth = _motion(experiment, time, axes, rng)
-    readings = np.einsum("iab,tb->tai", sensing, truth)
-    readings += biases
-    readings += levels * rng.standard_normal(readings.shape)
-    readings += noise.walk / math.sqrt(rate) * np.cumsum(rng.standard_normal(readings.shape), axis=0)
-    readings += _gauss_markov(readings.shape, noise, rate, rng)
+    readings = np.einsum("iab,tb->tai", sensing, truth) + biases
+    _add_noise(readings, levels, noise, rate, rng)
     for each in faults:
         _break(readings, each, rate, rng)
     head = {"serial": f"ARRAY-{seed:04d}", "model": f"simulated array of {elements}", "experiment": experiment}
     return _recording(time, readings, truth, biases, unit, head)
+
+
+def _add_noise(readings: Array, levels: Array, noise: NoiseModel, rate: float, rng: np.random.Generator) -> None:
+    """Add white noise of standard deviations `levels`, shape (axes, n), rate random walk and correlated noise."""
+    readings += levels * rng.standard_normal(readings.shape)
+    readings += noise.walk / math.sqrt(rate) * np.cumsum(rng.standard_normal(readings.shape), axis=0)
+    readings += _gauss_markov(readings.shape, noise, rate, rng)
 
 
 def _recording(time: Array, readings: Array, truth: Array, biases: Array, unit: str, head: dict[str, str]) -> Recording:

@@ -20,7 +20,8 @@ from imulab.recording import Array, Source
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
 if TYPE_CHECKING:
-    from imulab.procedures.noise.fit import ColumnModel
+    from imulab.estimation.noise.cleaning import Step
+    from imulab.procedures.noise.fit import ColumnModel, Drift
 
 _DIGITS = 7
 _TAILS = (0.025, 0.975)
@@ -187,16 +188,7 @@ def _column(column: ColumnModel) -> dict[str, Any]:
             {"frequency": _value(line.frequency, "Hz"), "amplitude": _value(line.amplitude, column.unit)}
             for line in column.lines
         ],
-        "steps": [
-            {
-                "time": _value(step.time, "s"),
-                "size": {
-                    **_value(step.size, column.unit),
-                    "standard_uncertainty": _number(step.standard_uncertainty),
-                },
-            }
-            for step in column.steps
-        ],
+        "steps": [_step(step, column.unit) for step in column.steps],
         "full_band": analysis.band.full,
         "flat": analysis.band.flat,
         "ripple": _number(analysis.allowance.ripple),
@@ -221,22 +213,28 @@ def _column(column: ColumnModel) -> dict[str, Any]:
             }
             for k in range(choice.deviance.shape[1])
         ],
-        "drifts": [
-            {
-                "follows": drift.covariate,
-                "slope": {
-                    "value": _number(drift.slope),
-                    "unit": drift_unit(drift.covariate, column.unit),
-                    "standard_uncertainty": _number(drift.standard_uncertainty),
-                },
-                "gain": _number(drift.found.gain),
-                "significant": drift.found.follows,
-                "removed": drift.taken,
-                "model_without": drift.letters[0],
-                "model_with": drift.letters[1],
-            }
-            for drift in column.drifts
-        ],
+        "drifts": [_drift(drift, column.unit) for drift in column.drifts],
+    }
+
+
+def _step(step: Step, unit: str) -> dict[str, Any]:
+    size = {**_value(step.size, unit), "standard_uncertainty": _number(step.standard_uncertainty)}
+    return {"time": _value(step.time, "s"), "size": size}
+
+
+def _drift(drift: Drift, unit: str) -> dict[str, Any]:
+    return {
+        "follows": drift.covariate,
+        "slope": {
+            "value": _number(drift.slope),
+            "unit": drift_unit(drift.covariate, unit),
+            "standard_uncertainty": _number(drift.standard_uncertainty),
+        },
+        "gain": _number(drift.found.gain),
+        "significant": drift.found.follows,
+        "removed": drift.taken,
+        "model_without": drift.letters[0],
+        "model_with": drift.letters[1],
     }
 
 

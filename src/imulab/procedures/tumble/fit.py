@@ -171,11 +171,7 @@ def fit_tumble(
     known = None if prior is None else as_record(prior, "fit_tumble: prior")
     if known is not None:
         order = _prior_order(known, order, attitudes)
-    rest = None
-    if method == "linearised":
-        rest = SOURCE_THRESHOLD
-        if threshold is not None:
-            rest = Threshold(threshold[0], threshold[1] / local.value, threshold[2])
+    rest = _threshold(threshold, local.value) if method == "linearised" else None
     estimate = estimate_triad(
         attitudes, local, scaling, order, loss, rest,
         nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross,
@@ -204,6 +200,11 @@ def fit_tumble(
         residuals=local.value * estimate.found.solution.deviations[0],
         down_weights=estimate.found.solution.down_weights[0],
     )
+
+
+def _threshold(given: Sequence[float] | None, gravity: float) -> Threshold:
+    """Return the changes at which method linearised rests, biases in g."""
+    return SOURCE_THRESHOLD if given is None else Threshold(given[0], given[1] / gravity, given[2])
 
 
 def estimate_triad(

@@ -16,11 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.least_squares import Observability, covariance, observability
-from imulab.estimation.rows import leave_out
+from imulab.estimation.rows import LeftOut, leave_out
 from imulab.procedures.tumble.apply import output_factor, specific_force
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.choices import CLOCKS, SENSITIVITIES
@@ -145,12 +146,8 @@ def fit_gyro(
     if noise is not None:
         found, said_of_noise = _with_noise(found, noise, attitudes, recording)
     known = clock_of_scale(comparison, clock, clock_of, counted=counted(check_time(recording)))
-    rest = np.zeros(len(time), dtype=np.bool_)
-    for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
-        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
-        rest[a:b] = True
     notes = [
-        *(f"gyro: {note}" for note in left_out.notes(rest)),
+        *(f"gyro: {note}" for note in left_out.notes(_at_rest(attitudes, time, left_out))),
         *said,
         *said_of_noise,
         *found.notes,
@@ -186,6 +183,15 @@ def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, 
         raise OptionError(f"clock {clock:g}: expected the relative uncertainty of a clock's rate, such as 50 ppm")
     if attitudes.trace is None:
         raise SegmentError(f"{attitudes.recording.name}: a table of attitudes has no turns between them")
+
+
+def _at_rest(attitudes: Attitudes, time: Array, left_out: LeftOut) -> NDArray[np.bool_]:
+    """Return which samples belong to an attitude, shape (n,); refuse one of which too many are left out."""
+    rest = np.zeros(len(time), dtype=np.bool_)
+    for a, b in np.searchsorted(time, np.column_stack([attitudes.start, attitudes.stop])).tolist():
+        left_out.check(a, b, f"the attitude at {time[a]:.1f} to {time[b - 1]:.1f} s")
+        rest[a:b] = True
+    return rest
 
 
 def _with_noise(

@@ -131,12 +131,7 @@ def find_attitudes(
     left_out = leave_out(recording, names)
     given, recording = recording, left_out.recording
     blocks = _form_blocks(recording, names, time, window)
-    width = max(3, round(window / blocks.duration))
-    if len(blocks.mean) < 2 * width:
-        raise SegmentError(
-            f"{recording.name}: {len(recording)} samples over {time[-1] - time[0]:.3g} s are too few to find static "
-            f"attitudes with a window of {window:g} s"
-        )
+    width = _window_width(blocks, recording, time, window)
     variance = _window_variance(blocks, width)
     quiet, resolution = _quietest(variance, recording, names)
     pieces, threshold = _sweep(variance, quiet, blocks, width, settling, shortest)
@@ -222,6 +217,17 @@ def _form_blocks(recording: Recording, names: list[str], time: Array, window: fl
     x, y, z = (np.ascontiguousarray(recording.column(name), dtype=np.float64) for name in names)
     _segment.blocks(x, y, z, np.ascontiguousarray(time), length, mean, scatter, longest)
     return _Blocks(mean, scatter, length, length * step, longest > max(_GAP_SECONDS, _GAP_STEPS * step))
+
+
+def _window_width(blocks: _Blocks, recording: Recording, time: Array, window: float) -> int:
+    """Return the length of the window in blocks; refuse a recording of less than two."""
+    width = max(3, round(window / blocks.duration))
+    if len(blocks.mean) < 2 * width:
+        raise SegmentError(
+            f"{recording.name}: {len(recording)} samples over {time[-1] - time[0]:.3g} s are too few to find static "
+            f"attitudes with a window of {window:g} s"
+        )
+    return width
 
 
 def _window_variance(blocks: _Blocks, width: int) -> Array:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import OptionError
 from imulab.procedures.tumble.choices import HIGHEST_ORDER
 from imulab.procedures.tumble.mag.simulate import Turns, rotate, simulate_field
@@ -113,23 +114,12 @@ def simulate_tumble(
     sample_rate, gravity = in_si(rate, "rate", "frequency", "Hz"), in_si(gravity, "gravity", "acceleration", "m/s^2")
     hold, move = in_si(hold, "hold", "time", "s"), in_si(move, "move", "time", "s")
     noise = in_si(noise, "noise", "acceleration", "mg")
-    _check(order, sample_rate, hold, move, noise, gravity)
-    if seed < 0:
-        raise OptionError(f"seed {seed}: expected a whole number from 0")
+    _check(order, sample_rate, hold, move, noise, gravity, seed)
     rng = np.random.default_rng(seed)
-    if isinstance(attitudes, int | str):
-        directions = _spread(whole(attitudes, "attitudes"), rng)
-    else:
-        directions = np.asarray(attitudes, dtype=np.float64)
-        if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():
-            raise OptionError(f"attitudes: expected upward directions, shape (n, 3), found shape {directions.shape}")
+    directions = _directions(attitudes, rng)
     if knock is not None and not 1 <= knock <= len(directions):
         raise OptionError(f"knock {knock}: expected the number of an attitude, 1 to {len(directions)}")
-    nominal = _nominal_scale(unit, scale)
-    sensor = _random_sensor(rng, order, nominal) if truth is None else dict(truth)
-    for name in _random_sensor(np.random.default_rng(0), 1, nominal):
-        if name not in sensor:
-            raise OptionError(f"truth: no {name!r}; expected bias, scale factor and misalignment of each axis")
+    sensor = _sensor(truth, order, _nominal_scale(unit, scale), rng)
     samples = len(directions) * (hold + move) * sample_rate
     if samples > _MOST_SAMPLES:
         raise OptionError(f"{samples:.3g} samples of all attitudes together: expected at most {_MOST_SAMPLES:.0e}")
@@ -142,28 +132,53 @@ def simulate_tumble(
     output = _forward(felt + noise * rng.standard_normal(felt.shape), sensor)
     if parse_unit(unit).symbol == "count":
         output = np.round(output)
-    columns = {"time": path.time} | {f"accel_{a}": output[:, i].copy() for i, a in enumerate("xyz")}
-    units = {"time": "s"} | {f"accel_{a}": unit for a in "xyz"}
+    columns, units = {"time": path.time}, {"time": "s"}
+    _put(columns, units, "accel", output, unit)
     if gyro:
         rates, gyro_truth = _gyro(path.rate, rng)
         sensor |= gyro_truth
-        columns |= {f"gyro_{a}": rates[:, i].copy() for i, a in enumerate("xyz")}
-        units |= {f"gyro_{a}": "deg/s" for a in "xyz"}
+        _put(columns, units, "gyro", rates, "deg/s")
     if field is not None:
         magnitude, sloped = in_si(field, "field", "magnetic field", "uT"), in_si(dip, "dip", "angle", "deg")
         outputs, mag_truth = simulate_field(path.turns, directions[0], magnitude, sloped, seed)
         sensor |= mag_truth
-        columns |= {f"mag_{a}": outputs[:, i].copy() for i, a in enumerate("xyz")}
-        units |= {f"mag_{a}": "uT" for a in "xyz"}
+        _put(columns, units, "mag", outputs, "uT")
     columns["temperature"] = np.round(temperature + 0.05 * rng.standard_normal(len(path.time)), 2)
-    columns |= {f"truth_accel_{a}": force[:, i].copy() for i, a in enumerate("xyz")}
-    units |= {"temperature": "degC"} | {f"truth_accel_{a}": "m/s^2" for a in "xyz"}
+    units["temperature"] = "degC"
+    _put(columns, units, "truth_accel", force, "m/s^2")
     metadata = {"serial": f"SIM-{seed:04d}", "model": "simulated triad", "gravity": f"{gravity!r} m/s^2"}
     metadata |= {f"truth_{name}": repr(float(value)) for name, value in sensor.items()}
     return Recording(columns=columns, units=units, metadata=metadata, name="simulated tumble")
 
 
-def _check(order: int, sample_rate: float, hold: float, move: float, noise: float, gravity: float) -> None:
+def _directions(given: int | str | Array, rng: np.random.Generator) -> Array:
+    """Return the upward directions that were given, or so many spread evenly, shape (n, 3)."""
+    if isinstance(given, int | str):
+        return _spread(whole(given, "attitudes"), rng)
+    directions = np.asarray(given, dtype=np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():
+        raise OptionError(f"attitudes: expected upward directions, shape (n, 3), found shape {directions.shape}")
+    return directions
+
+
+def _sensor(
+    truth: Mapping[str, float] | None, order: int, nominal: float, rng: np.random.Generator
+) -> dict[str, float]:
+    """Return the parameters that were given, or random ones."""
+    sensor = _random_sensor(rng, order, nominal) if truth is None else dict(truth)
+    for name in _random_sensor(np.random.default_rng(0), 1, nominal):
+        if name not in sensor:
+            raise OptionError(f"truth: no {name!r}; expected bias, scale factor and misalignment of each axis")
+    return sensor
+
+
+def _put(columns: dict[str, Array], units: dict[str, str], stem: str, values: Array, unit: str) -> None:
+    """Add the columns of a triad, shape (m, 3)."""
+    for name, column in zip(triad(stem), values.T, strict=True):
+        columns[name], units[name] = column.copy(), unit
+
+
+def _check(order: int, sample_rate: float, hold: float, move: float, noise: float, gravity: float, seed: int) -> None:
     if not 1 <= order <= HIGHEST_ORDER:
         raise OptionError(f"order {order}: expected 1 to {HIGHEST_ORDER}")
     for name, value, low, high in (
@@ -175,6 +190,8 @@ def _check(order: int, sample_rate: float, hold: float, move: float, noise: floa
     ):
         if not low <= value <= high:
             raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
+    if seed < 0:
+        raise OptionError(f"seed {seed}: expected a whole number from 0")
 
 
 def _spread(count: int, rng: np.random.Generator) -> Array:

@@ -9,7 +9,16 @@ import numpy as np
 from imulab.procedures.warmup.engineering import engineering_unit
 from imulab.procedures.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
 from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
-from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of, model_of
+from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of
+from imulab.procedures.warmup.tables import (
+    axes_by_kind,
+    largest_text,
+    models_table,
+    rms_of,
+    rms_text,
+    tests_table,
+    units_table,
+)
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import (
@@ -27,7 +36,6 @@ from imulab.report.elements import (
 from imulab.report.traces import rounded, scatter
 
 _POINTS = 121
-_LOST = "in noise"
 _INSTANTS = (0.0, 30.0, 100.0, 200.0)
 
 
@@ -36,40 +44,41 @@ def exhibits(record: Calibration) -> Exhibits:
     table = record_table(record)
     if not record.fit:
         return _handmade(table)
-    kinds = _kinds(table)
+    by_kind = axes_by_kind(table)
     fit = drawn_of(record).fit
     chosen, none = fit.row(), fit.row("none")
-    head, (label, factor) = next(iter(kinds.values())), engineering_unit(table.units[0])
-    before, after = (_rms(row.training, head) * factor for row in (none, chosen))
+    head, (label, factor) = next(iter(by_kind.values())), engineering_unit(table.units[0])
+    before, after = (rms_of(row.training, head) * factor for row in (none, chosen))
     left = f"{plain_number(after, 2)} {label}" if after > 0 else "nothing above the noise"
     floor = fit.repeatability.cycle
+    repeat = rms_text(floor, head, factor, f" {label}")
     edges = table.model == "interval-cubic"
     jump = ("largest edge jump", chosen.edge_jump) if edges else ("largest |Z(T_M)|", chosen.exit_jump)
     facts = [
-        ("left at the tests", _text(chosen.training, head, factor, f" {label}")),
-        ("temperature left out", _text(chosen.left_temperature, head, factor, f" {label}")),
+        ("left at the tests", rms_text(chosen.training, head, factor, f" {label}")),
+        ("temperature left out", rms_text(chosen.left_temperature, head, factor, f" {label}")),
         *_worst(record, fit, table, head, factor, label),
-        ("repeatability", _text(floor, head, factor, f" {label}")),
-        (jump[0], f"{_largest(jump[1], head, factor)} {label}"),
+        ("repeatability", repeat),
+        (jump[0], f"{largest_text(jump[1], head, factor)} {label}"),
         ("settling time T_M", f"{table.settling_time:g} s"),
         ("power cycles", str(fit.cycles)),
     ]
     items: list[Figure | ReportTable] = []
-    for kind, index in kinds.items():
-        items.append(_models(record, table, kind, index))
+    for kind, index in by_kind.items():
+        items.append(models_table(record, table, kind, index))
     if fit.repeatability.unit is not None:
-        items.append(_units(fit, table, kinds, fit.repeatability.unit))
-    for kind, index in kinds.items():
+        items.append(units_table(fit, table, by_kind, fit.repeatability.unit))
+    for kind, index in by_kind.items():
         items.append(_cycles(record, table, kind, index))
-    for kind, index in kinds.items():
+    for kind, index in by_kind.items():
         items.append(_residuals(record, table, kind, index))
-    for kind, index in kinds.items():
+    for kind, index in by_kind.items():
         items.append(_by_temperature(record, table, kind, index))
-    items += [_over_temperature(table), _tests(record, table)]
+    items += [_over_temperature(table), tests_table(record, table)]
     return Exhibits(
         headline=f"The {chosen.model} table leaves {left} of "
         f"{plain_number(before, 2)} {label} rms in the {table.settling_time:g} s after power-on"
-        + (f"; power cycles repeat to {_text(floor, head, factor, f' {label}')}." if _rms(floor, head) > 0 else "."),
+        + (f"; power cycles repeat to {repeat}." if rms_of(floor, head) > 0 else "."),
         facts=facts,
         items=items,
     )
@@ -86,9 +95,9 @@ def summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
         label, factor = engineering_unit(table.units[i])
         cells = ["–" if z is None else plain_number(float(z[i, 0]) * factor, 3) for z in first]
         if fit is not None:
-            cells += [_text(fit.row(name).training, [i], factor) for name in ("none", None)]
+            cells += [rms_text(fit.row(name).training, [i], factor) for name in ("none", None)]
             floor, u = fit.repeatability.cycle[i], fit.repeatability.standard_uncertainty[i]
-            known = format_uncertain(floor * factor, u * factor) if floor and u else [_text([floor], [0], factor)]
+            known = format_uncertain(floor * factor, u * factor) if floor and u else [rms_text([floor], [0], factor)]
             cells.append(" ± ".join(known))
         rows.append([axis, *cells, label])
     titles = ["rms before", "rms after", "cycles repeat to"] if fit is not None else []
@@ -103,7 +112,7 @@ def _worst(
     names = [f"worst_temperature_error_{table.axes[i]}" for i in index]
     if at is None or not all(name in record.parameters for name in names):
         return []
-    error = _text([record.value(name) for name in names], list(range(len(names))), factor, f" {label}")
+    error = rms_text([record.value(name) for name in names], list(range(len(names))), factor, f" {label}")
     return [(f"at worst, near {at.value:.3g} °C", error)]
 
 
@@ -114,91 +123,6 @@ def _handmade(table: WarmupTable) -> Exhibits:
         facts=[("model", table.model), ("T_M", f"{table.settling_time:g} s"), ("axes", " ".join(table.axes))],
         items=[_over_temperature(table)],
     )
-
-
-def _kinds(table: WarmupTable) -> dict[str, list[int]]:
-    found: dict[str, list[int]] = {}
-    for i, axis in enumerate(table.axes):
-        found.setdefault("gyroscopes" if axis.startswith("gyro") else "accelerometers", []).append(i)
-    return found
-
-
-def _rms(values: list[float | None] | None, index: list[int]) -> float:
-    chosen = [values[i] for i in index] if values else [None]
-    if any(value is None for value in chosen):
-        return float("nan")
-    return float(np.sqrt(np.mean(np.square(np.array(chosen, dtype=np.float64)))))
-
-
-def _text(values: list[float | None] | None, index: list[int], factor: float, unit: str = "") -> str:
-    """Root mean square of some axes as text; what is not above the white noise has no number."""
-    value = _rms(values, index) * factor
-    if np.isnan(value):
-        return "–"
-    return f"{plain_number(value, 2)}{unit}" if value > 0 else _LOST
-
-
-def _models(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
-    label, factor = engineering_unit(table.units[index[0]])
-    rows, highlight = [], None
-    fit = drawn_of(record).fit
-    for number, row in enumerate(fit.models):
-        if row.chosen:
-            highlight = number
-        scales = ", ".join(plain_number(value, 3) for value in row.scales) or "–"
-        none = row.model == "none"
-        rows.append(
-            [
-                row.model,
-                _text(row.training, index, factor),
-                "–" if none else _text(row.left_cycle, index, factor),
-                _text(row.left_temperature, index, factor),
-                "–" if none else _largest(row.edge_jump, index, factor),
-                "–" if none else _largest(row.exit_jump, index, factor),
-                scales,
-            ]
-        )
-    floor = _text(fit.repeatability.cycle, index, factor, f" {label}")
-    what = "unit" if model_of(record).pool == "type" else "cycle"
-    return ReportTable(
-        title=f"Models compared, {kind}, {label}",
-        caption="Root mean square over all axes and the time t after power-on up to T_M, from which the unit is "
-        "settled and nothing is subtracted; white noise taken off. Z is what the table subtracts. Columns: the cycles "
-        f"fitted, of each {what} left out, of each temperature left out (its neighbours are then twice as far as in "
-        "use); largest jump where a power-on temperature crosses an edge; largest |Z(T_M)|, which exit zero drops at "
-        f"once. No table can beat the repeatability of cycles, {floor}.",
-        columns=["model", "at tests", f"{what} left out", "temp. left out", "edge jump", "|Z(T_M)|", "tau, s"],
-        rows=rows,
-        highlight=highlight,
-    )
-
-
-def _units(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units: list[float | None]) -> ReportTable:
-    """Whether one table for the type is enough, axis by axis."""
-    found = fit.repeatability
-    rows = []
-    for index in kinds.values():
-        for i in index:
-            label, factor = engineering_unit(table.units[i])
-            unit, cycle, uncertainty = units[i], found.cycle[i], found.standard_uncertainty[i]
-            verdict = "–"
-            if unit is not None and cycle is not None and uncertainty is not None:
-                verdict = "each unit" if unit > cycle + 2 * uncertainty else "one per type"
-            shown = [_text(values, [i], factor) for values in (units, found.cycle)]
-            rows.append([table.axes[i], *shown, verdict, label])
-    return ReportTable(
-        title=f"Spread between {fit.units} units",
-        caption="Root mean square deviation of a unit's curve from that of the type, beside that of a cycle from its "
-        "unit. Where units differ clearly more than their cycles do (by two standard uncertainties of the latter), a "
-        "table for each unit would gain; otherwise one per type is enough.",
-        columns=["axis", "between units", "between cycles", "table for", "unit"],
-        rows=rows,
-    )
-
-
-def _largest(values: list[float | None], index: list[int], factor: float) -> str:
-    known = [value for i in index if (value := values[i]) is not None]
-    return plain_number(max(known) * factor, 2) if known else "–"
 
 
 def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
@@ -310,14 +234,14 @@ def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: l
         lines.insert(1, ("interval-cubic", source.by_temperature, "#b08a3e", "dashdot", "triangle-up"))
     traces = []
     for name, rows, colour, dash, symbol in lines:
-        values = [_rms(row, index) * factor for row in rows]
+        values = [rms_of(row, index) * factor for row in rows]
         points = [(t, v) for t, v in zip(knots, values, strict=True) if np.isfinite(v) and v > 0]
         if points:
             x, y = [t for t, _ in points], rounded([v for _, v in points], 4)
             line, marker = {"color": colour, "dash": dash}, {"symbol": symbol, "size": 8}
             hover = f"{name}<br>%{{x:g}} degC: %{{y:.3g}} {label}<extra></extra>"
             traces.append(scatter(x, y, "lines+markers", name=name, line=line, marker=marker, hovertemplate=hover))
-    after = [(_rms(row, index) * factor, at) for row, at in zip(chosen.by_temperature, knots, strict=True)]
+    after = [(rms_of(row, index) * factor, at) for row, at in zip(chosen.by_temperature, knots, strict=True)]
     worst, at = max((pair for pair in after if pair[0] > 0), default=(0.0, 0.0))
     return Figure(
         message=f"The chosen table is farthest off at {at:g} degC: {plain_number(worst, 2)} {label}.",
@@ -345,7 +269,7 @@ def _over_temperature(table: WarmupTable) -> Figure:
     spread = np.abs(z[:, :, 0]).max(axis=0)
     traces: list[dict[str, Any]] = []
     names = []
-    for number, index in enumerate(_kinds(table).values()):
+    for number, index in enumerate(axes_by_kind(table).values()):
         i = index[int(np.argmax(spread[index]))]
         label, factor = engineering_unit(table.units[i])
         names.append((table.axes[i], label))
@@ -376,35 +300,4 @@ def _over_temperature(table: WarmupTable) -> Figure:
         traces=traces,
         layout=layout,
         height=380,
-    )
-
-
-def _tests(record: Calibration, table: WarmupTable) -> ReportTable:
-    label, factor = engineering_unit(table.units[0])
-    head = next(iter(_kinds(table).values()))
-    drawn = drawn_of(record)
-    chosen = drawn.fit.row()
-    rows = []
-    for k, at in enumerate(drawn.data.knots):
-        members = [cycle for cycle in drawn.data.cycles if cycle.calibration_temperature == at]
-        power_on = [cycle.power_on_temperature for cycle in members]
-        drift = [None if (moved := cycle.settled_drift[i]) is None else abs(moved) for cycle in members for i in head]
-        rows.append(
-            [
-                f"{at:g}",
-                str(len(members)),
-                f"{min(power_on):.2f} to {max(power_on):.2f}",
-                _text(drawn.fit.repeatability.by_temperature[k], head, factor),
-                _text(chosen.by_temperature[k], head, factor),
-                _text(chosen.left_by_temperature[k], head, factor),
-                _largest(drift, list(range(len(drift))), factor),
-                f"{min(cycle.end for cycle in members):g}",
-            ]
-        )
-    return ReportTable(
-        title=f"The test, by temperature ({label})",
-        caption="Repeatability, what is left, and what is left where this temperature was kept out of the fit; largest "
-        "change of the settled part from T_M to its end; end of the shortest cycle.",
-        columns=["degC", "cycles", "power-on, degC", "repeatability", "left", "left out", "settled drift", "end, s"],
-        rows=rows,
     )

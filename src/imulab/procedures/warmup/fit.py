@@ -136,13 +136,8 @@ def fit_warmup(
     order = common_axes(found)
     found = [with_axes(cycle, order) for cycle in found]
     _check_units(found, pool)
-    named = settling_size(settling_limit, "settling_limit") if isinstance(settling_limit, str) else settling_limit
-    limit = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE)
-    for kind in named:
-        if kind not in limit:
-            raise OptionError(f"settling_limit {kind!r}: expected limits for {listed(limit, kind)}")
-    limit |= named
-    curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limit)
+    limits = _limits(settling_limit)
+    curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limits)
     spread = repeatability(curves)
     by_unit = pool == "type" and np.unique(curves.unit).size > 1
     weights = cycle_weights(curves, spread) if by_unit else np.ones(len(found))
@@ -173,6 +168,16 @@ def fit_warmup(
         },
     )
     return WarmupFit(record, table, tuple(rows), spread, curves)
+
+
+def _limits(given: Mapping[str, float] | str) -> dict[str, float]:
+    """Return kind to the size of Z that counts as settled, in SI, or less its share of the largest."""
+    named = settling_size(given, "settling_limit") if isinstance(given, str) else given
+    limits = dict.fromkeys(("gyro", "accel"), -SETTLING_SHARE)
+    for kind in named:
+        if kind not in limits:
+            raise OptionError(f"settling_limit {kind!r}: expected limits for {listed(limits, kind)}")
+    return limits | dict(named)
 
 
 def _cycles(

@@ -198,6 +198,14 @@ def plan_warmup(
     proposal = sorted(
         {*at, *(round(float(t), 6) for low, high in wide for t in np.linspace(low, high, _pieces(low, high) + 1))}
     )
+    warnings = _warnings(wide, proposal, count, record)
+    return WarmupPlan(tuple(steps), clock, at, count, warnings, tuple(proposal), record, walk, share)
+
+
+def _warnings(
+    wide: Sequence[tuple[float, float]], proposal: Sequence[float], count: int, record: float
+) -> tuple[str, ...]:
+    """Return what the test cannot show: within wide intervals, with one cycle, in short recordings."""
     warnings = tuple(
         f"the interval {low:g} to {high:g} degC is {high - low:g} K wide: interval-cubic uses the mean of both ends "
         "for all of it, wrong by half of their difference just inside each end, and no model sees a bend between them; "
@@ -211,7 +219,7 @@ def plan_warmup(
             f"recordings of {record:g} s: warm-up takes about 300 s, and 30 s more make the settled reference: "
             "record longer",
         )
-    return WarmupPlan(tuple(steps), clock, at, count, warnings, tuple(proposal), record, walk, share)
+    return warnings
 
 
 def _hours(seconds: float) -> str:

@@ -193,6 +193,14 @@ def _scatter(joint: Joint) -> list[str]:
     ]
 
 
+def _set_aside(label: str, one: Disturbed) -> str:
+    return (
+        f"mag: {label} set aside: |m| {100 * abs(one.magnitude):.2g} % "
+        f"{'high' if one.magnitude > 0 else 'low'}, dip {np.degrees(abs(one.dip)):.2g} deg "
+        f"{'high' if one.dip > 0 else 'low'} against the others (p {one.probability:.1g}): iron or a vehicle near?"
+    )
+
+
 def _warnings(
     ready: Ready,
     joint: Joint,
@@ -201,13 +209,8 @@ def _warnings(
     moved: Mapping[str, float],
     options: Mapping[str, Any],
 ) -> list[str]:
-    attitudes, found = ready.estimate.attitudes, list[str]()
-    for one in aside:
-        found.append(
-            f"mag: {attitudes.label(one.index)} set aside: |m| {100 * abs(one.magnitude):.2g} % "
-            f"{'high' if one.magnitude > 0 else 'low'}, dip {np.degrees(abs(one.dip)):.2g} deg "
-            f"{'high' if one.dip > 0 else 'low'} against the others (p {one.probability:.1g}): iron or a vehicle near?"
-        )
+    attitudes = ready.estimate.attitudes
+    found = [_set_aside(attitudes.label(one.index), one) for one in aside]
     n = len(joint.pair.mag)
     if n < _FEW:
         found.append(f"mag: {n} attitudes leave little to tell the noise from; {_FEW} or more are asked for")
