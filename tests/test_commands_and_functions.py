@@ -57,8 +57,8 @@ OTHERWISE = {
     "tumble gyro": {"accel", "accel_file"},  # the first argument; accel_data, which may be no file
     "array calibrate": {"interval"},  # window
     "array fuse": {"rate"},  # of arrays and files, a keyword of reading
-    "array compare": {"experiment", "seeds"},
-    "noise fit": {"for_", "rate", "step", "regress", "steps"},  # NoiseFit.wants; None is what the words no and say mean
+    "array compare": {"experiment", "seeds"},  # of the command alone: it simulates what the source had
+    "noise fit": {"for_", "rate", "step"},  # NoiseFit.wants
 }
 """Options that functions have by another name, or say in another way."""
 COMMANDS = dict(common.commands_of(command()))

@@ -6,8 +6,10 @@ from imulab.errors import OptionError, listed
 
 HORIZON = 10.0
 """s over which a filter predicts alone."""
+NO_COVARIATE = "no"
 COVARIATES = ("time", "temperature")
-STEPS = ("say", "remove")
+SAY_STEPS = "say"
+STEPS = (SAY_STEPS, "remove")
 LETTERS = {"N": "white", "B": "1/f", "K": "random walk", "G": "Gauss-Markov", "Q": "quantisation of the angle"}
 _REJECTED = 0.01
 
@@ -52,7 +54,7 @@ def check_options(
         raise OptionError(f"{label.format('horizon')} {horizon:g} s: expected more than 0")
     if band is not None and not 0 < band < 1e9:
         raise OptionError(f"{label.format('band')} {band:g} Hz: expected more than 0")
-    if regress is not None and regress not in COVARIATES:
-        raise OptionError(f"{label.format('regress')} {regress!r}: expected one of {listed(COVARIATES, regress)}")
+    if regress not in (None, NO_COVARIATE, *COVARIATES):
+        raise OptionError(f"{label.format('regress')} {regress!r}: expected one of {listed(COVARIATES, str(regress))}")
     if steps is not None and steps not in STEPS:
         raise OptionError(f"{label.format('steps')} {steps!r}: expected one of {listed(STEPS, steps)}")

@@ -20,7 +20,7 @@ from imulab.estimation.noise.regression import Regression, ramp_coefficients
 from imulab.estimation.noise.rest import Rest, at_rest
 from imulab.frames import is_frame
 from imulab.procedures.inputs import Data, Reading, as_recording
-from imulab.procedures.noise.choices import HORIZON, check_options
+from imulab.procedures.noise.choices import HORIZON, NO_COVARIATE, SAY_STEPS, check_options
 from imulab.procedures.noise.record import make_record
 from imulab.procedures.result import Result
 from imulab.recording import Array, Recording, Source
@@ -101,9 +101,9 @@ def fit_noise(
     terms: str = "auto",
     horizon: float = HORIZON,
     band: float | None = None,
-    regress: str | None = None,
+    regress: str | None = NO_COVARIATE,
     columns: Sequence[str] | None = None,
-    steps: str | None = None,
+    steps: str | None = SAY_STEPS,
     **reading: Unpack[Reading],
 ) -> NoiseFit:
     """Fit a model of the noise to every sensor column of logs at rest, by maximum likelihood of its spectrum.
@@ -126,11 +126,11 @@ def fit_noise(
     band
         Highest frequency to use, Hz; up to where the spectrum is flat if not given.
     regress
-        ``time`` or ``temperature``: take out what follows it.
+        ``time`` or ``temperature``: take out what follows it; ``no``: nothing.
     columns
         Which columns; all outputs of sensors if not given.
     steps
-        ``remove``: take changes of level out, which else are said.
+        ``remove``: take changes of level out; ``say``: only say them.
     reading
         How arrays and files are to be understood: `rate` and `unit`; `layout`, `window` ...
 
@@ -189,6 +189,8 @@ def fit_recordings(
     sources: Iterable[Source] = (),
 ) -> NoiseFit:
     """Fit noise models to the columns of recordings at rest; arguments and errors as for `fit_noise`."""
+    # A record holds what was asked for beyond the usual; old ones are fitted as they say.
+    regress, steps = None if regress == NO_COVARIATE else regress, None if steps == SAY_STEPS else steps
     rests = read_rests(recordings, columns)
     names = chosen_columns(rests[0].recording, columns)
     longest = max(stop[1] - stop[0] for rest in rests for stop in rest.parts) * rests[0].interval

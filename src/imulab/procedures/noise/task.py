@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.procedures.noise.choices import COVARIATES, HORIZON, STEPS, check_terms
+from imulab.procedures.noise.choices import COVARIATES, HORIZON, NO_COVARIATE, SAY_STEPS, STEPS, check_terms
 from imulab.procedures.options import ELEMENT, READING, Option, choice, measure, names_of_columns, part_of, read_options
 from imulab.procedures.procedure import Files, Task, source_of
 
@@ -28,9 +28,9 @@ OPTIONS = (
     Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
     measure("horizon", "Time that a filter predicts without aiding, s.", "time", "s", f"{HORIZON:g} s", shows="TIME"),
     measure("band", "Highest frequency to use, Hz; found from the spectrum if not given.", "frequency", "Hz"),
-    choice("regress", "Take out what follows it.", ("no", *COVARIATES), "no"),
+    choice("regress", "Take out what follows it.", (NO_COVARIATE, *COVARIATES), NO_COVARIATE),
     Option("columns", "Columns to fit; all sensors if not given.", names_of_columns, shows="A,A,..."),
-    choice("steps", "Changes of level: say them, or remove them too.", STEPS, "say"),
+    choice("steps", "Changes of level: say them, or remove them too.", STEPS, SAY_STEPS),
     *READING,
     ELEMENT,
 )
@@ -40,8 +40,6 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.procedures.noise.choices import check_options
 
     values = read_options(OPTIONS, texts, label)
-    for name, nothing in (("regress", "no"), ("steps", "say")):
-        values[name] = None if values[name] == nothing else values[name]
     check_options(values["terms"], values["horizon"], values["band"], values["regress"], values["steps"], label)
     return {**values, "part": part_of(values)}
 
