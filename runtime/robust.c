@@ -203,7 +203,7 @@ static void learn(const il_array *a, const il_robust_terms *t, il_array_axis *s,
 /* Who is trusted, who is inside, who is used, who teaches. Returns the number used. */
 static int32_t choose(const il_array *a, il_array_axis *s, const il_real *z, il_sample *p) {
     int32_t used = 0, nearest = -1;
-    gates(a, s, z, p, il_robust_roll_call(a, s, p));
+    gates(a, s, z, p, il_robust_choose_trusted(a, s, p));
     il_robust_judge(a, s, p);
     trust(a, s, p);
     for (int32_t i = 0; i < a->elements; i++) {
@@ -282,7 +282,7 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         il_robust_settle(a, s);
         if (il_robust_examine(a, s, z, reading, &p) || !well) {
             const il_real rate = look_closely(a, t, s, z, &p);
-            il_robust_muster(a, s);
+            il_robust_assess(a, s);
             return rate;
         }
         for (int32_t i = 0; i < a->elements; i++) il_count(&s->seen[i]);
@@ -296,7 +296,7 @@ il_real il_robust_step(const il_array *a, const il_robust_terms *t, il_array_axi
         p.learnt = il_most_seen(a, s) - 1;
         memset(p.learns, 1, sizeof p.learns);
         find_small_jumps(a, t, s, &p);
-        il_robust_muster(a, s);
+        il_robust_assess(a, s);
     }
     il_robust_pass(t, s, p.rate);
     return p.rate;

@@ -128,13 +128,13 @@ int il_robust_learn_well(const il_array *a, const il_robust_terms *t, il_array_a
 /* robust_standing.c: who is usable (returns whether anything needs a closer look), who is trusted (returns how many),
  * what the sample does to the standing of each, and what is told of it. */
 int il_robust_examine(const il_array *a, il_array_axis *s, const il_real *z, const il_real *reading, il_sample *p);
-int32_t il_robust_roll_call(const il_array *a, il_array_axis *s, il_sample *p);
+int32_t il_robust_choose_trusted(const il_array *a, il_array_axis *s, il_sample *p);
 void il_robust_judge(const il_array *a, il_array_axis *s, const il_sample *p);
 void il_robust_report(const il_array *a, il_array_axis *s, const il_sample *p, int32_t used);
 
 /* A gyro has jumped; count the samples since the last time in which all was well; whether it is well from now on. */
 void il_robust_jump(il_array_axis *s, int32_t i);
 void il_robust_settle(const il_array *a, il_array_axis *s);
-void il_robust_muster(const il_array *a, il_array_axis *s);
+void il_robust_assess(const il_array *a, il_array_axis *s);
 
 #endif

@@ -109,7 +109,7 @@ int il_robust_examine(const il_array *a, il_array_axis *s, const il_real *z, con
 }
 
 /* Trusted is who is usable and not waiting. Newcomers wait. */
-int32_t il_robust_roll_call(const il_array *a, il_array_axis *s, il_sample *p) {
+int32_t il_robust_choose_trusted(const il_array *a, il_array_axis *s, il_sample *p) {
     int32_t core = 0, usable = 0;
     for (int32_t i = 0; i < a->elements; i++) {
         if (p->usable[i] && s->seen[i] == 0 && p->learnt > 2 && !(s->standing[i] & IL_STANDS_FRESH)) {
@@ -186,7 +186,7 @@ void il_robust_report(const il_array *a, il_array_axis *s, const il_sample *p, i
 }
 
 /* It is well while all gyros are in use and none is under suspicion. */
-void il_robust_muster(const il_array *a, il_array_axis *s) {
+void il_robust_assess(const il_array *a, il_array_axis *s) {
     uint32_t trouble = s->resolution == IL_C(0.0), differ = 0, full = a->memory > IL_C(0.0) ? UINT32_MAX : a->cap;
     /* a start other than 1 has gains of its own until the memory is full */
     uint32_t least = a->start > 1 && full == a->cap ? full : 2;

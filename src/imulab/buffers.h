@@ -8,8 +8,8 @@
 #include <Python.h>
 #include <stdint.h>
 
-#define ONE ((Py_ssize_t)sizeof(double))    /* bytes of a number, */
-#define INDEX ((Py_ssize_t)sizeof(int64_t)) /* and of an index */
+#define DOUBLE_BYTES ((Py_ssize_t)sizeof(double))
+#define INDEX_BYTES ((Py_ssize_t)sizeof(int64_t))
 
 /* Give buffers back. Returns whether they fit; an exception says what is wrong where they do not. */
 static inline int released(Py_buffer *buffers, int count, int fits, const char *wrong) {
@@ -18,10 +18,10 @@ static inline int released(Py_buffer *buffers, int count, int fits, const char *
     return fits;
 }
 
-#define APART "buffers that do not go together"
+#define WRONG_BUFFERS "buffers that do not go together"
 
 static inline PyObject *done(Py_buffer *buffers, int count, int fits) {
-    return released(buffers, count, fits, APART) ? Py_NewRef(Py_None) : NULL;
+    return released(buffers, count, fits, WRONG_BUFFERS) ? Py_NewRef(Py_None) : NULL;
 }
 
 #define METHOD(name) {#name, name, METH_VARARGS, name##_doc}

@@ -22,19 +22,6 @@ from imulab.procedures.unit_tables import tables_of_all
 from imulab.records.calibration import Calibration
 
 _HEADERS = ("real.h", "array.h", "robust.h")
-_CORE = (
-    "tumble.c",
-    "centrifuge.c",
-    "warmup.c",
-    "array.c",
-    "plain.c",
-    "feedback.c",
-    "robust.c",
-    "robust_standing.c",
-    "robust_well.c",
-    "robust_motion.c",
-    "table.c",
-)
 _CHECKOUT = Path(__file__).resolve().parents[3] / "runtime"
 _ELEMENTS = 32  # IL_ARRAY_ELEMENTS of imulab.h
 _OWN_INCLUDE = re.compile(r'^#include "(?:imulab|real|array|robust)\.h"\n', re.MULTILINE)
@@ -74,6 +61,12 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     return [folder / name for name in (*contents, "unit.blob")]
 
 
+def _core() -> list[str]:
+    """Return the names of the core's sources, as compiled and, in a checkout, as they are there."""
+    folders = (files("imulab") / "core", _CHECKOUT)
+    return sorted({f.name for folder in folders if folder.is_dir() for f in folder.iterdir() if f.name.endswith(".c")})
+
+
 def _source(name: str) -> str:
     """Return a file of the core, as it was compiled; in a checkout it must be what the checkout has.
 
@@ -110,7 +103,7 @@ def _header(tables: Sequence[DeviceTable]) -> str:
 def _amalgamation() -> str:
     """The core's sources as one file, so that a project has one to add."""
     parts = ["/* The core of imulab in one file; the same for every unit. */\n", '#include "imulab.h"\n']
-    for name in (*_HEADERS, *_CORE):
+    for name in (*_HEADERS, *_core()):
         parts += [f"\n/* ==== {name} ==== */\n", _OWN_INCLUDE.sub("", _source(name))]
     return "".join(parts)
 

@@ -119,7 +119,7 @@ static PyObject *walk(PyObject *module, PyObject *args) {
     }
     Py_ssize_t capacity = v[OFFSETS].len < v[SIZES].len ? v[OFFSETS].len : v[SIZES].len;
     if (v[KEYS].len < capacity) capacity = v[KEYS].len;
-    capacity /= INDEX;
+    capacity /= INDEX_BYTES;
     int64_t *offset = v[OFFSETS].buf, *size = v[SIZES].buf, *key = v[KEYS].buf;
     const int fits = start >= 0 && start <= v[BLOCK].len && v[LENGTHS].len >= 256 && kind >= ULOG && kind <= ROSBAG;
     Py_ssize_t count = 0;

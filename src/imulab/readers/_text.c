@@ -306,7 +306,7 @@ static PyObject *parse(PyObject *module, PyObject *args) {
     int problem = OK, fits = prepared && capacity >= 0 && delimiter > 0 && delimiter < 128 && start >= 0 &&
                              start <= last && last <= v[BLOCK].len && row >= 0;
     for (Py_ssize_t i = 0; fits && i < t.fields; i++) {
-        const Py_ssize_t columns = v[OUT].len / ONE / (capacity > 0 ? capacity : 1);
+        const Py_ssize_t columns = v[OUT].len / DOUBLE_BYTES / (capacity > 0 ? capacity : 1);
         fits = t.slots[i] < 0 || (t.slots[i] & ~DATE) < columns;
         t.dated |= t.slots[i] >= 0 && (t.slots[i] & DATE);
     }

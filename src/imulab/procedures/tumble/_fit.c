@@ -39,7 +39,7 @@ static void lay_out(Work *w, double *room) {
 static double evaluate(const Work *w, const double *theta, double *residuals, double *jacobian) {
     double cost = 0.0, force[3];
     for (Py_ssize_t i = 0; i < w->n; i++) {
-        residuals[i] = length(theta, w->reading + 3 * i, w->order, jacobian + i * w->p, force) - 1.0 - w->lengthening[i];
+        residuals[i] = model_length(theta, w->reading + 3 * i, w->order, jacobian + i * w->p, force) - 1.0 - w->lengthening[i];
         cost += w->weights[i] * residuals[i] * residuals[i];
     }
     return cost;
@@ -147,13 +147,13 @@ static int minimise(Work *w, double *theta, double cost, double tolerance, int m
     return most;
 }
 
-const char fit_doc[] =
+const char model_fit_doc[] =
     "fit(theta, reading, weights, lengthening, order, tolerance, most, residuals, jacobian, iterations, converged)\n\n"
     "Minimise sum w (|f| - 1 - lengthening)^2 for each problem. theta (b, p), the start, becomes the solution;\n"
     "weights, lengthening, residuals (b, n), jacobian (b, n, p), iterations int64 (b), converged bool (b); reading\n"
     "(b, n, 3), or (1, n, 3) for all alike.";
 
-PyObject *fit(PyObject *module, PyObject *args) {
+PyObject *model_fit(PyObject *module, PyObject *args) {
     enum { THETA, READING, WEIGHTS, LENGTHENING, RESIDUALS, JACOBIAN, ITERATIONS, CONVERGED, BUFFERS };
     Py_buffer v[BUFFERS];
     int order, most;
@@ -164,11 +164,11 @@ PyObject *fit(PyObject *module, PyObject *args) {
         return NULL;
     }
     const Py_ssize_t problems = v[CONVERGED].len, p = 3 * ((Py_ssize_t)order + 2);
-    const Py_ssize_t n = problems > 0 ? v[WEIGHTS].len / ONE / problems : 0;
-    const int fits = order >= 0 && v[THETA].len == problems * p * ONE && v[WEIGHTS].len == problems * n * ONE &&
+    const Py_ssize_t n = problems > 0 ? v[WEIGHTS].len / DOUBLE_BYTES / problems : 0;
+    const int fits = order >= 0 && v[THETA].len == problems * p * DOUBLE_BYTES && v[WEIGHTS].len == problems * n * DOUBLE_BYTES &&
                      v[LENGTHENING].len == v[WEIGHTS].len && v[RESIDUALS].len == v[WEIGHTS].len &&
-                     v[JACOBIAN].len == v[WEIGHTS].len * p && v[ITERATIONS].len == problems * INDEX &&
-                     (v[READING].len == 3 * n * ONE || v[READING].len == 3 * v[WEIGHTS].len);
+                     v[JACOBIAN].len == v[WEIGHTS].len * p && v[ITERATIONS].len == problems * INDEX_BYTES &&
+                     (v[READING].len == 3 * n * DOUBLE_BYTES || v[READING].len == 3 * v[WEIGHTS].len);
     double *room = fits ? PyMem_Malloc(sizeof(double) * needed((size_t)n, (size_t)p)) : NULL;
     if (room != NULL) {
         const Py_ssize_t next = v[READING].len == 3 * v[WEIGHTS].len ? 3 * n : 0;
@@ -191,7 +191,7 @@ PyObject *fit(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS
         PyMem_Free(room);
     }
-    if (!released(v, BUFFERS, fits, APART)) return NULL;
+    if (!released(v, BUFFERS, fits, WRONG_BUFFERS)) return NULL;
     return room == NULL ? PyErr_NoMemory() : Py_NewRef(Py_None);
 }
 
@@ -221,12 +221,12 @@ static void leave_out_each(Work *w, Work *all, const double *theta, double toler
     }
 }
 
-const char left_out_doc[] =
+const char model_left_out_doc[] =
     "left_out(theta, reading, weights, lengthening, order, tolerance, most, errors) -> None\n\n"
     "Residual |f| - 1 - lengthening of each attitude (n,) under the fit to all others, as by `fit` with its weight set to\n"
     "zero; theta (p,), where each of these fits starts, reading (n, 3), weights and lengthening (n,).";
 
-PyObject *left_out(PyObject *module, PyObject *args) {
+PyObject *model_left_out(PyObject *module, PyObject *args) {
     enum { THETA, READING, WEIGHTS, LENGTHENING, ERRORS, BUFFERS };
     Py_buffer v[BUFFERS];
     int order, most;
@@ -236,8 +236,8 @@ PyObject *left_out(PyObject *module, PyObject *args) {
                           &most, &v[ERRORS])) {
         return NULL;
     }
-    const Py_ssize_t p = 3 * ((Py_ssize_t)order + 2), n = v[ERRORS].len / ONE;
-    const int fits = order >= 0 && v[THETA].len == p * ONE && v[READING].len == 3 * n * ONE && v[ERRORS].len == n * ONE &&
+    const Py_ssize_t p = 3 * ((Py_ssize_t)order + 2), n = v[ERRORS].len / DOUBLE_BYTES;
+    const int fits = order >= 0 && v[THETA].len == p * DOUBLE_BYTES && v[READING].len == 3 * n * DOUBLE_BYTES && v[ERRORS].len == n * DOUBLE_BYTES &&
                      v[WEIGHTS].len == v[ERRORS].len && v[LENGTHENING].len == v[ERRORS].len;
     double *room = fits ? PyMem_Malloc(sizeof(double) * (2 * needed((size_t)n, (size_t)p) + (size_t)n)) : NULL;
     if (room != NULL) {
@@ -253,6 +253,6 @@ PyObject *left_out(PyObject *module, PyObject *args) {
         Py_END_ALLOW_THREADS
         PyMem_Free(room);
     }
-    if (!released(v, BUFFERS, fits, APART)) return NULL;
+    if (!released(v, BUFFERS, fits, WRONG_BUFFERS)) return NULL;
     return room == NULL ? PyErr_NoMemory() : Py_NewRef(Py_None);
 }

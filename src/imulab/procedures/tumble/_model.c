@@ -7,7 +7,7 @@
 
 static const double ALIGNED[3] = {0.0, 0.0, 0.0}; /* order 0 has no misalignment */
 
-double length(const double *theta, const double *reading, int order, double *derivative, double *f) {
+double model_length(const double *theta, const double *reading, int order, double *derivative, double *f) {
     const double *scale = theta + 3, *m = order > 0 ? theta + 6 : ALIGNED;
     double a[3], s[3], slope[3];
     for (int i = 0; i < 3; i++) a[i] = (reading[i] - theta[i]) / scale[i];
@@ -50,11 +50,11 @@ static PyObject *lengths(PyObject *module, PyObject *args) {
     int order;
     (void)module;
     if (!PyArg_ParseTuple(args, "y*y*iw*w*w*", &v[THETA], &v[READING], &order, &v[NORM], &v[JACOBIAN], &v[FORCE])) return NULL;
-    const Py_ssize_t p = 3 * ((Py_ssize_t)order + 2), problems = order >= 0 ? v[THETA].len / ONE / p : 0;
-    const Py_ssize_t n = problems > 0 ? v[NORM].len / ONE / problems : 0;
-    const int fits = order >= 0 && v[THETA].len == problems * p * ONE && v[NORM].len == problems * n * ONE &&
+    const Py_ssize_t p = 3 * ((Py_ssize_t)order + 2), problems = order >= 0 ? v[THETA].len / DOUBLE_BYTES / p : 0;
+    const Py_ssize_t n = problems > 0 ? v[NORM].len / DOUBLE_BYTES / problems : 0;
+    const int fits = order >= 0 && v[THETA].len == problems * p * DOUBLE_BYTES && v[NORM].len == problems * n * DOUBLE_BYTES &&
                      v[JACOBIAN].len == v[NORM].len * p && v[FORCE].len == v[NORM].len * 3 &&
-                     (v[READING].len == n * 3 * ONE || v[READING].len == v[FORCE].len);
+                     (v[READING].len == n * 3 * DOUBLE_BYTES || v[READING].len == v[FORCE].len);
     if (fits) {
         const Py_ssize_t next = v[READING].len == v[FORCE].len ? 3 * n : 0;
         const double *theta = v[THETA].buf, *reading = v[READING].buf;
@@ -62,7 +62,7 @@ static PyObject *lengths(PyObject *module, PyObject *args) {
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t b = 0; b < problems; b++, theta += p, reading += next) {
             for (Py_ssize_t i = 0; i < n; i++, derivative += p, force += 3) {
-                *norm++ = length(theta, reading + 3 * i, order, derivative, force);
+                *norm++ = model_length(theta, reading + 3 * i, order, derivative, force);
             }
         }
         Py_END_ALLOW_THREADS
@@ -95,16 +95,16 @@ static PyObject *noise(PyObject *module, PyObject *args) {
     if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &v[THETA], &v[JACOBIAN], &v[COVARIANCE], &v[LENGTHENING], &v[VARIANCE])) {
         return NULL;
     }
-    const Py_ssize_t all = v[VARIANCE].len / ONE;
-    const Py_ssize_t p = all > 0 ? v[JACOBIAN].len / ONE / all : 0, problems = p > 0 ? v[THETA].len / ONE / p : 0;
+    const Py_ssize_t all = v[VARIANCE].len / DOUBLE_BYTES;
+    const Py_ssize_t p = all > 0 ? v[JACOBIAN].len / DOUBLE_BYTES / all : 0, problems = p > 0 ? v[THETA].len / DOUBLE_BYTES / p : 0;
     const Py_ssize_t n = problems > 0 ? all / problems : 0;
     const int size = v[LENGTHENING].len == 0 ? MOMENTS : AXES;
     const Py_ssize_t square = size * size;
-    const int fits = p >= 6 && n > 0 && v[THETA].len == problems * p * ONE && all == problems * n &&
-                     v[JACOBIAN].len == all * p * ONE && (size == MOMENTS || v[LENGTHENING].len == v[VARIANCE].len) &&
-                     (v[COVARIANCE].len == square * n * ONE || v[COVARIANCE].len == square * all * ONE);
+    const int fits = p >= 6 && n > 0 && v[THETA].len == problems * p * DOUBLE_BYTES && all == problems * n &&
+                     v[JACOBIAN].len == all * p * DOUBLE_BYTES && (size == MOMENTS || v[LENGTHENING].len == v[VARIANCE].len) &&
+                     (v[COVARIANCE].len == square * n * DOUBLE_BYTES || v[COVARIANCE].len == square * all * DOUBLE_BYTES);
     if (fits) {
-        const Py_ssize_t next = v[COVARIANCE].len == square * all * ONE ? square * n : 0;
+        const Py_ssize_t next = v[COVARIANCE].len == square * all * DOUBLE_BYTES ? square * n : 0;
         const double *theta = v[THETA].buf, *derivative = v[JACOBIAN].buf, *covariance = v[COVARIANCE].buf;
         double *lengthening = v[LENGTHENING].buf, *variance = v[VARIANCE].buf;
         for (Py_ssize_t b = 0; b < problems; b++, theta += p, covariance += next) {
@@ -139,4 +139,5 @@ static PyObject *noise(PyObject *module, PyObject *args) {
     return done(v, BUFFERS, fits);
 }
 
-MODULE(_model, "The inverse error model of a triad.", METHOD(lengths), METHOD(noise), METHOD(fit), METHOD(left_out))
+MODULE(_model, "The inverse error model of a triad.", METHOD(lengths), METHOD(noise),
+       {"fit", model_fit, METH_VARARGS, model_fit_doc}, {"left_out", model_left_out, METH_VARARGS, model_left_out_doc})

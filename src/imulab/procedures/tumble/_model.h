@@ -5,11 +5,11 @@
 #include "buffers.h"
 
 /* |f| in one attitude, its derivatives (3 (order + 2) of them), and f. */
-double length(const double *theta, const double *reading, int order, double *derivative, double *f);
+double model_length(const double *theta, const double *reading, int order, double *derivative, double *f);
 
 /* The methods `fit` and `left_out`. */
-extern const char fit_doc[], left_out_doc[];
-PyObject *fit(PyObject *module, PyObject *args);
-PyObject *left_out(PyObject *module, PyObject *args);
+extern const char model_fit_doc[], model_left_out_doc[];
+PyObject *model_fit(PyObject *module, PyObject *args);
+PyObject *model_left_out(PyObject *module, PyObject *args);
 
 #endif

@@ -60,10 +60,10 @@ static PyObject *turns(PyObject *module, PyObject *args) {
     if (!PyArg_ParseTuple(args, "y*y*y*y*w*w*", &v[ANGLE], &v[WEIGHTS], &v[START], &v[STOP], &v[MATRIX], &v[SUMS])) {
         return NULL;
     }
-    const Py_ssize_t n = v[ANGLE].len / ONE / 3, m = v[START].len / INDEX, k = n > 0 ? v[WEIGHTS].len / ONE / n : 0;
+    const Py_ssize_t n = v[ANGLE].len / DOUBLE_BYTES / 3, m = v[START].len / INDEX_BYTES, k = n > 0 ? v[WEIGHTS].len / DOUBLE_BYTES / n : 0;
     const int64_t *start = v[START].buf, *stop = v[STOP].buf;
-    int fits = v[ANGLE].len == 3 * n * ONE && v[WEIGHTS].len == n * k * ONE && v[STOP].len == v[START].len &&
-               v[MATRIX].len == 9 * m * ONE && v[SUMS].len == 9 * m * k * ONE;
+    int fits = v[ANGLE].len == 3 * n * DOUBLE_BYTES && v[WEIGHTS].len == n * k * DOUBLE_BYTES && v[STOP].len == v[START].len &&
+               v[MATRIX].len == 9 * m * DOUBLE_BYTES && v[SUMS].len == 9 * m * k * DOUBLE_BYTES;
     for (Py_ssize_t i = 0; fits && i < m; i++) fits = 0 <= start[i] && start[i] <= stop[i] && stop[i] <= n;
     if (fits) {
         const double *angle = v[ANGLE].buf, *weights = v[WEIGHTS].buf;
