@@ -121,6 +121,8 @@ def main(minutes: float) -> None:
     measured.append((time.monotonic(), *usage(process.pid)))
     os.write(screen, b"q")
     for _ in range(600):
+        if b"any key ends" in text:  # the record is made
+            os.write(screen, b"q")
         if process.poll() is not None:
             break
         if select.select([screen], [], [], 0.1)[0]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from imulab.gravity import Gravity
 from imulab.live.guide import Attitude, Guide
+from imulab.live.session import Session
+from imulab.live.simulated import simulated_unit
 from imulab.live.targets import Target, read_targets, share_of
 from imulab.procedures.tumble.plan import plan_tumble
 from imulab.procedures.tumble.simulate import simulate_tumble
@@ -150,3 +154,30 @@ def test_targets_are_read():
     bias, scale = read_targets("bias 100 ug, scale_factor 200 ppm")
     assert (bias.stem, scale.stem) == ("bias", "scale_factor")
     np.testing.assert_allclose([bias.value, scale.value], [100e-6 * G, 200e-6])
+
+
+@pytest.mark.parametrize(("order", "low"), [(1, True), (2, False), ("auto", False)])
+def test_an_order_that_is_too_low_for_the_target_is_said_and_is_no_last_attitude_for_ever(order, low):
+    unit, _ = simulated_unit("order=2,noise=0.2mg,rate=50", follow=True)
+    session, said = Session(order, None, read_targets("bias 60 ug")), []
+    for block in unit.blocks(0.1):
+        said += session.feed(block)
+        if session.enough or len(session.guide.kept) >= 24:
+            break
+        if session.state == "accepted" and session.next is not None:
+            unit.turn_to(session.next)
+    assert session.enough != low
+    warned = [event.text for event in said if event.kind == "warning"]
+    to_go = [event.text.rpartition("(")[2] for event in said if event.kind == "next"]
+    if low:
+        assert len(warned) == 1
+        assert re.fullmatch(
+            r"the attitudes disagree by [\d.]+ mg, \d\d+ times what each scatters by itself: more of them help little; "
+            "--order auto may",
+            warned[0],
+        )
+        assert all(text.startswith("over ") for text in to_go[-5:])
+        assert "1 to go)" not in to_go[14:]
+    else:
+        assert warned == []
+        assert not any(text.startswith("over ") for text in to_go)

@@ -138,6 +138,35 @@ def test_a_simulated_unit_goes_where_it_is_told():
     assert blocks[0].metadata["serial"] == "SIM-0004"
 
 
+def test_a_simulated_unit_that_is_taken_in_hand_is_left_alone():
+    source = open_source("simulate:seed=4,noise=0.1mg,speed=0,hold=1s", follow=False)
+    wanted = np.array([0.0, -1.0, 0.0])
+    blocks = [source.get(0.0)[0].data for _ in range(20)]
+    source.turn_by_hand(wanted)
+    source.turn_to(-wanted)  # the guide does not turn what a person holds
+    blocks += [source.get(0.0)[0].data for _ in range(600)]
+    for block in (blocks[100], blocks[-1]):
+        last = block.triad("accel").mean(axis=0)
+        assert np.degrees(np.arccos(last @ wanted / np.linalg.norm(last))) < 8
+
+
+def test_simulated_gyroscopes_stay_the_same_from_turn_to_turn():
+    source = open_source("simulate:seed=4,speed=0,gyro=1", follow=True)
+    blocks = []
+    for wanted in np.vstack([np.eye(3), -np.eye(3)]):
+        source.turn_to(wanted)
+        blocks += [source.get(0.0)[0].data for _ in range(100)]
+    names = [f"gyro_{axis}" for axis in "xyz"]
+    rates = np.column_stack([np.concatenate([block.columns[name] for block in blocks]) for name in names])
+    accel = np.concatenate([block.triad("accel") for block in blocks])
+    still = np.array([abs(accel[k - 50 : k + 50] - accel[k]).max() < 0.05 for k in range(50, len(accel) - 50)])
+    rests = rates[50:-50][still]
+    truth = [np.degrees(float(blocks[0].metadata[f"truth_gyro_bias_{axis}"])) for axis in "xyz"]
+    assert still.sum() > 500
+    for part in np.array_split(rests, 4):  # 0.05 deg/s of noise a sample; biases of other units are 0.3 deg/s apart
+        np.testing.assert_allclose(part.mean(axis=0), truth, atol=0.03)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -152,6 +181,7 @@ def test_a_simulated_unit_goes_where_it_is_told():
         ("simulate:noise=1s", "acceleration"),
         ("simulate:rate=1", "sample rate 1"),
         ("simulate:speed=-1", "speed -1"),
+        ("simulate:gyro=2", "gyro 2: expected 1"),
         ("replay:none.csv@0", "none.csv: no such file"),
     ],
 )

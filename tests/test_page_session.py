@@ -121,6 +121,42 @@ def test_from_the_plug_to_the_record_with_a_knocked_attitude_dropped(live, new_p
     assert content(tmp_path / "sn42.json") == content(tmp_path / "fit.json")
 
 
+def test_a_simulated_unit_is_turned_with_the_mouse_and_its_gyroscopes_are_calibrated(live, new_page, tmp_path):
+    running = live(f"{UNIT},speed=10,gyro=1", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "both.json")
+    page = new_page(running.address)
+    held = page.locator(".sphere .held")
+    for _ in range(60):  # what was wanted when it is clicked may just have been reached
+        page.get_by_role("button", name="Turn it so").click()
+        page.wait_for_timeout(700)
+        if held.count() >= 13:
+            break
+    assert held.count() >= 13
+    page.get_by_text("gyro_scale_factor_x").wait_for()
+    figure = page.locator(".body.by-hand")
+    box = figure.bounding_box()
+    before = page.locator(".sphere .now-mark").get_attribute("d")
+    page.mouse.move(box["x"] + 100, box["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 100, box["y"] + 190, steps=5)  # the upper side comes to the front: a quarter turn
+    page.mouse.up()
+    page.wait_for_function("old => document.querySelector('.sphere .now-mark').getAttribute('d') !== old", arg=before)
+    page.evaluate("window.told = new WebSocket(location.href.replace('http', 'ws') + 'ws')")
+    page.wait_for_function("() => told.readyState === 1")
+    for up in ("[0, 0, 0]", "[1, 2]", '["a", 0, 0]', "[1e999, 0, 0]", "null"):
+        page.evaluate(
+            """up => new Promise(done => {
+              told.onmessage = event => { if (event.data.includes('"refused"')) done(); };
+              told.send(`{"type": "turn", "up": ${up}}`);
+            })""",
+            up,
+        )
+    page.get_by_role("button", name="Make the record").click()
+    page.wait_for_selector(".result")
+    page.wait_for_selector(".result .caption:text-matches('deg/s corrected')")
+    assert "imulab tumble gyro rec.csv --accel accel.json" in page.locator(".result pre").inner_text()
+    assert "gyro_misalignment_yx" in content(tmp_path / "both.json")["parameters"]
+
+
 class Elsewhere(BaseHTTPRequestHandler):
     """A page of another port of this machine, which may do what it likes."""
 

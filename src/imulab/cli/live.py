@@ -211,8 +211,9 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
 
     from rich.live import Live
 
-    from imulab.live.terminal import draw, keys, pressed
+    from imulab.live.terminal import draw, keys, pressed, turned
 
+    by_hand = runner.source.by_hand
     with keys(wanted=typed) as usable, Live(auto_refresh=False, transient=True) as screen:
         drawn = 0.0
         while not runner.ended and not (runner.session.enough and not usable):
@@ -222,9 +223,11 @@ def _drawn(runner: Runner, *, typed: bool) -> None:
                 break
             if key == "u":
                 events += runner.drop()
+            if by_hand and (direction := turned(key, runner.session.next)) is not None:
+                runner.turn(direction)
             for event in events:
                 if event.kind not in ("state", "next", "format"):
                     screen.console.print(f"{event.time:8.1f} s  {event.text}", markup=False, highlight=False)
             if events or monotonic() - drawn > _EVERY:
-                screen.update(draw(runner.session.view(), *screen.console.size), refresh=True)
+                screen.update(draw(runner.session.view(), *screen.console.size, by_hand=by_hand), refresh=True)
                 drawn = monotonic()

@@ -30,6 +30,10 @@ _SPARE = 4
 _NEAR = np.cos(np.radians(12.0))
 _HORIZON = 60
 """So many attitudes are planned ahead at most: more take seconds, and hardly change which one is next."""
+_OFF = 2.0
+"""A plan that is longer or shorter by more than this factor, and two attitudes, is made anew."""
+_MUCH = 10.0
+"""Scatter of the attitudes over their own noise from which on something else than noise must be at work."""
 _FIVE = 5
 _LOWERS = 0.05
 _LONGEST = 10.0
@@ -73,6 +77,8 @@ class Guide:
         Of the outputs.
     metadata
         Of the stream's head.
+    beyond
+        Whether the target needs more attitudes than are planned ahead.
     """
 
     order: int | str = "auto"
@@ -84,6 +90,7 @@ class Guide:
     attitudes: list[Attitude] = field(default_factory=list)
     fit: TumbleFit | None = None
     why_not: str = ""
+    beyond: bool = False
     _outstanding: Array = field(default_factory=lambda: np.empty((0, 3)))
     _known: bool = False
 
@@ -120,9 +127,35 @@ class Guide:
         near = self._outstanding @ direction if len(self._outstanding) else np.empty(0)
         if near.size and near.max() > _NEAR:
             self._outstanding = np.delete(self._outstanding, int(np.argmax(near)), axis=0)
-            self._known = len(self._outstanding) > 0
+            self._known = len(self._outstanding) > 0 and not self._off()
         else:
             self._known = False
+
+    def _off(self) -> bool:
+        """Whether far fewer or more attitudes are planned than a scatter of another kind than noise asks for."""
+        if not self.targets or self.met or not self.scatter():
+            return False
+        # Variances fall as the number of attitudes rises, in proportion.
+        need = min(len(self.kept) * (max(self.shares()) ** 2 - 1), _HORIZON)
+        return not len(self._outstanding) / _OFF - 2 <= need <= len(self._outstanding) * _OFF + 2
+
+    @property
+    def _sure(self) -> int:
+        """The number of attitudes from which on a fit can be relied on."""
+        return parameter_count(self.model_order) + _SPARE
+
+    def scatter(self) -> str:
+        """Say where the attitudes disagree by far more than each scatters by itself; empty where they do not."""
+        if self.fit is None or len(self.kept) < self._sure:
+            return ""
+        own = float(np.median([self._own_noise(each.mean, each.covariance) for each in self.kept]))
+        if self._excess() < _MUCH * own:
+            return ""
+        higher = "--order auto" if self.order != "auto" else "a still table"
+        return (
+            f"the attitudes disagree by {1e3 * self._excess():.2g} mg, {self._excess() / own:.0f} times what each "
+            f"scatters by itself: more of them help little; {higher} may"
+        )
 
     def lengthen(self, attitude: Attitude) -> None:
         """Put a longer hold of the last attitude in its place."""
@@ -211,7 +244,7 @@ class Guide:
     def met(self) -> bool:
         """Whether the targets are met, or, without any, the number of attitudes is reached."""
         if self.targets:
-            enough = len(self.kept) >= parameter_count(self.model_order) + _SPARE
+            enough = len(self.kept) >= self._sure
             return enough and self.fit is not None and max(self.shares()) <= 1.0
         return self.fit is not None and len(self.kept) >= self.wanted()
 
@@ -248,7 +281,8 @@ class Guide:
         if self.planned is not None or not self.targets:
             left = self.wanted() - len(there)
             return self._planned(max(min(left, _HORIZON), least), there) if left > 0 or least > 1 else np.empty((0, 3))
-        count, noise = max(least, 3), self.noise()
+        noise = self._noise_as_fitted() if self._off() else self.noise()
+        count, self.beyond = max(least, 3), False
         tried: list[int] = []
         for _ in range(_ROUNDS):
             tried.append(count)
@@ -256,10 +290,16 @@ class Guide:
             share = self._predicted(covariance, noise)
             # Variances fall as the number of attitudes rises, in proportion.
             need = int(np.ceil((count + len(there)) * share**2)) - len(there)
-            count = max(min(need, _HORIZON), least)
+            count, self.beyond = max(min(need, _HORIZON), least), need > _HORIZON
             if count in tried:
                 break
         return self._planned(count, there)
+
+    def _noise_as_fitted(self) -> float:
+        """Return the noise by which the uncertainties of the fit so far are those predicted, in units of g."""
+        noise = self.noise()
+        now = Search(self.model_order, "A", self.directions()).covariance(np.empty((0, 3)))
+        return noise * max(self.shares()) / self._predicted(now, noise)
 
     def _predicted(self, covariance: Array, noise: float) -> float:
         sizes = (noise * np.sqrt(np.diag(covariance))).tolist()

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from imulab.columns import triad
-from imulab.errors import ReadError
+from imulab.errors import OptionError, ReadError
 from imulab.live.formats import Stream
 from imulab.live.gyros import GyroFits
 from imulab.live.recorder import Recorder
 from imulab.live.session import Event, Session
 from imulab.live.sources import Source
 from imulab.readers.layout import Layout
-from imulab.recording import Recording
+from imulab.recording import Array, Recording
 
 _SILENT = 3.0
 _BEFORE, _BEHIND = 1.0, 0.6
@@ -99,6 +99,18 @@ class Runner:
         if times is not None:
             self.recorder.cut(times[0] - _BEFORE, times[1] + _BEHIND)
         return self.session.events
+
+    def turn(self, direction: Array) -> None:
+        """Turn a simulated unit until this direction of the body is up, as a person does; others turn them in hand.
+
+        Raises
+        ------
+        OptionError
+            It is no simulated unit.
+        """
+        if not self.source.by_hand:
+            raise OptionError(f"{self.source.name}: expected a simulated unit (simulate) to be turned from here")
+        self.source.turn_by_hand(direction)
 
     def listen(self, wait: float) -> list[Recording]:
         """Return the samples that have come, after `wait` seconds at most, without session and recording."""

@@ -273,6 +273,8 @@ class Session:
                     f"attitude {number} is off by {milli:+.2g} mg: knocked? put it down again, or press u to drop it",
                 )
         self._aside = frozenset(aside)
+        if not self._aside and self.guide.targets and not self.guide.met:
+            self._warn(self._watch.scatter(self.guide.scatter()))
 
     def _plan(self) -> None:
         guide, was = self.guide, self._enough
@@ -286,7 +288,7 @@ class Session:
         self._next = guide.next_direction()
         if self._next is not None:
             left = guide.wanted() - len(guide.kept)
-            self._say("next", f"next: {in_words(self._next)} ({max(left, 1)} to go)")
+            self._say("next", f"next: {in_words(self._next)} ({'over ' if guide.beyond else ''}{max(left, 1)} to go)")
 
     def _advice(self) -> str:
         if self._dropping:

@@ -1,4 +1,4 @@
-"""A simulated unit on a simulated table: it goes where the guide says, or from one random attitude to the next."""
+"""A simulated unit on a simulated table: turned by the guide, by hand, or from one random attitude to the next."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from imulab.units import STANDARD_GRAVITY, from_si
 _LONGEST = 60.0
 _STRUCK, _SHIFT = 0.5, 5e-3 * STANDARD_GRAVITY
 """When an attitude is knocked, s after it is put down: before it is accepted; and by how much, m/s^2."""
-_KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "speed")
+_KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "gyro", "speed")
 _KINDS = {
     "rate": ("frequency", "Hz"),
     "noise": ("acceleration", "mg"),
@@ -39,8 +39,10 @@ class SimulatedUnit:
         How long it stays in an attitude where nobody turns it, s.
     knock
         Number of an attitude, from 1, that is knocked as soon as it is put down, or None.
+    gyro
+        Whether it has gyroscopes, too.
     follow
-        Whether `turn_to` turns it; otherwise it turns by itself.
+        Whether `turn_to` turns it; otherwise it turns by itself, until `turn_by_hand` does.
     """
 
     seed: int = 1
@@ -52,13 +54,19 @@ class SimulatedUnit:
     unit: str = "m/s^2"
     gravity: float = STANDARD_GRAVITY
     knock: int | None = None
+    gyro: bool = False
     follow: bool = False
+    _held: bool = field(default=False, init=False)
     _wanted: Array | None = field(default=None, init=False)
 
     def turn_to(self, direction: Array) -> None:
         """Turn until this direction of the body is up, where it follows."""
-        if self.follow:
+        if self.follow and not self._held:
             self._wanted = direction
+
+    def turn_by_hand(self, direction: Array) -> None:
+        """Turn until this direction of the body is up; from then on it is turned by hand alone."""
+        self._held, self._wanted = True, direction
 
     def blocks(self, step: float) -> Iterator[Recording]:
         """Yield its samples, `step` seconds at a time, without end."""
@@ -71,7 +79,7 @@ class SimulatedUnit:
         while True:
             leg = self._leg(here, there, known, legs)
             if not legs:
-                metadata = {key: text for key, text in leg.metadata.items() if not key.startswith("truth_gyro")}
+                metadata = dict(leg.metadata)
                 known = {
                     key.removeprefix("truth_"): float(text)
                     for key, text in metadata.items()
@@ -85,7 +93,8 @@ class SimulatedUnit:
                 part["time"] = (row + np.arange(count)) / self.rate
                 row += count
                 yield Recording(part, leg.units, metadata, "simulated unit")
-                if start + size >= stay and not self.follow and (start + size - stay) / self.rate >= self.hold:
+                alone = not (self.follow or self._held)
+                if alone and start + size >= stay and (start + size - stay) / self.rate >= self.hold:
                     self._wanted = _random_direction(rng)
                 if self._wanted is not None and np.allclose(self._wanted, here):
                     self._wanted = None  # said once more while the unit was being taken up
@@ -105,7 +114,7 @@ class SimulatedUnit:
             move=self.move,
             noise=self.noise,
             unit=self.unit,
-            gyro=False,
+            gyro=self.gyro,
             seed=self.seed if not number else 1000 * (self.seed + 1) + number,
         )
         resting = round(_LONGEST * self.rate)
@@ -143,6 +152,9 @@ def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
             given[key] = quantity(value, where, *_KINDS[key])
         else:
             given[key] = whole_number(value, where)
+    if given.setdefault("gyro", 0) not in (0, 1):
+        raise OptionError(f"simulate: gyro {given['gyro']}: expected 1 (with gyroscopes) or 0")
+    given["gyro"] = bool(given["gyro"])
     speed = given.pop("speed", 1.0)
     if not 0 <= speed <= 1e6:
         raise OptionError(f"simulate: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")

@@ -52,9 +52,11 @@ class Source:
         Whether nothing more will come.
     lost
         Why it ended, where that was no ordinary end.
+    by_hand
+        Whether it is a simulated unit, which `turn_by_hand` turns.
     """
 
-    polled = False
+    polled = by_hand = False
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -74,6 +76,9 @@ class Source:
 
     def turn_to(self, direction: Array) -> None:
         """Turn the unit until this direction of the body is up, where it is a simulated one that follows."""
+
+    def turn_by_hand(self, direction: Array) -> None:
+        """Turn a simulated unit until this direction of the body is up, as a person does."""
 
     def close(self) -> None:
         """Let go of what the source holds."""
@@ -185,6 +190,8 @@ class Paced(Source):
 class Simulated(Paced):
     """A simulated unit, which follows the guide where it is told to."""
 
+    by_hand = True
+
     def __init__(self, name: str, unit: SimulatedUnit, speed: float) -> None:
         super().__init__(name, unit.blocks(_STEP), speed)
         self.unit = unit
@@ -192,6 +199,10 @@ class Simulated(Paced):
     def turn_to(self, direction: Array) -> None:
         """Turn the unit."""
         self.unit.turn_to(direction)
+
+    def turn_by_hand(self, direction: Array) -> None:
+        """Turn the unit."""
+        self.unit.turn_by_hand(direction)
 
 
 def open_source(text: str, layout: str | None = None, *, follow: bool = False) -> Source:

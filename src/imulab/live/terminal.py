@@ -12,6 +12,7 @@ from rich.console import Group
 from rich.text import Text
 
 from imulab.live.view import Known, View, in_words
+from imulab.recording import Array
 from imulab.report.elements import format_uncertain
 from imulab.units import STANDARD_GRAVITY
 
@@ -25,14 +26,14 @@ _MOST_WARNINGS = 3
 _NARROW = 70
 
 
-def draw(view: View, width: int = 80, height: int = 24) -> Group:
+def draw(view: View, width: int = 80, height: int = 24, *, by_hand: bool = False) -> Group:
     """Return a view as what rich prints in `width` columns and `height` lines: what to do, where one is, what is known.
 
-    What there is no room for is left out, the map first.
+    `by_hand` is whether keys turn the unit. What there is no room for is left out, the map first.
     """
     above = [*_advice(view, width), _progress(view), _facts(view)]
     below = [Text(line, style="yellow") for text in view.warnings[-_MOST_WARNINGS:] for line in wrap(text, width)]
-    below.append(_keys(view))
+    below.append(_keys(view, by_hand=by_hand))
     table = _parameters(view, width)
     room = height - _EVENTS - len(above) - len(below)
     sphere = _sphere(view)
@@ -159,11 +160,23 @@ def _attitudes(view: View) -> str:
     return "|f| - g in mg:  " + "   ".join(parts) if parts else ""
 
 
-def _keys(view: View) -> Text:
+def turned(key: str, wanted: Array | None) -> Array | None:
+    """Return the direction that a key turns upward: x, y, z, down with X, Y, Z, the one wanted with n; else None."""
+    if key == "n":
+        return wanted
+    axis = "xyz".find(key.lower()) if key else -1
+    if axis < 0:
+        return None
+    direction: Array = np.eye(3)[axis] * (1.0 if key.islower() else -1.0)
+    return direction
+
+
+def _keys(view: View, *, by_hand: bool) -> Text:
     aside = [held.number for held in view.attitudes if held.aside]
     named = (aside or [held.number for held in view.attitudes])[-1:]
     drop = f"u: drop attitude {named[0]}   " if named else ""
-    return Text(f"{drop}q: finish, write record   Ctrl-C: stop", style="dim")
+    turn = "n x y z X Y Z: turn it   " if by_hand else ""
+    return Text(f"{turn}{drop}q: finish, write record   Ctrl-C: stop", style="dim")
 
 
 @contextmanager

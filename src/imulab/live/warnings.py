@@ -37,6 +37,10 @@ class Watch:
         self.said[key] = text
         return [text]
 
+    def scatter(self, text: str) -> list[str]:
+        """Take why more attitudes help little; empty where they help."""
+        return self._once("scatter", text) if text else []
+
     def hold(self, hold: Hold, unit: str, gravity: float) -> list[str]:
         """Look at the length of f at rest."""
         length = float(np.linalg.norm(hold.mean))

@@ -5,7 +5,8 @@ Messages to the page, beside those of `parts`:
 ``view``
     The `View` as JSON, at most ten a second: numbers in SI or as `View` says, parameters as texts (`name`, `value`,
     `uncertainty`, `unit`) with `share`, their standard uncertainty over the target's; each attitude in `words`; `phase`
-    (``measuring``, ``computing`` or ``done``); `silent`, a sentence while nothing comes; `recording`, its file.
+    (``measuring``, ``computing`` or ``done``); `silent`, a sentence while nothing comes; `recording`, its file;
+    `by_hand`, whether the unit is one that ``turn`` turns.
 ``event``
     Something that happened: `kind`, `text`, `time`, as `Event`.
 ``done``
@@ -16,7 +17,8 @@ Messages to the page, beside those of `parts`:
 ``failed``
     The session has ended: `text` says why; `lines` are the first of an unknown stream, `guess` a layout for it.
 
-Messages from the page: ``drop`` (`attitude`: its number), ``finish`` and ``quit``.
+Messages from the page: ``drop`` (`attitude`: its number), ``turn`` (`up`: the direction of the body that a simulated
+unit is to have upward), ``finish`` and ``quit``.
 """
 
 from __future__ import annotations
@@ -95,7 +97,12 @@ class GuidedPart(Part):
         self._stop = threading.Event()
         self._hub = Hub()
         self._thread = threading.Thread(target=partial(copy_context().run, self._run), daemon=True, name="imulab live")
-        self.hears = {"drop": self._drop, "finish": self._asked.put, "quit": lambda _: self._hub.stop()}
+        self.hears = {
+            "drop": self._drop,
+            "turn": self._turn,
+            "finish": self._asked.put,
+            "quit": lambda _: self._hub.stop(),
+        }
         self.routes = [Route("/api/session/{kind}", self._file)]
 
     def begin(self, hub: Hub) -> None:
@@ -118,6 +125,15 @@ class GuidedPart(Part):
         if type(number) is not int:
             raise OptionError(f"drop: expected the number of an attitude, found {quoted(number)}")
         self._asked.put(message)
+
+    def _turn(self, message: Message) -> None:
+        up = message.get("up")
+        if not (isinstance(up, list) and len(up) == 3 and all(type(each) in (int, float) for each in up)):
+            raise OptionError(f"turn: expected a direction of three numbers, found {quoted(up)}")
+        length = float(np.linalg.norm(np.array(up, dtype=np.float64)))
+        if not (np.isfinite(length) and length > 0):
+            raise OptionError(f"turn: expected a direction, found {quoted(up)}")
+        self._asked.put({"type": "turn", "up": np.array(up) / length})
 
     def _run(self) -> None:
         try:
@@ -173,7 +189,10 @@ class GuidedPart(Part):
                     self._finish = True
                     continue
                 try:
-                    events += self._runner.drop(message["attitude"])
+                    if message["type"] == "turn":
+                        self._runner.turn(message["up"])
+                    else:
+                        events += self._runner.drop(message["attitude"])
                 except OptionError as error:
                     self._tell({"type": "refused", "text": str(error)})
         except Empty:
@@ -194,6 +213,7 @@ class GuidedPart(Part):
             "phase": self._phase,
             "silent": self._silent,
             "recording": self._runner.recorder.path,
+            "by_hand": self._runner.source.by_hand,
         }
         self._tell(self._view, latest=True)
 

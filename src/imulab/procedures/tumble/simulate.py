@@ -135,7 +135,7 @@ def simulate_tumble(
     columns, units = {"time": path.time}, {"time": "s"}
     _put(columns, units, "accel", output, unit)
     if gyro:
-        rates, gyro_truth = _gyro(path.rate, rng)
+        rates, gyro_truth = _gyro(path.rate, rng, sensor)
         sensor |= gyro_truth
         _put(columns, units, "gyro", rates, "deg/s")
     if field is not None:
@@ -306,11 +306,15 @@ def _disturbances(path: _Path, hold: float, knock: int | None, rng: np.random.Ge
     return sway
 
 
-def _gyro(rate: Array, rng: np.random.Generator) -> tuple[Array, dict[str, float]]:
-    """Outputs of a gyroscope triad, deg/s: M = S (T w + b), and its truth in SI."""
+def _gyro(rate: Array, rng: np.random.Generator, known: Mapping[str, float]) -> tuple[Array, dict[str, float]]:
+    """Outputs of a gyroscope triad, deg/s: M = S (T w + b), and its truth in SI: that known, or else a random one."""
     bias = np.radians(0.3) * rng.uniform(-1, 1, 3)
     scale = 1 + 0.01 * rng.uniform(-1, 1, 3)
     misalignment = np.eye(3) + np.radians(1) * rng.uniform(-1, 1, (3, 3)) * (1 - np.eye(3))
+    if "gyro_bias_x" in known:
+        bias = np.array([known[f"gyro_bias_{a}"] for a in "xyz"])
+        scale = np.radians([known[f"gyro_scale_factor_{a}"] for a in "xyz"])
+        misalignment = np.array([[known.get(f"gyro_misalignment_{a}{b}", 1.0) for b in "xyz"] for a in "xyz"])
     sensed = rate @ misalignment.T + bias + np.radians(0.05) * rng.standard_normal(rate.shape)
     truth = {f"gyro_bias_{a}": float(bias[i]) for i, a in enumerate("xyz")}
     truth |= {f"gyro_scale_factor_{a}": float(np.degrees(scale[i])) for i, a in enumerate("xyz")}

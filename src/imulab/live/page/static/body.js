@@ -18,6 +18,23 @@ export function degreesBetween(a, b) {
   return Math.acos(Math.min(1, Math.max(-1, dot(a, b)))) * 180 / Math.PI;
 }
 
+// The rotation about an axis by an angle.
+function turn(axis, angle) {
+  const [x, y, z] = unit(axis), c = Math.cos(angle), d = 1 - c, e = Math.sin(angle);
+  return [
+    [c + x * x * d, x * y * d - z * e, x * z * d + y * e],
+    [y * x * d + z * e, c + y * y * d, y * z * d - x * e],
+    [z * x * d - y * e, z * y * d + x * e, c + z * z * d],
+  ];
+}
+
+// An orientation that is dragged on the screen, by angles to the right and downward.
+export function dragged(R, right, down) {
+  const across = [Math.cos(TURN), -Math.sin(TURN), 0];
+  const up = [Math.sin(TURN) * Math.sin(ABOVE), Math.cos(TURN) * Math.sin(ABOVE), Math.cos(ABOVE)];
+  return product(turn(across, down), product(turn(up, right), R));
+}
+
 // The shortest rotation that takes direction a to b; of opposite ones about the axis of the body that is most across.
 export function shortest(a, b) {
   let axis = cross(a, b), angle = Math.acos(Math.min(1, Math.max(-1, dot(a, b))));
@@ -27,12 +44,7 @@ export function shortest(a, b) {
     axis = cross(a, cross(across, a));
   }
   if (angle < 1e-9) return [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
-  const [x, y, z] = unit(axis), c = Math.cos(angle), d = 1 - c, e = Math.sin(angle);
-  return [
-    [c + x * x * d, x * y * d - z * e, x * z * d + y * e],
-    [y * x * d + z * e, c + y * y * d, y * z * d - x * e],
-    [z * x * d - y * e, z * y * d + x * e, c + z * z * d],
-  ];
+  return turn(axis, angle);
 }
 
 // An orientation with this direction up.

@@ -1,6 +1,6 @@
 // The guided session: what to do now above all, then where one is, then what is known.
 
-import { bodyPlace, degreesBetween, drawBody, product, shortest, upright } from "./body.js";
+import { bodyPlace, degreesBetween, dragged, drawBody, product, shortest, upright } from "./body.js";
 import { h, put, show } from "./dom.js";
 import { ResultArea } from "./result.js";
 import { beep, soundButton } from "./sound.js";
@@ -10,10 +10,11 @@ import { attitudeTable, milli, parameterTable, targetList } from "./tables.js";
 export const title = "Session";
 const STEPS = ["moving", "settling", "still", "accepted"];
 const NEAR = 12;
+const PER_PIXEL = Math.PI / 180;
 const LOG = 60;
 
 let page = null, place = null, result = null;
-let orientation = null, aim = null;
+let orientation = null, aim = null, drag = null;
 let drawn = {};
 const parts = {};
 
@@ -38,9 +39,12 @@ export function mount(into, given) {
   parts.nextText = h("figcaption", {});
   parts.live = bodyPlace("The unit now");
   parts.liveText = h("figcaption", {});
+  parts.hand = h("p", { class: "caption" }, "Simulated: drag it, or ",
+    h("button", { class: "small", onclick: () => aim?.up && page.send({ type: "turn", up: aim.up }) }, "Turn it so"));
   parts.nextFigure = h("figure", { class: "wanted" }, h("h2", {}, "Turn it like this"), parts.next, parts.nextText);
   parts.bodies = h("section", { class: "bodies" },
-    parts.nextFigure, h("figure", {}, h("h2", {}, "Now"), parts.live, parts.liveText));
+    parts.nextFigure, h("figure", {}, h("h2", {}, "Now"), parts.live, parts.liveText, parts.hand));
+  for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel"]) parts.live.addEventListener(kind, byHand);
   parts.sphere = spherePlace();
   parts.facts = h("dl", { class: "facts" });
   parts.parameters = h("div", {});
@@ -132,7 +136,9 @@ function bodies(now, measuring) {
   if (!orientation) orientation = upright(now.up);
   if (aim?.key !== key) aim = { key, up: wanted, R: wanted && product(orientation, shortest(wanted, lastUp(now))) };
   orientation = aim.up ? product(aim.R, shortest(now.up, aim.up)) : upright(now.up);
-  drawBody(parts.live, orientation);
+  if (!drag) drawBody(parts.live, orientation);
+  parts.live.classList.toggle("by-hand", now.by_hand && measuring);
+  show(parts.hand, now.by_hand && measuring);
   show(parts.nextFigure, Boolean(aim.up));
   if (!aim.up) {
     put(parts.liveText, "");
@@ -146,6 +152,20 @@ function bodies(now, measuring) {
   const away = degreesBetween(now.up, aim.up);
   put(parts.liveText, away < NEAR ? "this is it" : `${Math.round(away / 5) * 5}° away`);
   parts.liveText.className = away < NEAR ? "there" : "";
+}
+
+// A simulated unit is dragged to where it is to turn, and turns there once it is let go.
+function byHand(event) {
+  if (event.type === "pointerdown" && event.button === 0 && parts.live.classList.contains("by-hand")) {
+    parts.live.setPointerCapture(event.pointerId);
+    drag = { x: event.clientX, y: event.clientY, R: orientation };
+  } else if (drag && event.type === "pointermove") {
+    drag.turned = dragged(drag.R, (event.clientX - drag.x) * PER_PIXEL, (event.clientY - drag.y) * PER_PIXEL);
+    drawBody(parts.live, drag.turned);
+  } else if (drag && event.type !== "pointerdown") {
+    if (event.type === "pointerup" && drag.turned) page.send({ type: "turn", up: drag.turned[2] });
+    drag = null;
+  }
 }
 
 // The direction that the drawn orientation has up.
