@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import shutil
@@ -10,10 +12,12 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from imulab.cli import main
 from imulab.recording import Array, Recording
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -90,6 +94,28 @@ Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 @pytest.fixture
 def imulab(tmp_path: Path) -> Run:
+    """Run the command line in an empty folder, within this process: starting Python takes longer than most commands."""
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        words = list(map(str, arguments))
+        streams = [io.TextIOWrapper(io.BytesIO(), encoding="utf-8", newline="") for _ in range(2)]
+        with (
+            contextlib.chdir(tmp_path),
+            Path(os.devnull).open() as nothing,
+            mock.patch.multiple(sys, argv=["imulab", *words], stdin=nothing, stdout=streams[0], stderr=streams[1]),
+        ):
+            status = main(words)
+        said = []
+        for stream in streams:
+            stream.flush()
+            said.append(stream.buffer.getvalue().decode())
+        return subprocess.CompletedProcess(words, status, *said)
+
+    return run
+
+
+@pytest.fixture
+def imulab_process(tmp_path: Path) -> Run:
     """Run the command line in a process of its own, in an empty folder."""
 
     def run(*arguments: object, stdin: str | None = None) -> subprocess.CompletedProcess[str]:

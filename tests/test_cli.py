@@ -116,13 +116,13 @@ def test_simulate_fit_apply_show_report(imulab, tmp_path):
     assert np.abs(means).max() < 5e-4 * 9.80665
 
 
-def test_apply_writes_to_standard_output_what_it_writes_to_a_file(imulab, tmp_path):
+def test_apply_writes_to_standard_output_what_it_writes_to_a_file(imulab, imulab_process, tmp_path):
     imulab("tumble", "simulate", "-o", "t.csv", "--attitudes", "16", "--hold", "2", "--order", "1")
     imulab("tumble", "fit", "t.csv", "--gravity", G, "-o", "t.json", "--order", "1")
     imulab("apply", "t.json", "t.csv", "-o", "c.csv")
     text = (tmp_path / "c.csv").read_text()
     assert imulab("apply", "t.json", "t.csv").stdout == text
-    assert imulab("apply", "t.json", "-", stdin=(tmp_path / "t.csv").read_text()).stdout == text
+    assert imulab_process("apply", "t.json", "-", stdin=(tmp_path / "t.csv").read_text()).stdout == text
 
 
 def test_json_prints_the_record_alone(imulab, tmp_path):

@@ -40,13 +40,13 @@ def plain(path):
 # ---- parameters are the single command's ---------------------------------------------------------------------------
 
 
-def test_parameters_equal_the_single_commands_to_the_last_bit(imulab, tmp_path):
+def test_parameters_equal_the_single_commands_to_the_last_bit(imulab, imulab_process, tmp_path):
     manifest = make_fleet(tmp_path / "in", 3)
     il.write(il.simulate_tumble(attitudes=16, order=1, hold=2.0, seed=4), tmp_path / "in" / "long.csv")
     edited(manifest, lambda rows: rows.append(
         {"serial": "LONG", "procedure": "tumble", "file": "long.csv", "latitude": "48.1", "height": "500", "order": "1"}
     ))  # fmt: skip
-    done = imulab("fleet", "run", "in/manifest.csv", "-o", "out", "--workers", 2)
+    done = imulab_process("fleet", "run", "in/manifest.csv", "-o", "out", "--workers", 2)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("4 units: 4 done, 0 failed")
     for serial, arguments in {

@@ -140,8 +140,8 @@ def test_lines_are_fused_as_they_come(run_file):
     np.testing.assert_array_equal([float(line.split(b",")[1]) for line in got], whole[:1000])
 
 
-def test_a_stream_tells_of_a_gyro_at_once_and_sums_up_at_its_end(imulab, run_file):
-    done = imulab("array", "fuse", "-", "--rate", "50 Hz", stdin=(run_file / "run.csv").read_text())
+def test_a_stream_tells_of_a_gyro_at_once_and_sums_up_at_its_end(imulab_process, run_file):
+    done = imulab_process("array", "fuse", "-", "--rate", "50 Hz", stdin=(run_file / "run.csv").read_text())
     lines = [line.removeprefix("imulab: warning: ") for line in done.stderr.splitlines()]
     assert "gyro_3: stuck at 10.5 s" in lines
     assert lines.index("gyro_3: stuck at 10.5 s") < lines.index("gyro_5: jumped at 20.48 s")
