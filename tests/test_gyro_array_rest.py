@@ -9,7 +9,7 @@ from imulab.procedures.gyro_array.checks import Checks
 from imulab.procedures.gyro_array.compare import compare_methods
 from imulab.procedures.gyro_array.fit import calibrate_array
 from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
-from imulab.procedures.gyro_array.rest import find_rest, together
+from imulab.procedures.gyro_array.rest import common_motion, find_rest
 from imulab.recording import Recording
 from test_gyro_array_calibrate import UPSIDE_DOWN, motion
 from test_gyro_array_fuse import array_recording as recording_of
@@ -106,10 +106,10 @@ def test_elements_go_together_by_what_the_array_turns():
     rates = np.random.default_rng(6).standard_normal((500, 3))
     off = np.einsum("iab,tb->tai", np.array([turned(np.random.default_rng(i)) for i in range(5)]), rates)
     noise = 0.01 * np.random.default_rng(7).standard_normal(off.shape)
-    moves, ratio = together(off + noise, np.full((3, 5), 0.01))
+    moves, ratio = common_motion(off + noise, np.full((3, 5), 0.01))
     assert moves == pytest.approx(1.0, rel=0.05)
     assert 80 < ratio < 130
-    assert together(noise, np.full((3, 5), 0.01))[1] < 2
+    assert common_motion(noise, np.full((3, 5), 0.01))[1] < 2
 
 
 def test_the_real_array_finds_its_own_rest(real_data):

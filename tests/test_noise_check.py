@@ -129,7 +129,7 @@ def test_noise_that_the_model_has_not_got_is_found(record):
     hum = np.fft.irfft(np.fft.rfft(np.random.default_rng(3).standard_normal(len(x))) * ((f > 3.5) & (f < 5)), len(x))
     found = il.check_noise(record, log.with_columns({"gyro_x": x + 0.6 * np.std(x) * hum}, {"gyro_x": "deg/s"}))
     assert found.differs("gyro_x")
-    assert "noise from 3.1 to 6.2 Hz" in found.columns["gyro_x"].said()
+    assert "noise from 3.1 to 6.2 Hz" in found.columns["gyro_x"].text()
 
 
 def test_several_logs_add_up_and_files_are_taken(record, tmp_path):

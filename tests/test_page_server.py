@@ -290,11 +290,11 @@ def test_numbers_that_are_none_are_null():
 
 def test_a_page_for_others_tells_an_address_that_they_reach():
     listening = server._listen(0, "0.0.0.0")
-    address = server._reached("0.0.0.0"), listening.getsockname()[1]
+    address = server._address_for_others("0.0.0.0"), listening.getsockname()[1]
     with socket.create_connection(address, timeout=5):
         pass
     listening.close()
-    assert server._reached("10.1.2.3") == "10.1.2.3"
+    assert server._address_for_others("10.1.2.3") == "10.1.2.3"
     with pytest.raises(OptionError, match=r"--host 192\.0\.2\.7: cannot be listened at"):
         server.serve([], host="192.0.2.7", browser=False)
 

@@ -62,7 +62,7 @@ def comparison(found: Comparison) -> str:
             body.append([method, *method_texts(rows[a], factor, 4, halves=halves)])
         lines += ["", *([f"axis {axis}"] if axis else []), *aligned(titles, body), *reasons]
         lines.append(
-            f"single gyro, mean of {_those(found.elements.names[a], data['working'][a])}: "
+            f"single gyro, mean of {_gyros_of_mean(found.elements.names[a], data['working'][a])}: "
             f"{plain_number(data['single'][a], 4)} {unit}; limit of one sample {plain_number(data['limit'][a], 4)} "
             f"{unit}"
         )
@@ -73,7 +73,7 @@ def comparison(found: Comparison) -> str:
     return "\n".join(lines)
 
 
-def _those(names: Sequence[str], working: Sequence[str]) -> str:
+def _gyros_of_mean(names: Sequence[str], working: Sequence[str]) -> str:
     """Return which gyros the mean single gyro is the mean of."""
     if len(working) == len(names):
         return "all"

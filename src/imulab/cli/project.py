@@ -85,14 +85,14 @@ def _check_values(found: Mapping[str, str], shown: str) -> None:
         raise OptionError(f"{shown}: {error}") from None
 
 
-def additions(said: Mapping[str, str], typed: Mapping[str, object], files: Sequence[str]) -> dict[str, str]:
+def additions(settings: Mapping[str, str], typed: Mapping[str, object], files: Sequence[str]) -> dict[str, str]:
     """Return what a project file adds to the options of a command.
 
     `typed` are the options that the command has, None where not given; `files` what it reads. Options of gravity count
     together: one that is typed leaves out those of the file. A layout is left out where all files say themselves what
     their columns are; else it is for those that do not.
     """
-    found = {key: text for key, text in said.items() if key in typed and typed[key] is None}
+    found = {key: text for key, text in settings.items() if key in typed and typed[key] is None}
     if any(typed.get(key) is not None for key in _GRAVITY):
         found = {key: text for key, text in found.items() if key not in _GRAVITY}
     if "layout" in found and files and all(map(_describes_itself, files)):

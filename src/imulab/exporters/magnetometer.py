@@ -20,7 +20,7 @@ from imulab.records.calibration import Calibration
 from imulab.units import parse_unit
 
 _NEGLIGIBLE = np.radians(0.01)
-_BENT = 1e-4
+_NEGLIGIBLE_QUADRATIC = 1e-4
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def magnetometers(record: Calibration, target: str) -> Magnetometers | None:
             f"{target}: the magnetometers' axes are left-handed: no rotation turns them into the body frame"
         )
     quadratic = field_of(table, "quadratic") if int(field_of(table, "order")) == 2 else np.zeros(3)
-    bent = float(np.abs(quadratic).max()) * (5e-5 if known else 1.0)
-    return Magnetometers(scale * matrix, hard_iron, unit, bent)
+    largest = float(np.abs(quadratic).max()) * (5e-5 if known else 1.0)
+    return Magnetometers(scale * matrix, hard_iron, unit, largest)
 
 
 def _linear(table: DeviceTable) -> tuple[Array, Array]:
@@ -96,7 +96,7 @@ def settle(mag: Magnetometers, target: str, options: ExportOptions, *, turned: b
     lost = []
     if not turned and mag.angle > _NEGLIGIBLE:
         lost.append(f"how the magnetometers are turned against the accelerometers, {np.degrees(mag.angle):.3g} deg")
-    if mag.quadratic > _BENT:
+    if mag.quadratic > _NEGLIGIBLE_QUADRATIC:
         lost.append(f"mag_k2, {100 * mag.quadratic:.2g} % of the field")
     if not lost:
         return []

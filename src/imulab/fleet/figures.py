@@ -44,7 +44,7 @@ def distributions(title: str, statistics: Sequence[ParameterStatistics]) -> list
     pages = grid.pages(panels)
     return [
         _distributions(grid.paged(f"{title}: distribution over the units", n, len(pages)), page,
-                       small.some(statistics, panels))
+                       small.which_are_drawn(statistics, panels))
         for n, page in enumerate(pages)
     ]  # fmt: skip
 
@@ -59,9 +59,9 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         x, y = grid.names(index)
         far = bulk(values)
         inside = np.ones(len(values), dtype=bool) if far is None else ~far.beyond
-        edges = small.edges(values[inside])
+        edges = small.bin_edges(values[inside])
         counts, edges = np.histogram(values[inside], bins=edges)
-        limits = small.ends(item, shown, values[inside])
+        limits = small.limits_in_view(item, shown, values[inside])
         traces.append(
             {
                 "type": "bar",
@@ -119,7 +119,7 @@ def over_date(title: str, statistics: Sequence[ParameterStatistics]) -> list[Fig
     name = f"{title}: over the {'date' if dated else 'units in the order of the manifest'}"
     pages = grid.pages(panels)
     return [
-        _over_date(grid.paged(name, n, len(pages)), page, small.some(statistics, panels), dated=dated)
+        _over_date(grid.paged(name, n, len(pages)), page, small.which_are_drawn(statistics, panels), dated=dated)
         for n, page in enumerate(pages)
     ]
 

@@ -24,8 +24,8 @@ def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
     return [round(top * (1 - 0.15 * (k % 7)), 3) for k in order.tolist()]
 
 
-def ends(item: ParameterStatistics, shown: Display, values: Array) -> list[float]:
-    """Limits of a parameter that lie near enough to the values that are shown to be drawn."""
+def limits_in_view(item: ParameterStatistics, shown: Display, values: Array) -> list[float]:
+    """Return the limits of a parameter that lie near enough to the values that are shown to be drawn."""
     if item.capability is None:
         return []
     limits = item.capability.limits
@@ -34,8 +34,8 @@ def ends(item: ParameterStatistics, shown: Display, values: Array) -> list[float
     return [end for end in ends if values.min() - 2 * span <= end <= values.max() + 2 * span]
 
 
-def edges(values: Array) -> Array:
-    """Edges of bins by Freedman and Diaconis over the bulk, at most 60 over all."""
+def bin_edges(values: Array) -> Array:
+    """Return the edges of bins by Freedman and Diaconis over the bulk, at most 60 over all."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
         half = abs(low) * 1e-6 or 0.5
@@ -64,7 +64,7 @@ def date_axis(days: Array) -> dict[str, Any]:
     }
 
 
-def some(statistics: Sequence[ParameterStatistics], panels: Sequence[ParameterStatistics]) -> str:
+def which_are_drawn(statistics: Sequence[ParameterStatistics], panels: Sequence[ParameterStatistics]) -> str:
     """Say that not all parameters are drawn, where that is so."""
     if len(panels) == len(statistics):
         return ""

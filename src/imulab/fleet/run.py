@@ -164,7 +164,7 @@ def run_fleet(
         write_table(rows, table_file)
     return FleetState(
         folder, fleet, rows, kept=keeper.kept, seconds=time.monotonic() - begin,
-        notes=(*notes, *keeper.notes, *_said_of(rows)),
+        notes=(*notes, *keeper.notes, *_remarks_on(rows)),
     )  # fmt: skip
 
 
@@ -172,13 +172,13 @@ def read_by(fleet: FleetManifest) -> dict[str, str]:
     """Return the files here that a fleet reads, full name to name: manifest, recordings, layouts, priors."""
     if is_url(fleet.base):
         return {}
-    found = {_full(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
+    found = {_absolute(os.path.join(fleet.base, Path(fleet.name).name)): fleet.name}  # noqa: PTH118
     for unit in fleet.units:
         options = PROCEDURES[unit.procedure].task.options
         paths = [unit.options[o.name] for o in options if o.names_file and o.name in unit.options]
         for name in (*unit.files, *paths):
             if not is_url(name):
-                found[_full(os.path.join(fleet.base, name))] = name  # noqa: PTH118
+                found[_absolute(os.path.join(fleet.base, name))] = name  # noqa: PTH118
     return found
 
 
@@ -186,16 +186,16 @@ def own_files(store: Store, fleet: FleetManifest, *, table: bool = True) -> dict
     """Return the files that a fleet's folder holds, full name to name."""
     names = [HISTORY, TABLE] if table else [HISTORY]
     mine = [*(store.record(unit.serial) for unit in fleet.units), *(store.folder / name for name in names)]
-    return {_full(path): str(path) for path in mine}
+    return {_absolute(path): str(path) for path in mine}
 
 
-def _full(path: str | Path) -> str:
+def _absolute(path: str | Path) -> str:
     folder, name = os.path.split(os.path.abspath(path))  # noqa: PTH100
-    return os.path.join(_real(folder), name)  # noqa: PTH118
+    return os.path.join(_real_folder(folder), name)  # noqa: PTH118
 
 
 @lru_cache(maxsize=64)
-def _real(folder: str) -> str:
+def _real_folder(folder: str) -> str:
     return os.path.realpath(folder)
 
 
@@ -208,7 +208,7 @@ def refuse_overwriting(outputs: Iterable[Path], kept: Mapping[str, str]) -> None
         One does.
     """
     for path in outputs:
-        taken = kept.get(_full(path))
+        taken = kept.get(_absolute(path))
         if taken is not None:
             raise OptionError(f"{path}: would overwrite {taken}; expected another name or folder")
 
@@ -277,7 +277,7 @@ class _Keeper:
         )
 
 
-def _said_of(rows: Sequence[Row]) -> Iterator[str]:
+def _remarks_on(rows: Sequence[Row]) -> Iterator[str]:
     """Say what a person must know of the records as a whole, and no record can say by itself."""
     made = [row.summary for row in rows if row.summary is not None]
     others = [summary.software for summary in made if summary.software != f"imulab {VERSION}"]
@@ -314,11 +314,11 @@ def _work_through(engine: Engine, job: Job, keeper: _Keeper) -> None:
         away = [unit for unit in easy if unit.serial in keeper.unseen]
         try:
             if away:
-                _take(engine.run(away, replace(job, folder=None)), keeper)
+                _take_all(engine.run(away, replace(job, folder=None)), keeper)
             elif easy:
-                _take(engine.run(easy, job), keeper)
+                _take_all(engine.run(easy, job), keeper)
             for serial in sorted(suspects & set(keeper.left)):
-                _take(engine.run_alone(keeper.left[serial], job), keeper)
+                _take_all(engine.run_alone(keeper.left[serial], job), keeper)
         except WorkersLostError as error:
             fruitless = fruitless + 1 if len(keeper.left) == before and not suspects else 0
             if fruitless >= _FRUITLESS:
@@ -327,7 +327,7 @@ def _work_through(engine: Engine, job: Job, keeper: _Keeper) -> None:
                 ) from None
 
 
-def _take(outcomes: Iterator[Outcome], keeper: _Keeper) -> None:
+def _take_all(outcomes: Iterator[Outcome], keeper: _Keeper) -> None:
     with closing(outcomes):  # type: ignore[type-var]
         for outcome in outcomes:
             keeper.take(outcome)

@@ -73,7 +73,7 @@ class Store:
         except OSError as error:
             raise OptionError(f"{self.folder}: cannot be written: {error.strerror}") from None
         with stream:
-            if not any(_tries(stream.fileno())):
+            if not any(_lock_attempts(stream.fileno())):
                 raise OptionError(f"{self.folder}: another run is at work on it ({self._holder()})")
             stream.seek(0)
             stream.truncate()
@@ -196,7 +196,7 @@ class Store:
         except RecordError:
             return None
         made = record.sections.get("fleet")
-        return (record, sha256) if isinstance(made, Mapping) and _asked(made) == asked_of(unit) else None
+        return (record, sha256) if isinstance(made, Mapping) and _request_in(made) == request_of(unit) else None
 
     # --- what was asked --------------------------------------------------------------------------------------------
 
@@ -223,16 +223,16 @@ class Store:
             raise OptionError(f"{self.folder}: expected a folder that 'imulab fleet run' has written to") from None
 
 
-def asked_of(unit: FleetUnit) -> dict[str, Any]:
+def request_of(unit: FleetUnit) -> dict[str, Any]:
     """Return what identifies the work on a unit, as its record keeps it."""
     return {"procedure": unit.procedure, "files": list(unit.files), "options": dict(unit.options)}
 
 
-def _asked(made: Mapping[str, Any]) -> dict[str, Any]:
+def _request_in(made: Mapping[str, Any]) -> dict[str, Any]:
     return {key: made.get(key) for key in ("procedure", "files", "options")}
 
 
-def _tries(descriptor: int) -> Iterator[bool]:
+def _lock_attempts(descriptor: int) -> Iterator[bool]:
     """Try for the lock for a moment: `at_work` may just be looking."""
     for _ in range(20):
         yield _lock(descriptor, exclusive=True)

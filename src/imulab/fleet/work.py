@@ -11,7 +11,7 @@ from imulab.atomic_write import write_text
 from imulab.errors import ImulabError
 from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.sources import UnitFiles
-from imulab.fleet.store import MOST_ATTEMPTS, Store, asked_of
+from imulab.fleet.store import MOST_ATTEMPTS, Store, request_of
 from imulab.procedures.run import run_task
 from imulab.records.calibration import Calibration, Parameter
 
@@ -117,7 +117,7 @@ def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
         f"the file states serial {serial!r}, the manifest {unit.serial!r}: the manifest's is used" for serial in others
     ]
     made = {
-        **asked_of(unit),
+        **request_of(unit),
         "inputs": [{"file": name, "sha256": sha256} for name, sha256 in files.inputs.items()],
         **({} if files.date is None else {"date": files.date}),
     }

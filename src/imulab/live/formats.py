@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.errors import ReadError, quoted
 from imulab.live.guess import Guess, guess_layout
-from imulab.live.lines import Laid, MotionCal, Native, XImu3, is_titles
+from imulab.live.lines import LayoutDecoder, MotionCal, Native, XImu3, is_titles
 from imulab.live.packets import Mavlink, Msp, looks_like_mavlink, looks_like_msp
 from imulab.live.stamps import ArrivalClock, Counts, DeviceClock
 from imulab.printable import printable
@@ -166,7 +166,7 @@ class Stream:
     def _recognised(self, head: bytes) -> Decoder:
         """Return the decoder of a stream by its first bytes."""
         if self._layout is not None and not self._layout.if_needed:
-            return Laid(self._layout, self.counts)
+            return LayoutDecoder(self._layout, self.counts)
         if looks_like_msp(head):
             return Msp(self.counts)
         if looks_like_mavlink(head):
@@ -187,7 +187,7 @@ class Stream:
         if b"I" in kinds and _share(lines, lambda line: line[:2] in ("I,", "M,", "T,")) > 0.5:
             return XImu3(kinds, self.counts)
         if self._layout is not None:
-            return Laid(self._layout, self.counts)
+            return LayoutDecoder(self._layout, self.counts)
         raise self._unknown(head, [line for line in lines if line])
 
     def _unknown(self, head: bytes, lines: list[str]) -> UnknownFormatError:

@@ -152,7 +152,7 @@ class XImu3(LineDecoder):
         return None
 
 
-class Laid(LineDecoder):
+class LayoutDecoder(LineDecoder):
     """Delimited text or a JSON object a line, through a layout."""
 
     def __init__(self, layout: Layout, counts: Counts) -> None:

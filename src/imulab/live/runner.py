@@ -25,7 +25,7 @@ class Runner:
     def __init__(self, source: Source, session: Session, recorder: Recorder, layout: Layout | None = None) -> None:
         self.source, self.session, self.recorder = source, session, recorder
         self._stream = Stream(source.name, layout, polled=source.polled)
-        self._heard = source.now()
+        self._last_arrival = source.now()
         self._silent = False
         self._gyros: GyroFits | None = None
         self._fit_due = False
@@ -80,7 +80,7 @@ class Runner:
             self.recorder.tick(now)
         if self.source.ended:
             events += self._take(self._stream.finish(), now)
-        events += self._listen(bool(arrived), now)
+        events += self._check_silence(bool(arrived), now)
         if self.source.lost:
             raise ReadError(f"{self.source.lost} {self.kept()}")
         events += self._gyroscopes(events)
@@ -155,13 +155,13 @@ class Runner:
         if self._stream.to_send:
             self.source.send(self._stream.to_send)
 
-    def _listen(self, heard: bool, now: float) -> list[Event]:
+    def _check_silence(self, arrived: bool, now: float) -> list[Event]:
         """Say that nothing comes any more, or again."""
-        if heard:
-            self._heard = now
+        if arrived:
+            self._last_arrival = now
             again, self._silent = self._silent, False
             return [Event("again", "samples come again", self.recorder.last)] if again else []
-        if self._silent or now - self._heard < _SILENT or self.source.ended:
+        if self._silent or now - self._last_arrival < _SILENT or self.source.ended:
             return []
         self._silent = True
         text = f"nothing has come from {self.source.name} for {_SILENT:.0f} s: is the unit on, and does it send?"

@@ -18,7 +18,7 @@ _MOST_THREADS = 8
 LONGEST_LINE = 1 << 20
 
 
-class Crew:
+class ParserThreads:
     """Threads to parse with, as many as there are processors; started when there is work for them.
 
     OMP_NUM_THREADS limits them as it does the linear algebra, so that workers beside each other do not compete.
@@ -36,7 +36,7 @@ class Crew:
             self._pool = ThreadPoolExecutor(self.size)
         return self._pool.submit(job).result
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> ParserThreads:
         return self
 
     def __exit__(self, *_: object) -> None:

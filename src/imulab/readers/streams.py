@@ -115,7 +115,7 @@ def on_one_clock(
     clock, others = buffers[0], buffers[1:]
     row, done = 1, np.iinfo(np.int64).min
     held: Recording | None = None  # until it is known whether it is the last, which says how the streams ended
-    for piece in _and_end(pieces):
+    for piece in _with_end(pieces):
         if piece is not None:
             if piece.stream and piece.ticks.size and piece.ticks[-1] < done:
                 _refuse_late(buffers[piece.stream], clock, name)
@@ -153,7 +153,7 @@ def on_one_clock(
     yield replace(held, notes=(*held.notes, *_left_out(clock, others), *_ends(buffers, per_second)))
 
 
-def _and_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
+def _with_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
     yield from pieces
     yield None
 

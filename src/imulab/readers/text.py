@@ -19,7 +19,7 @@ from imulab.columns import parse_column_title
 from imulab.errors import ReadError, several
 from imulab.readers import _text
 from imulab.readers.layout import Layout
-from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Crew, Lines
+from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Lines, ParserThreads
 from imulab.readers.readings import BackwardsError, Readings
 from imulab.recording import CORRECTED_BY, Recording
 from imulab.verdict import Note
@@ -105,13 +105,13 @@ class TextFile:
         row = 1
         waiting: deque[_Job] = deque()
         live = self._lines.live
-        with Crew() as crew:
+        with ParserThreads() as threads:
             while True:
                 lines = self._lines.block(self._blanks)
                 if lines is not None:
-                    waiting.append(self._begin(lines, crew))
+                    waiting.append(self._begin(lines, threads))
                 # A file is read ahead while threads parse what has come; a pipe's lines go on at once.
-                while waiting and (lines is None or live or len(waiting) > crew.size):
+                while waiting and (lines is None or live or len(waiting) > threads.size):
                     job = waiting.popleft()
                     rows, problem, field = job.answer()
                     try:
@@ -287,7 +287,7 @@ class TextFile:
 
     # --- rows --------------------------------------------------------------------------------------------------
 
-    def _begin(self, lines: bytes, crew: Crew) -> _Job:
+    def _begin(self, lines: bytes, threads: ParserThreads) -> _Job:
         """Begin to parse a block of whole lines."""
         rows = lines
         if self._layout and self._layout.decimal == ",":
@@ -298,7 +298,7 @@ class TextFile:
         capacity = min(rows.count(b"\n"), len(rows) // len(self._slots) + 1) + 1
         room, first = self._place_for(capacity, len(lines))
         job = partial(_text.parse, rows, self._delimiter, self._slots, room, room.shape[1], 0, -1, first)
-        answer = crew.begin(job) if len(rows) >= WORTH_SHARING else job
+        answer = threads.begin(job) if len(rows) >= WORTH_SHARING else job
         return _Job(lines, rows, room[:, first : first + capacity], answer)
 
     def _chosen(self, lines: bytes, most: int) -> tuple[bytes, int]:

@@ -16,7 +16,7 @@ _MOST_NUMBERS = 8
 
 def narrow(figure: Figure) -> dict[str, Any] | None:
     """Return layout and height of a figure for a narrow screen; None where they stay as they are."""
-    layout = {key: _sparse(value) for key, value in figure.layout.items()}
+    layout = {key: _with_fewer_numbers(value) for key, value in figure.layout.items()}
     keys = _legend_lines(figure)
     panels = [key[5:] for key in layout if key.startswith("xaxis") and "yaxis" + key[5:] in layout]
     if len({tuple(layout["xaxis" + panel].get("domain", (0, 1))) for panel in panels}) < 2:
@@ -48,7 +48,7 @@ def narrow(figure: Figure) -> dict[str, Any] | None:
     }
 
 
-def _sparse(axis: Any) -> Any:
+def _with_fewer_numbers(axis: Any) -> Any:
     """Return an axis that is numbered evenly, with no more numbers than a narrow screen has room for."""
     if not isinstance(axis, dict) or axis.get("type") == "log" or not {"dtick", "range"} <= axis.keys():
         return axis

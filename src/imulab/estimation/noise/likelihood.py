@@ -233,7 +233,7 @@ def score(bins: Bins, start: Array, free: Flags, limits: tuple[float, float], po
         if not rows.size:
             break
         step = _step(slope[rows], fisher[rows], _movable(values[rows], free[rows], slope[rows], edges), damping[rows])
-        tried = _moved(values[rows], step, edges)
+        tried = _stepped(values[rows], step, edges)
         new, new_slope, new_fisher = _expansion(bins, tried, power[rows], freedom[rows])
         better = new <= now[rows] + 1e-9
         gain = np.where(better, now[rows] - new, np.inf)
@@ -292,7 +292,7 @@ def _step(slope: Array, fisher: Array, movable: Flags, damping: Array) -> Array:
     return np.asarray(step * np.minimum(1, _LONGEST / np.maximum(longest, 1e-300)))
 
 
-def _moved(values: Array, step: Array, edges: Array) -> Array:
+def _stepped(values: Array, step: Array, edges: Array) -> Array:
     moved = values * np.exp(step)
     for time in TIME:
         present = values[:, time] > 0

@@ -41,7 +41,7 @@ def walk_square(values: Array, horizon: Array, interval: float, shortest: float 
     parts = allan_terms(values, horizon, interval)
     slow = parts[..., 1, :] + parts[..., 2, :]
     for k in range(2):
-        slow = slow + np.where(_fast(values, k, horizon, shortest), 0.0, parts[..., 4 + k, :])
+        slow = slow + np.where(_is_fast(values, k, horizon, shortest), 0.0, parts[..., 4 + k, :])
     return np.asarray(3 * slow / horizon)
 
 
@@ -54,7 +54,7 @@ def white_square(values: Array, horizon: Array, shortest: float = 0.0) -> Array:
     total = values[..., :1] ** 2 + _OF_FLICKER * values[..., 1:2] ** 2 * horizon
     for k, (sigma, time) in enumerate(zip(SIGMA, TIME, strict=True)):
         density = 2 * values[..., sigma, None] ** 2 * values[..., time, None]
-        total = total + np.where(_fast(values, k, horizon, shortest), density, 0.0)
+        total = total + np.where(_is_fast(values, k, horizon, shortest), density, 0.0)
     return np.asarray(total)
 
 
@@ -109,6 +109,6 @@ def edge_as_white(values: Array, covariance: Array, shortest: float) -> tuple[Ar
     return found, np.asarray(turn @ covariance @ turn.T)
 
 
-def _fast(values: Array, k: int, horizon: Array, shortest: float) -> NDArray[np.bool_]:
+def _is_fast(values: Array, k: int, horizon: Array, shortest: float) -> NDArray[np.bool_]:
     edge = at_band_edge(values, shortest)[..., k, None]
     return np.asarray(edge | (values[..., TIME[k], None] <= horizon / _WHITE_TO_FILTER))

@@ -138,9 +138,9 @@ def serve(
         server.should_exit = True
 
     app.state.hub.stop = stop
-    address = f"http://{_reached(host or LOCAL)}:{listening.getsockname()[1]}/?token="
+    address = f"http://{_address_for_others(host or LOCAL)}:{listening.getsockname()[1]}/?token="
     try:
-        with _hung_up(stop):
+        with _end_on_hangup(stop):
             tell(address + app.state.token)
             sys.stdout.flush()
             if browser:
@@ -153,7 +153,7 @@ def serve(
 
 
 @contextmanager
-def _hung_up(stop: Callable[[], None]) -> Iterator[None]:
+def _end_on_hangup(stop: Callable[[], None]) -> Iterator[None]:
     """End the server as by Ctrl-C where its terminal is closed, so that nothing that it runs is left behind."""
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
@@ -171,7 +171,7 @@ def _open(address: str) -> None:
         webbrowser.open(address)
 
 
-def _reached(host: str) -> str:
+def _address_for_others(host: str) -> str:
     """Return the address by which others reach a server that listens at `host`."""
     if host != ANY:
         return host

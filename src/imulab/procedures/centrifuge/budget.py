@@ -66,10 +66,10 @@ def error_budget(
         *_tilt(test), _flexure(test), *_scale_mismatch(test), *_delays(test), _table_rate(test),
         _arm_rate(test, manifest), _radius(test, manifest),
     ]  # fmt: skip
-    return [asdict(_after(entry) if entry.error in corrected else entry) for entry in entries]
+    return [asdict(_corrected_entry(entry) if entry.error in corrected else entry) for entry in entries]
 
 
-def _after(entry: Entry) -> Entry:
+def _corrected_entry(entry: Entry) -> Entry:
     """An entry once its value is corrected: what is left is its uncertainty."""
     share = (entry.standard_uncertainty or 0.0) / max(
         np.hypot(entry.value or 0.0, entry.standard_uncertainty or 0.0), 1e-300

@@ -150,7 +150,7 @@ def compress(blocks: Iterable[Samples], table_rate: float, net_rate: float) -> C
     work = _Work(start, offset, cell, bins, table_rate, net_rate)
     results, total = [], 0
     rest = head
-    for piece in _then(pieces):
+    for piece in _none_first(pieces):
         if piece is not None:
             rest = _joined(rest, piece)
         whole = len(rest.time) // cell
@@ -255,7 +255,7 @@ def pieces_of(blocks: Iterable[Samples]) -> Iterator[Samples]:
         yield _joined(*waiting)
 
 
-def _then(pieces: Iterator[Samples]) -> Iterator[Samples | None]:
+def _none_first(pieces: Iterator[Samples]) -> Iterator[Samples | None]:
     """Yield None for what is already at hand, then the rest."""
     yield None
     yield from pieces

@@ -78,7 +78,7 @@ def find_corrections(runs: Sequence[LoadedRun], lines: dict[int, RunLine], *, co
 
 
 @dataclass(frozen=True)
-class _Shown:
+class _Finding:
     """An error that a test shows; `common` is what a standard uncertainty of it does to the lines, (runs, axes)."""
 
     common: Complex
@@ -86,17 +86,17 @@ class _Shown:
     named: tuple[str, ...] = ()
 
 
-def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool) -> tuple[float, list[_Shown]]:
+def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: bool) -> tuple[float, list[_Finding]]:
     """How much the FOG's line is turned back by, s, and what was found of delays."""
     found = delays(test)
     if found is None:
         return 0.0, []
     late = 0.0
-    shown: list[_Shown] = []
+    shown: list[_Finding] = []
     top = float(np.abs(test.table).max())
-    turning = _clear(found.own, found.own_uncertainty) and abs(found.own) * top > _FLOOR
+    turning = _is_clear(found.own, found.own_uncertainty) and abs(found.own) * top > _FLOOR
     size = max(abs(found.fog), abs(found.late)) if turning else abs(found.late)
-    clear = _clear(found.fog, found.fog_uncertainty) or (_clear(found.late, found.uncertainty) and not turning)
+    clear = _is_clear(found.fog, found.fog_uncertainty) or (_is_clear(found.late, found.uncertainty) and not turning)
     if clear and size * top * test.fog_share > _FLOOR:
         named: tuple[str, ...] = ()
         if correct and not turning:
@@ -110,7 +110,7 @@ def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: boo
             )
         turn = np.exp(-1j * test.table * late)
         shown.append(
-            _Shown(
+            _Finding(
                 (1j * size * test.table * turn * test.fog)[:, None] * _QUARTER[:axes],
                 f"the FOG is {1e3 * found.fog:.3g} ± {1e3 * found.fog_uncertainty:.1g} ms late against table_angle, "
                 f"which changes K at the highest level by up to {100 * abs(found.fog) * top * test.fog_share:.2g} %: "
@@ -121,7 +121,7 @@ def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: boo
     if turning:
         drift = np.array([lines[run.index].line * run.force for run in test.runs])
         shown.append(
-            _Shown(
+            _Finding(
                 1j * found.own * test.table[:, None] * drift,
                 f"X turns against table_angle as if it were {1e3 * found.own:.3g} ± {1e3 * found.own_uncertainty:.1g} "
                 "ms late (differential flexure looks the same): added to the uncertainty of the direction, which it "
@@ -131,10 +131,10 @@ def _delay(test: Measured, lines: dict[int, RunLine], axes: int, *, correct: boo
     return late, shown
 
 
-def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: bool) -> tuple[Complex, list[_Shown]]:
+def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: bool) -> tuple[Complex, list[_Finding]]:
     """What to add to the factor of the FOG's line in an axis, by run, and what Earth rate shows of it."""
     change = np.zeros(len(test.runs), dtype=np.complex128)
-    shown: list[_Shown] = []
+    shown: list[_Finding] = []
     ratio = mismatch(test, axis, late)
     if ratio is None:
         return change, shown
@@ -144,12 +144,12 @@ def _difference(test: Measured, axis: int, axes: int, late: float, *, correct: b
         ("scale mismatch", "per mille", ratio.scale, np.ones(len(sense))),
         ("FOG azimuth", "mrad", ratio.azimuth, 1j * sense),
     ):
-        if not (_clear(value, ratio.uncertainty, ratio.freedom) and abs(value) * test.fog_share > _FLOOR):
+        if not (_is_clear(value, ratio.uncertainty, ratio.freedom) and abs(value) * test.fog_share > _FLOOR):
             continue
         change += unit * value
         size = ratio.uncertainty if correct else abs(value)
         shown.append(
-            _Shown(
+            _Finding(
                 -size * (unit * turn * test.fog)[:, None] * _QUARTER[:axes] * (np.arange(axes) == axis),
                 f"Earth rate shows a {name} of {1e3 * value:.3g} ± {1e3 * ratio.uncertainty:.1g} {scale} between "
                 f"{'XY'[axis]} and the FOG, which would change K at the highest level by up to "
@@ -167,5 +167,5 @@ def corrected(runs: Sequence[LoadedRun], found: Corrections) -> list[LoadedRun]:
     return [replace(run, fog_factor=found.fog.get(run.index), common=found.common.get(run.index)) for run in runs]
 
 
-def _clear(value: float, uncertainty: float, freedom: float | None = None) -> bool:
+def _is_clear(value: float, uncertainty: float, freedom: float | None = None) -> bool:
     return abs(value) > three_sigma(freedom) * uncertainty

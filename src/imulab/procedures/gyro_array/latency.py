@@ -57,21 +57,21 @@ def align_in_time(time: Array, readings: Array, white: Array, truth: Array | Non
         if truth is None:
             step = step - np.median(step)
         delay = delay + np.clip(step, -_LONGEST, _LONGEST)
-        if moved is readings and not _late(delay, u).any():
+        if moved is readings and not _is_late(delay, u).any():
             break
-        moved, fine = _moved(time, readings, delay)
+        moved, fine = _without_delays(time, readings, delay)
         found = align(moved[fine], white, None if truth is None else truth[fine], strict=False)
         if np.abs(step).max() < _SETTLED * u.min():
             break
     known = bool(np.isfinite(u).all() and np.isfinite(delay).all())
-    if not known or not _late(delay, u).any() or fine.sum() < _FEWEST:
+    if not known or not _is_late(delay, u).any() or fine.sum() < _FEWEST:
         found = align(readings, white, truth)
     else:
         found = align(moved[fine], white, None if truth is None else truth[fine])
     return replace(found, latency=delay, latency_uncertainty=u) if known else found
 
 
-def _late(delay: Array, u: Array) -> NDArray[np.bool_]:
+def _is_late(delay: Array, u: Array) -> NDArray[np.bool_]:
     """Which latencies are clear, and not too small to matter."""
     found: NDArray[np.bool_] = np.abs(delay) > np.maximum(_CLEAR * u, _HARMLESS)
     return found
@@ -81,7 +81,7 @@ def latency_notes(found: Alignment, names: Sequence[str]) -> list[str]:
     """Say which elements are late, under these names."""
     if found.latency is None or found.latency_uncertainty is None:
         return []
-    late = np.flatnonzero(_late(found.latency, found.latency_uncertainty)).tolist()
+    late = np.flatnonzero(_is_late(found.latency, found.latency_uncertainty)).tolist()
     if not late:
         return []
     listed = ", ".join(
@@ -126,7 +126,7 @@ def _regressed(
     return delays(total), np.maximum(spread, np.median(spread))
 
 
-def _moved(time: Array, readings: Array, delay: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _without_delays(time: Array, readings: Array, delay: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return readings earlier by each element's delay, and which rows are interpolated, not made up, (m,)."""
     from scipy.interpolate import CubicSpline
 

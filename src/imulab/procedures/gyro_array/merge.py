@@ -78,7 +78,7 @@ def merge_recordings(
     values = [_in_unit_of(first, names[0], r, own) for r, own in zip(recordings, names, strict=True)]
     notes = []
     for i in range(1, len(recordings)):
-        name, offset = recordings[i].name, _offset(times[0], values[0], times[i], values[i])
+        name, offset = recordings[i].name, _clock_offset(times[0], values[0], times[i], values[i])
         if align:
             if offset is None:
                 raise DataError(f"{name}: --align: found no motion that fits {first.name} at one offset of time only")
@@ -191,12 +191,12 @@ def _in_unit_of(first: Recording, wanted: Sequence[str], recording: Recording, n
 def _interpolated(wanted: Array, time: Array, values: Array) -> Array:
     """Return readings at other times, shape (m, axes); NaN across gaps."""
     found = np.column_stack([np.interp(wanted, time, column) for column in values.T])
-    away, across = _away(wanted, time)
+    away, across = _distance_to_samples(wanted, time)
     found[across & (away > 0)] = np.nan
     return found
 
 
-def _away(wanted: Array, time: Array) -> tuple[Array, np.ndarray]:
+def _distance_to_samples(wanted: Array, time: Array) -> tuple[Array, np.ndarray]:
     """Return how far times, shape (m,), lie from the nearest sample, s, and which lie in a gap too wide to bridge."""
     right = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
     away = np.minimum(np.abs(time[right] - wanted), np.abs(wanted - time[right - 1]))
@@ -205,7 +205,7 @@ def _away(wanted: Array, time: Array) -> tuple[Array, np.ndarray]:
 
 def _joined(recording: Recording, time: Array, clock: Array, wanted: Array) -> list[str]:
     """Say between which rates a recording is interpolated, and how far its own samples are from the times wanted."""
-    away, across = _away(wanted, time)
+    away, across = _distance_to_samples(wanted, time)
     most = float(away[~across].max(initial=0.0))
     if most == 0:
         return []
@@ -216,7 +216,7 @@ def _joined(recording: Recording, time: Array, clock: Array, wanted: Array) -> l
     ]
 
 
-def _offset(time: Array, values: Array, other: Array, others: Array) -> float | None:
+def _clock_offset(time: Array, values: Array, other: Array, others: Array) -> float | None:
     """How much later the other clock shows the same motion, s; None where no single offset fits clearly.
 
     The size of the rate, which is the same however a gyroscope is mounted, is correlated over all shifts that leave
@@ -226,7 +226,7 @@ def _offset(time: Array, values: Array, other: Array, others: Array) -> float | 
     step = max(step, max(time[-1] - time[0], other[-1] - other[0]) / _MOST_POINTS)
     a, b = _size_of_rate(time, values, step), _size_of_rate(other, others, step)
     shorter = min(len(a), len(b))
-    if shorter < _FEWEST_POINTS or not (_moves(values) and _moves(others)):
+    if shorter < _FEWEST_POINTS or not (_is_moving(values) and _is_moving(others)):
         return None
     length = 1 << (len(a) + len(b)).bit_length()
 
@@ -261,7 +261,7 @@ def _offset(time: Array, values: Array, other: Array, others: Array) -> float | 
     return float(other[0] - time[0] + shift * step)
 
 
-def _moves(values: Array) -> bool:
+def _is_moving(values: Array) -> bool:
     """Whether readings, shape (n, axes), take more values than the last digits of a gyroscope at rest."""
     return any(len(np.unique(column[np.isfinite(column)])) >= _FEWEST_LEVELS for column in values.T)
 

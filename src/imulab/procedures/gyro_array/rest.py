@@ -77,21 +77,21 @@ def find_rest(readings: Array, rate: float, names: Sequence[Sequence[str]], name
     runs = np.flatnonzero(edges).reshape(-1, 2)
     first, last = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))].tolist() if len(runs) else (0, 0)
     if last - first < _SHORTEST:
-        moves, ratio = together(mean - mean.mean(axis=0), usual / math.sqrt(size))
+        moves, ratio = common_motion(mean - mean.mean(axis=0), usual / math.sqrt(size))
         if ratio > _TOGETHER:
-            raise DataError(_goes_together(name, moves, ratio))
+            raise DataError(_motion_message(name, moves, ratio))
         raise DataError(
             f"{name}: no stretch of {_SHORTEST * size / rate:.3g} s at rest: "
-            f"{_first_restless(restless, spread, mean - centre, names, size / rate)}; expected a recording at rest"
+            f"{_restless_message(restless, spread, mean - centre, names, size / rate)}; expected a recording at rest"
         )
     start, stop = first * size, count if last == len(windows) else last * size
     _refuse_motion(readings[start:stop], mean[first:last], usual, size, names, name)
     if (start, stop) == (0, count):
         return Rest(0, count)
-    return Rest(start, stop, _first_restless(restless, spread, mean - centre, names, size / rate))
+    return Rest(start, stop, _restless_message(restless, spread, mean - centre, names, size / rate))
 
 
-def together(off: Array, noise: Array) -> tuple[float, float]:
+def common_motion(off: Array, noise: Array) -> tuple[float, float]:
     """Return how far the elements of an array go together, rms, and its ratio to what each does on its own.
 
     The largest eigenvectors of the covariance, as many as there are axes, whitened by `noise`, hold what all elements
@@ -124,13 +124,13 @@ def _refuse_motion(
     readings: Array, mean: Array, usual: Array, size: int, names: Sequence[Sequence[str]], name: str
 ) -> None:
     """Refuse a quiet stretch whose elements go together, or that turns steadily."""
-    slow = together(mean - mean.mean(axis=0), usual / math.sqrt(size))
+    slow = common_motion(mean - mean.mean(axis=0), usual / math.sqrt(size))
     part = readings[: min(len(readings), _MOST_SAMPLES) // size * size]
     blocks = part.reshape(-1, size, *part.shape[1:])
-    fast = together((blocks - blocks.mean(axis=1, keepdims=True)).reshape(part.shape), usual)
+    fast = common_motion((blocks - blocks.mean(axis=1, keepdims=True)).reshape(part.shape), usual)
     moves, ratio = max(slow, fast, key=lambda found: found[1])
     if ratio > _TOGETHER:
-        raise DataError(_goes_together(name, moves, ratio))
+        raise DataError(_motion_message(name, moves, ratio))
     steady = readings.mean(axis=0)
     rates = np.sqrt((steady**2).sum(axis=0))
     low, middle, high = np.quantile(rates, [0.0, 0.5, 1.0])
@@ -148,14 +148,14 @@ def _refuse_motion(
         )
 
 
-def _goes_together(name: str, moves: float, ratio: float) -> str:
+def _motion_message(name: str, moves: float, ratio: float) -> str:
     return (
         f"{name}: the array moves: its elements go together by {math.degrees(moves):.3g} deg/s, {ratio:.0f} times what "
         "they differ; expected a recording at rest"
     )
 
 
-def _first_restless(
+def _restless_message(
     restless: np.ndarray, spread: Array, off: Array, names: Sequence[Sequence[str]], step: float
 ) -> str:
     """Name the gyro that moves most, its rate, and when, s from the beginning."""

@@ -76,7 +76,7 @@ class ColumnCheck:
         """Of so large a difference, if nothing changed."""
         return self.agreement.probability
 
-    def said(self) -> str:
+    def text(self) -> str:
         """Return what changed, by how much, with 95 % intervals: certain changes, or the one that is most so."""
         certain = [each for each in self.changes if not each.low < 1 < each.high] or list(self.changes[:1])
         parts = [f"{label(each.term, self.unit)} {times(each.ratio, each.low, each.high)}" for each in certain]

@@ -26,7 +26,7 @@ def meaning(check: NoiseCheck) -> str:
     if check.passed:
         return "the log agrees with the noise of the record"
     worst = min(check.columns.values(), key=lambda each: each.probability)
-    return f"the noise is not that of the record; most in {worst.name}: {worst.said()}"
+    return f"the noise is not that of the record; most in {worst.name}: {worst.text()}"
 
 
 def p_text(probability: float) -> str:
@@ -45,7 +45,7 @@ def exhibits_of_check(check: NoiseCheck) -> Exhibits:
             name,
             "differs" if check.differs(name) else "agrees",
             p_text(each.probability).removeprefix("p ").removeprefix("= "),
-            each.said(),
+            each.text(),
         ]
         for name, each in check.columns.items()
     ]
@@ -131,7 +131,7 @@ def as_text(check: NoiseCheck, record: str, files: Sequence[str], verdict: str) 
         )
     many = len(check.columns)
     lines.append(f"{p_text(check.probability)} over {many} column{'s' if many > 1 else ''}")
-    lines += [f"{name}: {p_text(each.probability)}; {each.said()}" for name, each in check.columns.items()]
+    lines += [f"{name}: {p_text(each.probability)}; {each.text()}" for name, each in check.columns.items()]
     return "\n".join(lines)
 
 

@@ -45,7 +45,10 @@ def direction_covariance(record: Calibration, attitudes: Attitudes, output: Arra
         matrix = record.covariance.block(names)
         sigma = np.sqrt(np.diag(matrix))
         moved = np.stack(
-            [_moved(record, name, size, output).ravel() for name, size in zip(names, sigma.tolist(), strict=True)],
+            [
+                _force_change(record, name, size, output).ravel()
+                for name, size in zip(names, sigma.tolist(), strict=True)
+            ],
             axis=1,
         )
         joint += (moved @ (matrix / np.outer(sigma, sigma)) @ moved.T).reshape(n, 3, n, 3)
@@ -62,7 +65,7 @@ def _slope(record: Calibration, output: Array, step: Array) -> Array:
     return change
 
 
-def _moved(record: Calibration, name: str, sigma: float, output: Array) -> Array:
+def _force_change(record: Calibration, name: str, sigma: float, output: Array) -> Array:
     """Change of the specific force with one standard uncertainty of a parameter, shape (n, 3)."""
     parameter = record.parameters[name]
     ends = [

@@ -142,8 +142,8 @@ def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest
     flat = mean - mean.mean(axis=0)
     # A zero that drifts goes with some direction of f by chance: held against, and found beside, a slope in time.
     drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), force, when])
-    left = _left(whole, mean)
-    costs = float((_left(drift, mean) ** 2).sum()), float((left**2).sum())
+    left = _residuals(whole, mean)
+    costs = float((_residuals(drift, mean) ** 2).sum()), float((left**2).sum())
     shown = n > 7 and f_test(costs[0], 6, costs[1], 15, 3 * n) < _SIGNIFICANT
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
         scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
@@ -151,12 +151,12 @@ def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest
     solution = np.asarray(np.linalg.lstsq(whole, mean, rcond=None)[0], dtype=np.float64)
     root = np.sqrt(np.diag(np.linalg.inv(whole.T @ whole)))
     spread = np.sqrt((left**2).sum(axis=0) / max(n - 5, 1))
-    wander = np.sqrt((_left(whole[:, :4], mean) ** 2).sum(axis=0) / max(n - 4, 1))
+    wander = np.sqrt((_residuals(whole[:, :4], mean) ** 2).sum(axis=0) / max(n - 4, 1))
     uncertainty: Array = spread[:, None] * root[1:4]
     return Rest(solution[0], solution[1:4].T, np.maximum(spread, wander) * root[0], uncertainty)
 
 
-def _left(design: Array, values: Array) -> Array:
+def _residuals(design: Array, values: Array) -> Array:
     """What a least-squares fit of each column leaves."""
     left: Array = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
     return left

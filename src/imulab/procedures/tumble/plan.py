@@ -123,8 +123,8 @@ def plan_tumble(
         raise OptionError(f"{source}: {len(points)} different candidate attitudes; expected at least {size}")
     search = Search(order, criterion, before, distinct_verticals)
     best = optimal_set(search, points, attitudes, seed, free=free) if len(points) >= attitudes else None
-    if not free and (best is None or len(_apart(search, best)) < attitudes):
-        apart = _apart(search, points)
+    if not free and (best is None or len(_without_repeats(search, best)) < attitudes):
+        apart = _without_repeats(search, points)
         if distinct_verticals and len(apart) < attitudes:
             raise OptionError(
                 f"{source}: {len(apart)} candidate attitudes lie 3 deg apart and repeat no vertical axis; expected at "
@@ -135,7 +135,7 @@ def plan_tumble(
         raise ObservabilityError(
             f"{source}: no {attitudes} of the {len(points)} candidate attitudes determine order {order}"
         )
-    rounds = [best, *_put_down_again(search, points, best, attitudes)]
+    rounds = [best, *_repeated(search, points, best, attitudes)]
     best = np.vstack(rounds)
     everything = np.vstack([before, best])
     jacobian = information_rows(everything, order)
@@ -147,7 +147,7 @@ def plan_tumble(
     return Plan(paths, order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
 
 
-def _apart(search: Search, points: Array) -> Array:
+def _without_repeats(search: Search, points: Array) -> Array:
     """Candidates that repeat neither one another nor an attitude already there, in their order, shape (k, 3)."""
     found = np.empty((0, 3))
     for point in points:
@@ -156,9 +156,9 @@ def _apart(search: Search, points: Array) -> Array:
     return found
 
 
-def _put_down_again(search: Search, points: Array, best: Array, attitudes: int) -> list[Array]:
+def _repeated(search: Search, points: Array, best: Array, attitudes: int) -> list[Array]:
     """Attitudes that make up the number, in rounds: no attitude is put down a third time before all were twice."""
-    everywhere = best if len(best) else _apart(replace(search, before=np.empty((0, 3))), points)
+    everywhere = best if len(best) else _without_repeats(replace(search, before=np.empty((0, 3))), points)
     rows, rounds = information_rows(everywhere, search.order), list[Array]()
     kept, left = information_rows(best, search.order), attitudes - len(best)
     while left > 0:

@@ -32,7 +32,7 @@ _TOLERANCE = 1e-11
 _DAMPING = 1e-4
 _PASSES = 50
 _RESTS = 1e-3
-_ASKS = 0.05
+_BEYOND_BY_CHANCE = 0.05
 """Probability of chi-square below which attitudes whose noise is known scatter beyond it."""
 _HUBER = 2.0
 _LEAST = 1e-24  # variance that exact data leave, or rounding in them
@@ -148,7 +148,7 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
     unknown = pair.noise is None
     first = float(np.median(pair.accel_variance))
     extra = np.array([first if unknown else 0.0] * 2 + [first])
-    asked = np.array([unknown, unknown, pair.held is not None])
+    free = np.array([unknown, unknown, pair.held is not None])
     converged = False
     for number in range(_PASSES):
         known = _known(pair, pair.evaluate(theta))
@@ -158,9 +158,9 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
         known = _known(pair, found)
         before, weights_before = extra, down
         if number == 0 and not unknown:
-            asked[:2] = _asked(found, known)
-        if asked.any():
-            extra = _restricted(pair, found, _information(pair, known, extra, down), extra, down, asked)
+            free[:2] = _scatters_beyond(found, known)
+        if free.any():
+            extra = _likelihood_pass(pair, found, _information(pair, known, extra, down), extra, down, free)
         if robust:
             down = _huber(found, known, extra)
         rests = np.abs(extra - before) <= _RESTS * extra + _LEAST
@@ -168,7 +168,7 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
             converged = True
             break
     information = _information(pair, known, extra, np.ones(len(down)))
-    covariance, freedom = _uncertainty(pair, found, _information(pair, known, extra, down), extra, asked)
+    covariance, freedom = _uncertainty(pair, found, _information(pair, known, extra, down), extra, free)
     return Joint(pair, theta, found, information, covariance, freedom, np.sqrt(extra), down, converged)
 
 
@@ -285,7 +285,9 @@ def _blocks(information: Array, found: Invariants, covariance: Array) -> tuple[A
     return trace, squares
 
 
-def _restricted(pair: Pair, found: Invariants, information: Array, extra: Array, down: Array, asked: Array) -> Array:
+def _likelihood_pass(
+    pair: Pair, found: Invariants, information: Array, extra: Array, down: Array, free: Array
+) -> Array:
     """One pass of restricted maximum likelihood for the variances of |m|, dip and directions held."""
     covariance = _covariance(pair, found, information)
     trace, squares = _blocks(information, found, covariance)
@@ -296,23 +298,23 @@ def _restricted(pair: Pair, found: Invariants, information: Array, extra: Array,
     weights[:, 1:3] = 1 / np.maximum(down, 1e-12)[:, None]
     square = np.bincount(_BLOCKS[: felt.shape[1]], (weights * felt**2).sum(axis=0), 4)
     new = extra.copy()
-    which = np.flatnonzero(asked)
+    which = np.flatnonzero(free)
     change = np.linalg.solve(squares[1:, 1:][np.ix_(which, which)], (square - trace)[1:][which])
     new[which] = np.maximum(extra[which] + change, 0.0)
     if pair.noise is None and new[1] < new[0]:
         both = slice(1, 3)
         change = (square - trace)[both].sum() / squares[both, both].sum()
         new[:2] = max(float(extra[:2].mean()) + change, 0.0)
-    new[np.logical_not(asked)] = 0.0
+    new[np.logical_not(free)] = 0.0
     return new
 
 
-def _asked(found: Invariants, known: Array) -> Array:
+def _scatters_beyond(found: Invariants, known: Array) -> Array:
     """Whether |m|, and the dip, scatter beyond their known noise; each has about half of the parameters they have."""
     n, size = len(known), found.by_parameters.shape[2]
     chi = (found.residuals[:, :3] ** 2 / (np.einsum("nii->ni", known) + _LEAST))[:, 1:].sum(axis=0)
     freedom = max(n - size / 3, 1.0)
-    return np.array([chi_square_probability(float(value), freedom) < _ASKS for value in chi])
+    return np.array([chi_square_probability(float(value), freedom) < _BEYOND_BY_CHANCE for value in chi])
 
 
 def _huber(found: Invariants, known: Array, extra: Array) -> Array:
@@ -323,7 +325,7 @@ def _huber(found: Invariants, known: Array, extra: Array) -> Array:
     return weights
 
 
-def _uncertainty(pair: Pair, found: Invariants, information: Array, extra: Array, asked: Array) -> tuple[Array, Array]:
+def _uncertainty(pair: Pair, found: Invariants, information: Array, extra: Array, free: Array) -> tuple[Array, Array]:
     """Covariance of theta, and the degrees of freedom of each variance in it."""
     covariance = _covariance(pair, found, information)
     squares = _blocks(information, found, covariance)[1]
@@ -334,7 +336,7 @@ def _uncertainty(pair: Pair, found: Invariants, information: Array, extra: Array
     spread = np.zeros((4, 4))
     if np.isfinite(pair.accel_freedom):
         spread[0, 0] = float(np.median(pair.accel_variance)) ** 2 / pair.accel_freedom
-    which = np.flatnonzero(asked) + 1
+    which = np.flatnonzero(free) + 1
     spread[np.ix_(which, which)] = np.linalg.inv(squares[np.ix_(which, which)])
     with np.errstate(divide="ignore"):
         freedom = np.diag(covariance) ** 2 / np.einsum("kp,kl,lp->p", by_block, spread, by_block)

@@ -41,7 +41,7 @@ def find_start(mag: Array, direction: Array) -> Start:
     shape = _ellipsoid(scaled)
     if shape is None:
         shape = _sphere(scaled)
-        rotation, sine = _of_a_cube((scaled - shape[1]) @ shape[0].T, direction)
+        rotation, sine = _best_permutation_of_axes((scaled - shape[1]) @ shape[0].T, direction)
     else:
         rotation, sine = _alignment((scaled - shape[1]) @ shape[0].T, direction)
     upper, hard_iron = shape
@@ -87,7 +87,7 @@ def _alignment(field: Array, direction: Array) -> tuple[Array, float]:
     return rotation, float(-np.mean(np.einsum("ni,ij,nj->n", direction, rotation, field)))
 
 
-def _of_a_cube(field: Array, direction: Array) -> tuple[Array, float]:
+def _best_permutation_of_axes(field: Array, direction: Array) -> tuple[Array, float]:
     """Return, of the 24 rotations that carry axes into axes, the one under which the dip varies least."""
     candidates = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
