@@ -5,12 +5,12 @@ import re
 import runpy
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import imulab
+from imulab.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"<!-- tested -->\n+```(\w*)\n(.*?)```", re.DOTALL)
@@ -75,7 +75,7 @@ PAGES = sorted(page for page in (REPOSITORY / "docs").glob("*.md") if BLOCK.sear
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_what_a_page_shows_runs(page, tmp_path, monkeypatch):
+def test_what_a_page_shows_runs(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
         if language == "python":
@@ -87,8 +87,10 @@ def test_what_a_page_shows_runs(page, tmp_path, monkeypatch):
             if not words:
                 continue
             assert words[0] in ("imulab", "make"), line
-            command = [sys.executable, "-m", *words] if words[0] == "imulab" else words
-            done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+            if words[0] == "imulab":
+                assert main(words[1:]) == 0, f"{page.name}: {line}\n{capsys.readouterr().err}"
+                continue
+            done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
             assert done.returncode == 0, f"{page.name}: {line}\n{done.stderr}"
 
 
