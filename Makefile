@@ -11,6 +11,9 @@ ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
 
+# The tests start many processes: each would compile what it imports again where the environment forbids to keep it.
+test test-all: export PYTHONDONTWRITEBYTECODE =
+
 test: core $(STAMP)
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 	$(BIN)/python -m pytest -n 2 -m slow --reduced
