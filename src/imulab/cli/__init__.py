@@ -49,7 +49,10 @@ def _main(arguments: Sequence[str] | None) -> int:
             stream.reconfigure(errors="replace")
     try:
         status = command(sys.argv[1:] if arguments is None else arguments).main(
-            args=arguments, prog_name="imulab", standalone_mode=False
+            args=arguments,
+            prog_name="imulab",
+            standalone_mode=False,
+            obj=main,  # `imulab demo` runs other commands
         )
         sys.stdout.flush()
         release()

@@ -236,12 +236,12 @@ def report(
 
 
 def demo(
+    context: typer.Context,
     folder: Annotated[str, typer.Argument(metavar="[DIR]", help="Folder to write to.")] = "demo",
 ) -> None:
     """Run the procedures on simulated rigs and write recordings, records, corrected data and reports."""
     from functools import partial
 
-    from imulab.cli import main
     from imulab.demo import run
 
-    print(run(folder, partial(main, project=False)))
+    print(run(folder, partial(context.obj, project=False)))
