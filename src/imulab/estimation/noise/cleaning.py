@@ -129,7 +129,7 @@ def _levels(squares: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -
     for half, most in ((_LEAST // 4, _LEAST // 2), (_LEAST // 2, len(squares) - _LEAST // 2)):
         near = np.flatnonzero((width < _FEWEST) & (centre >= half) & (centre < min(most, len(squares) - half)))
         if near.size:
-            level[near] = np.median(squares[centre[near, None] + np.arange(-half, half + 1)], axis=1)
+            level[near] = medians(squares[centre[near, None] + np.arange(-half, half + 1)])
     found = np.zeros(len(squares))
     found[first[0] - 1 : last[-1]] = np.repeat(level, width)
     return found
