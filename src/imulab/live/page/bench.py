@@ -60,6 +60,7 @@ class Workbench(Part):
         self._hub = Hub()
         self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
         self._coming: set[str] = set()
+        shown = _json(list(forms.values()))
         self.routes = [
             Route(f"{_HERE}/files", self._list),
             Route(f"{_HERE}/files/{{name:path}}", self._receive, methods=["PUT"]),
@@ -67,7 +68,7 @@ class Workbench(Part):
             Route(f"{_HERE}/files/{{name:path}}", self._send),
             Route(f"{_HERE}/zip/{{name:path}}", self._zip),
             Route(f"{_HERE}/reports/{{name:path}}", self._report),
-            Route(f"{_HERE}/forms", lambda request: _json(list(self._forms.values()))),
+            Route(f"{_HERE}/forms", lambda request: shown),
             Route(f"{_HERE}/open", self._open, methods=["POST"]),
             Route(f"{_HERE}/curves", self._curves),
             Route(f"{_HERE}/command", self._command, methods=["POST"]),
@@ -76,8 +77,11 @@ class Workbench(Part):
         ]
 
     def begin(self, hub: Hub) -> None:
-        """Begin to tell pages."""
+        """Begin to tell pages, and to read the recording that they show first."""
         self._hub = hub
+        first = next((entry.name for entry in self._files.entries() if entry.kind == "recording"), None)
+        if first is not None and self._files.is_given(first):
+            self._openings.open(first, {})
 
     def greet(self) -> Iterable[Message]:
         """Yield the files and what was run."""

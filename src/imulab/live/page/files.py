@@ -68,6 +68,7 @@ class Files:
                 raise OptionError(f"{quoted(name)}: expected a file name without control characters")
             if not Path(name).exists():
                 raise OptionError(f"{name}: no such file")
+        self._first = frozenset(given)
         self._given = [f"./{name}" if name.startswith("-") else name for name in dict.fromkeys([*given, *later])]
 
     def make(self) -> None:
@@ -104,6 +105,10 @@ class Files:
         if name not in self._given and (own == name or own.startswith(".") or not inside(self.folder, own).exists()):
             raise OptionError(f"{quoted(name)}: not among the files of this session")
         return name
+
+    def is_given(self, name: str) -> bool:
+        """Whether the command line named a file that was there already."""
+        return name.removeprefix("./") in self._first or name in self._first
 
     def owns(self, name: str) -> bool:
         """Whether a file lies in the session's folder, and was not named by the command line."""

@@ -47,7 +47,7 @@ export function mount(into, given) {
       if (kind === "drop") take([...event.dataTransfer.files]);
     });
   }
-  ask("forms").then(found => { forms = found; if (chosen) choose(chosen.name); }).catch(fail);
+  ask("forms").then(found => { forms = found; if (chosen) formed(); }).catch(fail);
 }
 
 const fail = error => page.say(error.message, "bad");
@@ -126,6 +126,13 @@ function remove() {
   if (confirm(`Remove ${chosen.short} from the folder ${folder}?`)) {
     ask(`files/${encodeURIComponent(chosen.name)}`, undefined, { method: "DELETE" }).catch(fail);
   }
+}
+
+// What a file shows that is made of forms; a recording that is shown already stays as it is.
+function formed() {
+  if (chosen.kind === "record") record();
+  else if (chosen.kind === "recording") ui.reading.replaceChildren(ui.reading.firstChild, readingForm());
+  offer();
 }
 
 function recording() {
