@@ -1,4 +1,4 @@
-"""The Arduino sketch of docs/live.md: compiled with a stub of what it includes, its output read without a layout."""
+"""The Arduino sketch of docs/streams.md: compiled with a stub of what it includes, its output read without a layout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from imulab.live.formats import Stream
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "live.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "streams.md"
 STUB = r"""
 #include <cstdint>
 #include <cstdio>

@@ -119,7 +119,10 @@ make -C firmware test
 )
 
 
-_LIVE = "live, with a simulated unit: imulab live simulate --follow --save live.csv (--help says more)"
+_LIVE = (
+    "live in the browser, with a simulated unit and the workbench beside it:\n"
+    "    imulab live simulate --follow --save live.csv --page     (without --page in the terminal)"
+)
 
 
 def run(folder: str | Path, main: Callable[[list[str]], int]) -> str:

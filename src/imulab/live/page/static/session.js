@@ -39,8 +39,8 @@ export function mount(into, given) {
   parts.nextText = h("figcaption", {});
   parts.live = bodyPlace("The unit now");
   parts.liveText = h("figcaption", {});
-  parts.hand = h("p", { class: "caption" }, "Simulated: drag it, or ",
-    h("button", { class: "small", onclick: () => aim?.up && page.send({ type: "turn", up: aim.up }) }, "Turn it so"));
+  parts.soon = h("span", {}, ", or ", h("button", { class: "small", onclick: () => aim?.up && page.send({ type: "turn", up: aim.up }) }, "Turn it so"));
+  parts.hand = h("p", { class: "caption" }, "Simulated: drag it", parts.soon);
   parts.nextFigure = h("figure", { class: "wanted" }, h("h2", {}, "Turn it like this"), parts.next, parts.nextText);
   parts.bodies = h("section", { class: "bodies" },
     parts.nextFigure, h("figure", {}, h("h2", {}, "Now"), parts.live, parts.liveText, parts.hand));
@@ -140,6 +140,7 @@ function bodies(now, measuring) {
   parts.live.classList.toggle("by-hand", now.by_hand && measuring);
   show(parts.hand, now.by_hand && measuring);
   show(parts.nextFigure, Boolean(aim.up));
+  show(parts.soon, Boolean(aim.up));
   if (!aim.up) {
     put(parts.liveText, "");
     return;

@@ -198,7 +198,7 @@ function summary({ head, done, attitudes }) {
   if (head.timed) {
     const seconds = head.last - head.first;
     if (head.rows > 1 && head.usual > 0) parts.push(`${seconds.toPrecision(4)} s at ${Number((1 / head.usual).toPrecision(4))} Hz`);
-    parts.push(head.gap_count ? `${head.gap_count} gaps` : "no gaps");
+    parts.push(head.gap_count ? `${head.gap_count} ${head.gap_count === 1 ? "gap" : "gaps"}` : "no gaps");
     if (attitudes === undefined) parts.push("looking for attitudes…");
     else if (attitudes.length) parts.push(`${attitudes.length} ${attitudes.length === 1 ? "attitude" : "attitudes"} at rest (shaded)`);
   } else {
