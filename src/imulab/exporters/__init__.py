@@ -12,16 +12,8 @@ from imulab.device.array_settings import Fusion
 from imulab.errors import OptionError, listed
 from imulab.records.calibration import Calibration
 
-EXPORTERS = {
-    "c": "c",
-    "blob": "blob",
-    "px4": "px4",
-    "ardupilot": "ardupilot",
-    "kalibr": "kalibr",
-    "openvins": "openvins",
-    "ros": "ros",
-}
-"""Target to module; each has ``export(records, folder, options) -> list of the files written``."""
+EXPORTERS = ("c", "blob", "px4", "ardupilot", "kalibr", "openvins", "ros")
+"""Targets, a module each, which has ``export(records, folder, options) -> list of the files written``."""
 
 
 def _nothing(message: str) -> None:
@@ -72,15 +64,8 @@ def export(
     """
     if target not in EXPORTERS:
         raise OptionError(f"unknown target {target!r}; known targets: {listed(EXPORTERS, target)}")
-    module = f"imulab.exporters.{EXPORTERS[target]}"
-    try:
-        exporter = import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise
-        raise OptionError(f"target {target} is not there yet; known targets: {' '.join(EXPORTERS)}") from None
     chosen = options or ExportOptions()
-    files: list[Path] = exporter.export(records, Path(folder), chosen)
+    files: list[Path] = import_module(f"imulab.exporters.{target}").export(records, Path(folder), chosen)
     if target not in _WITH_MAGNETOMETERS and any("mag_bias_x" in record.parameters for record in records):
         chosen.tell(f"{target}: its file has no place for magnetometers: theirs are left out")
     return files
