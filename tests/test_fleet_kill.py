@@ -17,12 +17,12 @@ from fleets import children, command, make_fleet, records, wait_for, workers_of
 from imulab.fleet.run import fleet_status, run_fleet
 from imulab.fleet.store import MOST_ATTEMPTS
 
-UNITS = 300
+UNITS = 120
 
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory):
-    """Enough units for some seconds of work."""
+    """Enough units for a run to be caught at its work."""
     return make_fleet(tmp_path_factory.mktemp("fleet"), UNITS)
 
 
