@@ -38,7 +38,7 @@ class Echo(Part):
         super().__init__()
         self.folder = folder
         self.routes = [Route("/api/files/{name:path}", self.store, methods=["PUT"])]
-        self.hears = {"say": self.say}
+        self.handlers = {"say": self.say}
 
     async def store(self, request: Request) -> JSONResponse:
         size = await receive_file(request, inside(self.folder, request.path_params["name"]))

@@ -31,8 +31,8 @@ def shown_first(statistics: Sequence[ParameterStatistics]) -> list[ParameterStat
 
     def weight(item: ParameterStatistics) -> tuple[float, float]:
         cpk = math.inf if item.capability is None else item.capability.cpk
-        strange = int(item.outliers.sum()) + (item.drift is not None and item.drift.significant)
-        return cpk, -float(strange)
+        found = int(item.outliers.sum()) + (item.drift is not None and item.drift.significant)
+        return cpk, -float(found)
 
     chosen = sorted(statistics, key=weight)[:MOST_PANELS]
     return [item for item in statistics if item in chosen]

@@ -97,7 +97,7 @@ class GuidedPart(Part):
         self._stop = threading.Event()
         self._hub = Hub()
         self._thread = threading.Thread(target=partial(copy_context().run, self._run), daemon=True, name="imulab live")
-        self.hears = {
+        self.handlers = {
             "drop": self._drop,
             "turn": self._turn,
             "finish": self._asked.put,

@@ -60,7 +60,7 @@ class Job:
 
 
 class Jobs:
-    """The commands of a session; `tell` hears of every change, in threads of their own."""
+    """The commands of a session; `tell` is called with every change, from other threads."""
 
     def __init__(self, tell: Callable[[Job], object]) -> None:
         self.jobs: dict[int, Job] = {}

@@ -56,7 +56,7 @@ class Opening:
 
 
 class Openings:
-    """The files of a session that the page has looked into; `tell` hears of what is found, in threads of their own."""
+    """The files of a session that the page has looked into; `tell` is called with what is found, from other threads."""
 
     def __init__(self, tell: Callable[[Opening], object]) -> None:
         self._tell = tell

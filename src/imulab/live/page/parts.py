@@ -24,7 +24,7 @@ _MOST_WAITING = 1000
 
 
 class Part:
-    """One area of the page; `session.SessionPart` is the guided session.
+    """One area of the page; `guided.GuidedPart` is the guided session.
 
     Attributes
     ----------
@@ -32,8 +32,8 @@ class Part:
         Of its area in ``index.html`` and of its module under ``static``.
     routes
         Addresses beside those of the others.
-    hears
-        Messages of pages by their type, and what takes each, in the server's thread: what takes long belongs in
+    handlers
+        What is called with a page's message, by its type, in the server's thread: what takes long belongs in
         another. An ImulabError that it raises becomes ``refused``.
     """
 
@@ -41,7 +41,7 @@ class Part:
 
     def __init__(self) -> None:
         self.routes: Sequence[BaseRoute] = ()
-        self.hears: Mapping[str, Callable[[Message], object]] = {}
+        self.handlers: Mapping[str, Callable[[Message], object]] = {}
 
     def begin(self, hub: Hub) -> None:
         """Begin, once the server runs: from now on `hub.tell` reaches the pages."""

@@ -42,7 +42,7 @@ _GRACE = 2
 def application(token: str, parts: Sequence[Part], *, host: str = LOCAL, limit: int = UPLOAD_LIMIT) -> Starlette:
     """Return the application of a page with these parts at an address; its `state` has `hub`, `token` and `once`."""
     hub, once = Hub(), new_token()
-    known = {kind: take for part in parts for kind, take in part.hears.items()}
+    known = {kind: take for part in parts for kind, take in part.handlers.items()}
     hello = {"type": "hello", "areas": [part.name for part in parts], "version": VERSION}
 
     @asynccontextmanager
