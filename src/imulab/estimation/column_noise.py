@@ -265,6 +265,11 @@ def _columns(names: list[str]) -> str:
     return f"column{'s' * (len(names) > 1)} {' '.join(names)}"
 
 
+def most_reach(quantity: str, noise: float) -> float:
+    """Return how far means of a sensor at rest may lie apart, SI, by their noise; no bound for other quantities."""
+    return max(_STILL[quantity][0], _NOISE_REACH * noise) if quantity in _STILL else math.inf
+
+
 def moved_columns(recording: Recording, names: list[str], rate: float) -> dict[str, str]:
     """Return the columns whose means over a second range farther than any zero drifts and than noise explains: why."""
     size = max(1, min(round(rate), len(recording)))
@@ -277,7 +282,7 @@ def moved_columns(recording: Recording, names: list[str], rate: float) -> dict[s
         means = samples[: len(samples) // size * size].reshape(-1, size).mean(axis=1)
         reach = float(np.ptp(means)) if means.size else 0.0
         noise = deviation_of_steps(samples) / math.sqrt(2 * size)
-        if reach > max(_STILL[quantity][0], _NOISE_REACH * noise):
+        if reach > most_reach(quantity, noise):
             moved[name] = reach
     reasons: dict[str, str] = {}
     for quantity, (_, unit) in _STILL.items():

@@ -17,10 +17,10 @@ _FEWEST = 3
 _GAP = 1.5
 _COARSE = 0.2
 _BLOCKS, _SMALLEST_BLOCK = 100, 100
-_SAME_RATE = 0.05
+SAME_RATE = 0.05
 _SLOWEST, _FASTEST = 5.0, 20_000.0  # Hz, of sensors as they are logged
 _USUAL = (10.0, 10_000.0)  # Hz
-_BRIDGED = 0.01  # of all rows
+BRIDGED = 0.01  # of all rows
 
 
 def usual_step(step: Array) -> tuple[float, float]:
@@ -58,16 +58,16 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     usual, longest = usual_step(step)
     start, stop = steady_rows(time)
     if (start, stop) != (0, len(time)):
-        return 1 / usual, [_change(recording, time, start, stop), *_mislabelled(recording, 1 / usual)]
+        return 1 / usual, [_change(recording, time, start, stop), *mislabelled(recording, 1 / usual)]
     wide = np.flatnonzero(step > longest)
     if not wide.size:
         rate = (len(time) - 1) / float(time[-1] - time[0])
-        return rate, _mislabelled(recording, rate)
+        return rate, mislabelled(recording, rate)
     worst = int(wide[np.argmax(step[wide])])
     return 1 / usual, [
         f"{recording.name}: {wide.size} gap{'s' if wide.size > 1 else ''} in time, the longest {step[worst]:.3g} s "
         f"after {recording.place(worst)}; the samples on both sides are taken as neighbours",
-        *_mislabelled(recording, 1 / usual),
+        *mislabelled(recording, 1 / usual),
     ]
 
 
@@ -78,7 +78,7 @@ def steady_rows(time: Array) -> tuple[int, int]:
     that differs is passed over.
     """
     step = np.diff(time)
-    if step.size and step.max() < (1 + _SAME_RATE / 2) * step.min():  # as most are
+    if step.size and step.max() < (1 + SAME_RATE / 2) * step.min():  # as most are
         return 0, len(time)
     size = max(_SMALLEST_BLOCK, -(-len(step) // _BLOCKS))
     count = len(step) // size
@@ -88,7 +88,7 @@ def steady_rows(time: Array) -> tuple[int, int]:
     size_of_step = np.log([usual_step(block)[0] for block in blocks])
     best = (0, 0)
     for level in size_of_step:
-        same = np.abs(size_of_step - level) < _SAME_RATE
+        same = np.abs(size_of_step - level) < SAME_RATE
         same[1:-1] |= same[:-2] & same[2:]
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
         runs = edges.reshape(-1, 2)
@@ -137,7 +137,7 @@ def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str
     count = int(np.count_nonzero(bad | ~timed))
     if not count:
         return recording, []
-    if count > _BRIDGED * len(recording):
+    if count > BRIDGED * len(recording):
         check_finite(recording, [*names, *(["time"] if "time" in recording else [])])
     columns = {name: values[timed] for name, values in recording.columns.items()}
     row = np.arange(len(recording), dtype=np.float64)[timed]
@@ -145,9 +145,14 @@ def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str
         fine = np.isfinite(columns[name])
         columns[name] = np.interp(row, row[fine], columns[name][fine])
     first = recording.place(int(np.argmax(bad | ~timed)))
+    return replace(recording, columns=columns), [bridged_line(recording.name, count, first)]
+
+
+def bridged_line(name: str, count: int, first: str) -> str:
+    """Say how many rows of a file hold no numbers, and where the first of them is."""
     rows = f"{count} row{'s' if count > 1 else ''} without numbers"
     where = first if count == 1 else f"the first {first}"
-    return replace(recording, columns=columns), [f"{recording.name}: {rows} ({where}) bridged from their neighbours"]
+    return f"{name}: {rows} ({where}) bridged from their neighbours"
 
 
 def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
@@ -165,7 +170,7 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
     )
 
 
-def _mislabelled(recording: Recording, rate: float) -> list[str]:
+def mislabelled(recording: Recording, rate: float) -> list[str]:
     """Say that no sensor is logged at a rate, and in which unit of time it would be."""
     if _SLOWEST < rate < _FASTEST:
         return []

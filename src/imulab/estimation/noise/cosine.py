@@ -136,8 +136,15 @@ class Accumulator:
         self._waiting.append(np.array(samples, dtype=np.float64))
         self._held += len(samples)
 
-    def stretch(self) -> Stretch:
-        """Return the spectra of all samples; the accumulator takes no more."""
+    def stretch(self, interval: float | None = None) -> Stretch:
+        """Return the spectra of all samples; the accumulator takes no more.
+
+        Parameters
+        ----------
+        interval
+            Time between samples, s, where it is known better now.
+        """
+        self._interval = interval or self._interval
         held = self._all()
         self._waiting = []
         if not self._stretches:
@@ -146,6 +153,13 @@ class Accumulator:
             held = self._cleaned(held)
             self._average(held)
         return self._two_parts()
+
+    def slow(self) -> Array:
+        """Return the lowest coefficients alone, of a covariate, lines and all, shape (J,); it takes no more then."""
+        if self._stretches:
+            return self.stretch().slow
+        held = self._all()
+        return cosine_coefficients(held[: smooth_count(len(held))])[:SLOW]
 
     def _all(self) -> Array:
         return self._waiting[0] if len(self._waiting) == 1 else np.concatenate([*self._waiting, np.empty(0)])
@@ -237,6 +251,13 @@ def transformed(samples: Array, interval: float, despike: bool = True) -> Stretc
     gathered = Accumulator(interval, despike)
     gathered.add(samples)
     return gathered.stretch()
+
+
+def slow_coefficients(samples: Array, interval: float) -> Array:
+    """Return the lowest coefficients of a covariate in memory, finite, shape (n,): see `Accumulator.slow`."""
+    gathered = Accumulator(interval, despike=False)
+    gathered.add(samples)
+    return gathered.slow()
 
 
 def frequencies(spectrum: Spectrum) -> Array:

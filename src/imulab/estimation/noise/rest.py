@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.errors import DataError
 from imulab.estimation.column_noise import moved_columns
-from imulab.estimation.noise.cosine import Stretch, transformed
+from imulab.estimation.noise.cosine import Stretch, slow_coefficients, transformed
 from imulab.estimation.ranked import distinct
 from imulab.estimation.sampling import WIDEST_GAP, bridged, sampling_rate, steady_part, usual_step
 from imulab.recording import Array, Recording, check_time
@@ -18,9 +18,9 @@ from imulab.verdict import Note
 
 FEWEST, SHORT = 500, 100.0
 """Samples of a stretch at least; s below which only white noise and limits of the rest can be told."""
-_MOST, _SHARE = 16, 0.05
+MOST, SHARE = 16, 0.05
 """Stretches between gaps at most, and how long each must be in terms of the longest."""
-_LEVELS, _PILED, _A_FEW = 6, 2, 10
+LEVELS, _PILED, _A_FEW = 6, 2, 10
 _SEEN = 100_000
 
 
@@ -78,6 +78,15 @@ class Rest:
         self._check(name)
         return [transformed(each, self.interval) for each in self.samples(name)]
 
+    def slow(self, name: str) -> list[Array] | None:
+        """Return the slow coefficients of a covariate, stretch by stretch; None where it does not change."""
+        if name not in self.recording:
+            return None
+        samples = self.samples(name)
+        if not all(np.isfinite(each).all() and float(np.ptp(each)) > 0 for each in samples):
+            return None
+        return [slow_coefficients(each, self.interval) for each in samples]
+
     def _check(self, name: str) -> None:
         values, unit = self.recording.column(name), self.recording.units[name]
         where = f"{self.recording.name}: column {name}"
@@ -123,24 +132,28 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         raise _too_few(recording, left_out)
     # Lines about gaps are said here, for other figures than those of an Allan curve follow from them.
     notes += [line for line in timing if " in time, the longest " not in line]
+    notes += notes_of_gaps(recording.name, usual, list(map(_length, parts)), filled, left_out, len(time))
+    return Rest(recording, usual, tuple(parts), filled, tuple(notes))
+
+
+def notes_of_gaps(
+    name: str, interval: float, lengths: Sequence[int], filled: int, left_out: int, rows: int
+) -> list[str]:
+    """Say of a log what was bridged and left out, and whether its stretches, of so many samples each, are short."""
+    notes: list[str] = []
     if filled:
-        kind: type[str] = Note if filled < 0.01 * len(time) else str
-        notes.append(kind(f"{recording.name}: {filled} samples missing in short gaps are bridged by straight lines"))
-    if len(parts) > 1 or left_out:
-        total = sum(_length(part) for part in parts)
-        words = f"{len(parts)} stretches of {total * usual:.4g} s in all" if len(parts) > 1 else "one stretch"
+        kind: type[str] = Note if filled < 0.01 * rows else str
+        notes.append(kind(f"{name}: {filled} samples missing in short gaps are bridged by straight lines"))
+    duration = sum(lengths) * interval
+    if len(lengths) > 1 or left_out:
+        words = f"{len(lengths)} stretches of {duration:.4g} s in all" if len(lengths) > 1 else "one stretch"
         lost = f"; {left_out} samples in shorter ones are left out" if left_out else ""
+        notes.append(f"{name}: gaps in time leave {words}, which are taken as records of the same noise{lost}")
+    if duration < SHORT:
         notes.append(
-            f"{recording.name}: gaps in time leave {words}, which are taken as records of the same noise{lost}"
+            Note(f"{name}: {duration:.3g} s; below {SHORT:g} s only white noise and limits of slow noise can be told")
         )
-    found = Rest(recording, usual, tuple(parts), filled, tuple(notes))
-    if not found.short:
-        return found
-    short = Note(
-        f"{recording.name}: {found.duration:.3g} s; below {SHORT:g} s only white noise and limits of slow noise "
-        "can be told"
-    )
-    return Rest(recording, usual, found.parts, filled, (*notes, short))
+    return notes
 
 
 def _too_few(recording: Recording, count: int) -> DataError:
@@ -170,21 +183,26 @@ def _parts(time: Array) -> tuple[list[tuple[int, int, Array | None]], int, int]:
             place = np.concatenate([[0.0], np.cumsum(between)])
         parts.append((start, stop, place))
     lengths = np.array([stop - start for start, stop, _ in parts])
-    least = max(FEWEST, _SHARE * int(lengths.max()))
-    order = np.argsort(-lengths, kind="stable")[:_MOST]
+    least = max(FEWEST, SHARE * int(lengths.max()))
+    order = np.argsort(-lengths, kind="stable")[:MOST]
     kept = [parts[k] for k in sorted(order.tolist()) if lengths[k] >= least]
     filled = sum(_length(part) - (part[1] - part[0]) for part in kept)
     return kept, filled, int(len(time) - sum(stop - start for start, stop, _ in kept))
 
 
+def is_clipped(piled: int, next_to: int) -> bool:
+    """Whether the outermost level has too many samples for noise, by how many the next level has."""
+    return piled > _A_FEW and piled > _PILED * next_to + _A_FEW
+
+
 def _clipped(values: Array) -> float | None:
     """Return the limit at which samples pile up: more than twice as many as at the next level; noise has fewer."""
-    if len(distinct(values[:_SEEN])) < _LEVELS:
+    if len(distinct(values[:_SEEN])) < LEVELS:
         return None
     for limit, outside, nearest in ((values.max(), np.less, np.max), (values.min(), np.greater, np.min)):
         piled = int(np.count_nonzero(values == limit))
         if piled > _A_FEW:
             below = nearest(values[outside(values, limit)])
-            if piled > _PILED * int(np.count_nonzero(values == below)) + _A_FEW:
+            if is_clipped(piled, int(np.count_nonzero(values == below))):
                 return float(limit)
     return None

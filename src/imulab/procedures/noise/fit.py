@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from os import PathLike
 from typing import Any, Unpack
 
@@ -15,7 +16,7 @@ from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.noise.analysis import Analysis, analysed, without_steps
 from imulab.estimation.noise.choice import CANDIDATES
 from imulab.estimation.noise.cleaning import Line, Step
-from imulab.estimation.noise.cosine import WHOLE, Stretch, cosine_coefficients, smooth_count, transformed
+from imulab.estimation.noise.cosine import Stretch
 from imulab.estimation.noise.regression import Regression, ramp_coefficients
 from imulab.estimation.noise.rest import Rest, at_rest
 from imulab.frames import is_frame
@@ -178,7 +179,7 @@ def _is_log(data: object) -> bool:
 
 
 def fit_recordings(
-    recordings: Iterable[Recording],
+    recordings: Iterable[Recording | Rest],
     *,
     terms: str,
     horizon: float,
@@ -188,7 +189,7 @@ def fit_recordings(
     steps: str | None,
     sources: Iterable[Source] = (),
 ) -> NoiseFit:
-    """Fit noise models to the columns of recordings at rest; arguments and errors as for `fit_noise`."""
+    """Fit noise models to the columns of recordings at rest, or of what is left of long ones: as `fit_noise`."""
     # A record holds what was asked for beyond the usual; old ones are fitted as they say.
     regress, steps = None if regress == NO_COVARIATE else regress, None if steps == SAY_STEPS else steps
     rests = read_rests(recordings, columns)
@@ -198,11 +199,12 @@ def fit_recordings(
         raise OptionError(
             f"horizon {horizon:g} s: expected at most the length of the record, {longest:.4g} s in one stretch"
         )
-    if regress == "temperature" and not all(map(_has_temperature, rests)):
-        where = next(rest.recording.name for rest in rests if not _has_temperature(rest))
+    temperatures = [rest.slow("temperature") for rest in rests]
+    if regress == "temperature" and None in temperatures:
+        where = rests[temperatures.index(None)].recording.name
         raise DataError(f"{where}: regress temperature: expected a column temperature that changes, found none")
     candidates = CANDIDATES if terms == "auto" else (terms,)
-    found = {name: _column(name, rests, candidates, band, regress, steps == "remove") for name in names}
+    found = {name: _column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names}
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}
     record = make_record(found, rests, {**options, "columns": None if columns is None else names}, tuple(sources))
     return NoiseFit(record, found)
@@ -234,15 +236,23 @@ def chosen_columns(recording: Recording, columns: Sequence[str] | None) -> list[
     return found
 
 
-def read_rests(recordings: Iterable[Recording], columns: Sequence[str] | None) -> list[Rest]:
+def read_rests(recordings: Iterable[Recording | Rest], columns: Sequence[str] | None) -> list[Rest]:
     """Return recordings of one unit as stretches at rest; errors as for `fit_noise`."""
     rests: list[Rest] = []
-    for recording in recordings:
-        rest = at_rest(recording, chosen_columns(recording, columns))
+    for log in recordings:
+        rest = log if isinstance(log, Rest) else at_rest(log, chosen_columns(log, columns))
         if rests:
             _check_alike(rests[0], rest, columns)
         rests.append(rest)
     return rests
+
+
+def long_log(blocks: Iterator[Recording], columns: Sequence[str] | None) -> Rest | None:
+    """Return a long log at rest from its blocks, without keeping its rows; None where it has to be read as a whole."""
+    from imulab.estimation.noise.long_rest import long_rest
+
+    first = next(blocks)
+    return long_rest(chain([first], blocks), chosen_columns(first, columns))
 
 
 def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> None:
@@ -265,7 +275,13 @@ def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> Non
 
 
 def _column(
-    name: str, rests: Sequence[Rest], candidates: tuple[str, ...], band: float | None, regress: str | None, flat: bool
+    name: str,
+    rests: Sequence[Rest],
+    temperatures: Sequence[list[Array] | None],
+    candidates: tuple[str, ...],
+    band: float | None,
+    regress: str | None,
+    flat: bool,
 ) -> ColumnModel:
     stretches = [each for rest in rests for each in rest.stretches(name)]
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
@@ -276,7 +292,7 @@ def _column(
         found = without.steps(stretches)
         analysis = analysed(without_steps(stretches, found), candidates, band) if flat else analysis
     drifts = []
-    for covariate, slow in _covariates(rests, analysis.stretches).items():
+    for covariate, slow in _covariates(temperatures, analysis.stretches).items():
         regression = analysis.regressed(slow)
         taken, left = covariate == regress, analysis.letters
         if regression.follows or taken:
@@ -301,23 +317,10 @@ def _longest(stretches: Sequence[Stretch]) -> Stretch:
     return max(stretches, key=lambda each: each.count)
 
 
-def _has_temperature(rest: Rest) -> bool:
-    if "temperature" not in rest.recording:
-        return False
-    return all(np.isfinite(each).all() and float(np.ptp(each)) > 0 for each in rest.samples("temperature"))
-
-
-def _covariates(rests: Sequence[Rest], stretches: Sequence[Stretch]) -> dict[str, list[Array]]:
+def _covariates(temperatures: Sequence[list[Array] | None], stretches: Sequence[Stretch]) -> dict[str, list[Array]]:
     """The slow coefficients of time, and of the temperature where all logs have one that changes, of each stretch."""
     found = {"time": [ramp_coefficients(each)[None] for each in stretches]}
-    if all(map(_has_temperature, rests)):
-        samples = [each for rest in rests for each in rest.samples("temperature")]
-        found["temperature"] = [_slow(each, stretch)[None] for each, stretch in zip(samples, stretches, strict=True)]
+    known = [each for each in temperatures if each is not None]
+    if len(known) == len(temperatures):
+        found["temperature"] = [each[None] for rest in known for each in rest]
     return found
-
-
-def _slow(samples: Array, like: Stretch) -> Array:
-    """The slow coefficients of a covariate: of a log in one piece its own, without a look for lines."""
-    if len(samples) > WHOLE:
-        return transformed(samples, like.interval, despike=False).slow
-    return cosine_coefficients(samples[: smooth_count(len(samples))])[: len(like.slow)]

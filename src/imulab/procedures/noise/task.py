@@ -10,20 +10,33 @@ from imulab.procedures.options import ELEMENT, READING, Option, choice, measure,
 from imulab.procedures.procedure import Files, Task, source_of
 
 if TYPE_CHECKING:
+    from imulab.estimation.noise.rest import Rest
+    from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
 
 def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
-    from imulab.procedures.noise.fit import fit_recordings
+    from imulab.procedures.noise.fit import fit_recordings, long_log
 
-    recordings = (access.recording(name, values["layout"], **values["part"]) for name in files)
+    def read(name: str) -> Recording | Rest:
+        part = {"layout": values["layout"], **values["part"]}
+        path = access.path(name)
+        if name != "-" and path.is_file() and path.stat().st_size > LARGE:
+            found = long_log(access.blocks(name, **part), values["columns"])
+            if found is not None:
+                return found
+        return access.recording(name, **part)
+
+    recordings = map(read, files)
     sources = (source for name in files if (source := source_of(access, name)) is not None)
     fit = {name: values[name] for name in ("terms", "horizon", "band", "regress", "columns", "steps")}
     return fit_recordings(recordings, sources=sources, **fit).calibration
 
 
+LARGE = 1 << 28
+"""Bytes of a file whose rows are not kept in memory."""
 OPTIONS = (
     Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
     measure("horizon", "Time that a filter predicts without aiding, s.", "time", "s", f"{HORIZON:g} s", shows="TIME"),

@@ -1,0 +1,151 @@
+"""Logs that are read block by block give what they give in memory; those with faults are looked at as a whole."""
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli.options import GivenFiles
+from imulab.errors import ImulabError
+from imulab.estimation.noise.long_rest import long_rest
+from imulab.estimation.noise.rest import at_rest
+from imulab.procedures.noise import task
+from imulab.procedures.run import run_task
+from imulab.recording import Recording
+
+RATE = 50.0
+
+
+def log(seed=1, n=40_000):
+    rng = np.random.default_rng(seed)
+    walk = 2e-3 * np.cumsum(rng.standard_normal(n))
+    return {
+        "time": np.arange(n) / RATE,
+        "gyro_x": rng.standard_normal(n) + walk,
+        "gyro_y": rng.standard_normal(n),
+        "temperature": 20 + 1e-3 * np.cumsum(rng.standard_normal(n)),
+    }
+
+
+UNITS = {"time": "s", "gyro_x": "deg/s", "gyro_y": "deg/s", "temperature": "degC"}
+
+
+def without(columns, *rows):
+    kept = np.setdiff1d(np.arange(len(columns["time"])), np.concatenate([np.arange(a, b) for a, b in rows]))
+    return {name: values[kept] for name, values in columns.items()}
+
+
+def blocks_of(columns, size):
+    for start in range(0, len(columns["time"]), size):
+        part = {name: values[start : start + size] for name, values in columns.items()}
+        yield Recording(part, UNITS, name="log", first_row=start + 1)
+
+
+def both(columns, size=7001):
+    names = ["gyro_x", "gyro_y"]
+    return at_rest(Recording(columns, UNITS, name="log"), names), long_rest(blocks_of(columns, size), names)
+
+
+def holes(columns):
+    for row, count in ((7000, 3), (14_002, 1), (20_000, 5), (39_998, 2)):  # across the end of a block, and of the log
+        columns["gyro_x"][row : row + count] = np.nan
+    return columns
+
+
+@pytest.mark.parametrize("size", [7001, 1000, 39_999])
+@pytest.mark.parametrize(
+    "columns",
+    [
+        log(),
+        holes(log()),
+        without(log(), (6999, 7003), (14_002, 14_003), (30_000, 30_009)),
+        without(log(), (7001, 7101), (22_000, 22_900)),
+        without(log(), (7001, 7101), (7201, 7300), (39_900, 39_950)),
+    ],
+    ids=["plain", "no numbers", "short gaps", "long gaps", "short stretches"],
+)
+def test_blocks_give_what_the_whole_log_gives(columns, size):
+    whole, parts = both(columns, size)
+    assert parts is not None
+    assert parts.notes == whole.notes
+    assert parts.interval == pytest.approx(whole.interval, rel=1e-9)
+    assert parts.duration == pytest.approx(whole.duration, rel=1e-9)
+    assert parts.bridged == whole.bridged
+    for name in ("gyro_x", "gyro_y"):
+        for one, other in zip(parts.stretches(name), whole.stretches(name), strict=True):
+            assert one.count == other.count
+            np.testing.assert_allclose(one.slow, other.slow, rtol=1e-7, atol=1e-12)
+            np.testing.assert_allclose(one.spectra[0].power, other.spectra[0].power, rtol=1e-9)
+    for one, other in zip(parts.slow("temperature"), whole.slow("temperature"), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-12)
+
+
+def faulty(kind):
+    columns = log()
+    if kind == "stands still":
+        columns["time"][9000] = columns["time"][8999]
+    elif kind == "rate":
+        columns["time"] = np.cumsum(np.where(np.arange(40_000) < 20_000, 1, 2)) / RATE
+    elif kind == "constant":
+        columns["gyro_y"][:] = 0.25
+    elif kind == "clipped":
+        columns["gyro_y"] = np.clip(columns["gyro_y"], -9.0, 1.0)
+    elif kind == "moves":
+        columns["gyro_y"][30_000:] += 200.0
+    elif kind == "bad rows":
+        columns["gyro_y"][10_000:11_000] = np.nan
+    elif kind == "no time":
+        columns["time"][9000] = np.nan
+    elif kind == "many stretches":
+        columns = without(columns, *((k, k + 20) for k in range(2000, 40_000, 2000)))
+    elif kind == "few":
+        columns = {name: values[:400] for name, values in columns.items()}
+    return columns
+
+
+@pytest.mark.parametrize(
+    "kind", ["stands still", "rate", "constant", "clipped", "moves", "bad rows", "no time", "many stretches", "few"]
+)
+def test_a_faulty_log_is_looked_at_as_a_whole(kind):
+    assert long_rest(blocks_of(faulty(kind), 7001), ["gyro_x", "gyro_y"]) is None
+
+
+@pytest.mark.parametrize("kind", ["plain", "moves"])
+def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kind):
+    file = tmp_path / "log.csv"
+    il.write_csv(Recording(holes(faulty(kind)), UNITS, {"serial": "7"}), file)
+    options = {option.name: None for option in task.OPTIONS} | {"regress": "temperature"}
+
+    def outcome():
+        try:
+            record = run_task("noise", [str(file)], options, GivenFiles())
+        except ImulabError as error:
+            return str(error), [], {}, []
+        values = [parameter.value for parameter in record.parameters.values()]
+        return list(record.parameters), values, record.sensor, record.warnings
+
+    small = outcome()
+    monkeypatch.setattr(task, "LARGE", 0)
+    large = outcome()
+    assert large[0] == small[0]
+    assert large[1] == pytest.approx(small[1], rel=1e-4)
+    assert large[2:] == small[2:]
+
+
+def test_the_rows_are_not_kept(monkeypatch):
+    """What is held does not grow with the log beyond the samples that are transformed as a whole."""
+    from imulab.estimation.noise import cosine
+    from imulab.estimation.noise import long_rest as module
+
+    monkeypatch.setattr(cosine, "WHOLE", 1 << 12)
+    monkeypatch.setattr(cosine, "STRETCH", 1 << 11)
+    seen = []
+    add = module.Accumulator.add
+
+    def watched(self, samples):
+        add(self, samples)
+        seen.append(self._held)
+
+    monkeypatch.setattr(module.Accumulator, "add", watched)
+    assert long_rest(blocks_of(log(), 1000), ["gyro_x"]) is not None
+    assert max(seen) <= 1 << 12
+    assert len(seen) == 2 * 40
