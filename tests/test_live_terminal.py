@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import select
 import struct
 import subprocess
@@ -13,13 +14,14 @@ import time
 from contextlib import suppress
 from io import StringIO
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 import imulab as il
 from imulab.live.session import Session
 from imulab.live.targets import read_targets
-from imulab.live.terminal import draw
+from imulab.live.terminal import draw, turned
 
 
 def shown(session: Session, width: int, height: int) -> list[str]:
@@ -51,6 +53,30 @@ def test_what_to_do_is_first_and_nothing_is_wider_or_longer_than_the_terminal(se
         assert "u: drop attitude 12   q: finish" in lines[-1]
     # The map needs room.
     assert any("N next" in line for line in lines) == (width >= 80)
+
+
+def test_the_keys_of_a_simulated_unit_turn_it(session):
+    console = Console(width=80, height=24, file=StringIO())
+    console.print(draw(session.view(), 80, 24, by_hand=True))
+    last = console.file.getvalue().rstrip("\n").split("\n")[-1]
+    assert last.startswith("n xyz XYZ: turn   u: drop")
+    assert last.endswith("Ctrl-C: stop")
+    wanted = np.array([0.6, 0.0, 0.8])
+    assert turned("n", wanted) is wanted
+    np.testing.assert_array_equal(turned("y", wanted), [0, 1, 0])
+    np.testing.assert_array_equal(turned("Z", None), [0, 0, -1])
+    assert [turned(key, wanted) for key in ("", "u", "q", "\x1b")] == [None] * 4
+
+
+def test_a_key_turns_the_simulated_unit_of_a_terminal(tmp_path):
+    screen = Screen(["simulate:gravity=9.81,noise=0.1mg,speed=5", "--save", "rec.csv"], tmp_path)
+    assert screen.until("turn it")
+    screen.press("Z")
+    assert screen.shows("now z down")
+    screen.press("X")
+    assert screen.shows("now x down")
+    screen.press("q")
+    screen.ended()
 
 
 def test_a_terminal_without_samples_says_what_it_waits_for():
@@ -85,6 +111,13 @@ class Screen:
                 except OSError:
                     break
         return what in self.text
+
+    def shows(self, what: str, seconds: float = 25.0) -> bool:
+        """Whether a text comes, whatever its style."""
+        end = time.monotonic() + seconds
+        while what not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text) and time.monotonic() < end:
+            self.until("\0", 0.1)
+        return time.monotonic() < end
 
     def press(self, key: str) -> None:
         self.text = ""

@@ -30,6 +30,7 @@ from imulab.cli import main
 from imulab.cli.app import command
 from imulab.cli.common import commands_of
 from imulab.errors import OptionError
+from imulab.live.page import bench as bench_module
 from imulab.live.page import server
 from imulab.live.page.bench import Workbench
 from imulab.live.page.files import Files, checked
@@ -361,6 +362,20 @@ def test_no_address_leads_out_of_the_session(bench, tmp_path, kind, method, name
     answer = bench.ask(f"{kind}/{quote(name, safe='')}", b"x" if method == "PUT" else None, method)
     assert answer.status in (400, 404, 405)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_recording_that_grows_is_saved_as_far_as_it_was(bench, monkeypatch):
+    Path("session/rec.csv").write_bytes(b"0123456789" * 1000)
+
+    def grown(stream, size):
+        with Path("session/rec.csv").open("ab") as more:
+            more.write(b"more")
+        return pieces(stream, size)
+
+    pieces = bench_module._pieces
+    monkeypatch.setattr(bench_module, "_pieces", grown)
+    assert bench.ask("files/session%2Frec.csv").body == b"0123456789" * 1000
+    assert bench.ask("files/session%2Frec.csv").body == b"0123456789" * 1000 + b"more"
 
 
 def test_a_page_from_elsewhere_is_not_shown_but_saved(bench):

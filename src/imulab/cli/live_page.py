@@ -39,7 +39,7 @@ def port_number(text: str | None) -> int:
 
 def checked_host(text: str | None) -> str | None:
     """Return the address to listen at, with a warning where others reach it; None, this machine alone, of None."""
-    if text is not None and not text.startswith("127."):
+    if text is not None and text != "localhost" and not text.startswith("127."):
         warn(f"whoever reaches {text} and has the address below can use the page; it is not encrypted")
     return text
 

@@ -175,7 +175,7 @@ def _keys(view: View, *, by_hand: bool) -> Text:
     aside = [held.number for held in view.attitudes if held.aside]
     named = (aside or [held.number for held in view.attitudes])[-1:]
     drop = f"u: drop attitude {named[0]}   " if named else ""
-    turn = "n x y z X Y Z: turn it   " if by_hand else ""
+    turn = "n xyz XYZ: turn   " if by_hand else ""
     return Text(f"{turn}{drop}q: finish, write record   Ctrl-C: stop", style="dim")
 
 

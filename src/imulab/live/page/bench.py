@@ -12,17 +12,17 @@ import math
 import os
 import tempfile
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from shlex import join
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 from urllib.parse import quote
 
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import FileResponse, Response
+from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from imulab.errors import OptionError, quoted
@@ -39,6 +39,8 @@ _LONGEST = 1 << 20
 """Bytes of a JSON object."""
 _READING = tuple(option.name for option in (*READING, ELEMENT))
 _HERE = "/api/workbench"
+_ANY = "application/octet-stream"
+_PIECE = 1 << 20
 
 
 class Workbench(Part):
@@ -60,7 +62,7 @@ class Workbench(Part):
         self._hub = Hub()
         self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
         self._coming: set[str] = set()
-        shown = _json(list(forms.values()))
+        shown = to_json(list(forms.values()))
         self.routes = [
             Route(f"{_HERE}/files", self._list),
             Route(f"{_HERE}/files/{{name:path}}", self._receive, methods=["PUT"]),
@@ -68,7 +70,7 @@ class Workbench(Part):
             Route(f"{_HERE}/files/{{name:path}}", self._send),
             Route(f"{_HERE}/zip/{{name:path}}", self._zip),
             Route(f"{_HERE}/reports/{{name:path}}", self._report),
-            Route(f"{_HERE}/forms", lambda request: shown),
+            Route(f"{_HERE}/forms", lambda request: Response(shown, media_type="application/json")),
             Route(f"{_HERE}/open", self._open, methods=["POST"]),
             Route(f"{_HERE}/curves", self._curves),
             Route(f"{_HERE}/command", self._command, methods=["POST"]),
@@ -132,7 +134,10 @@ class Workbench(Part):
         name = self._files.path(request.path_params["name"])
         if Path(name).is_dir():
             raise OptionError(f"{name}: is a folder")
-        return _attachment(name, Path(name).name)
+        stream = Path(name).open("rb")  # noqa: SIM115 -- it is closed once it is sent
+        size = os.fstat(stream.fileno()).st_size  # a recording that is still written grows meanwhile
+        headers = {**_to_be_saved(Path(name).name), "content-length": str(size)}
+        return StreamingResponse(_pieces(stream, size), headers=headers, media_type=_ANY)
 
     async def _zip(self, request: Request) -> Response:
         name = self._files.path(request.path_params["name"])
@@ -140,7 +145,7 @@ class Workbench(Part):
             raise OptionError(f"{name}: expected a folder")
         packed = await run_in_threadpool(_packed, Path(name))
         task = BackgroundTask(Path(packed).unlink, missing_ok=True)
-        return _attachment(packed, f"{Path(name).name}.zip", background=task)
+        return FileResponse(packed, headers=_to_be_saved(f"{Path(name).name}.zip"), media_type=_ANY, background=task)
 
     async def _report(self, request: Request) -> Response:
         """Show a report that a command of this session has drawn: pages from elsewhere are only to be saved."""
@@ -257,10 +262,17 @@ async def _object(request: Request) -> dict[str, Any]:
     return found
 
 
-def _attachment(path: str, name: str, **more: Any) -> FileResponse:
-    """Return a file to be saved, whatever it says that it is."""
-    kept = {"content-disposition": f"attachment; filename*=UTF-8''{quote(name, safe='')}"}
-    return FileResponse(path, headers=kept, media_type="application/octet-stream", **more)
+def _to_be_saved(name: str) -> dict[str, str]:
+    """Return the header of a file to be saved, whatever it says that it is."""
+    return {"content-disposition": f"attachment; filename*=UTF-8''{quote(name, safe='')}"}
+
+
+def _pieces(stream: IO[bytes], size: int) -> Iterator[bytes]:
+    """Yield the first bytes of a file, and close it."""
+    with stream:
+        while size and (piece := stream.read(min(size, _PIECE))):
+            size -= len(piece)
+            yield piece
 
 
 def _packed(folder: Path) -> str:

@@ -69,7 +69,9 @@ class Files:
             if not Path(name).exists():
                 raise OptionError(f"{name}: no such file")
         self._first = frozenset(given)
-        self._given = [f"./{name}" if name.startswith("-") else name for name in dict.fromkeys([*given, *later])]
+        self._given = [
+            f"./{name}" if name.startswith("-") else name for name in dict.fromkeys([*given, *filter(_plain, later)])
+        ]
 
     def make(self) -> None:
         """Make the folder where it is not there.
