@@ -69,7 +69,7 @@ class ParameterStatistics:
     z
         Robust z of each unit, shape (n,): its distance from the median in robust deviations.
     outlier_limit
-        What a z is beyond, either way, in one normal population out of a hundred; infinite for few units.
+        A healthy line of this size shows a unit beyond this z, either way, in one of a hundred cases; infinite for few units.
     drift, capability
         None where there are too few units, no span of dates, no limits.
     """
@@ -135,7 +135,7 @@ def days_of(text: str) -> float | None:
 
 
 def outlier_limit(count: int) -> float:
-    """Return the robust z that one normal population of this size in a hundred has a unit beyond."""
+    """Return the robust z beyond which a healthy line of this size shows a unit in one of a hundred cases."""
     if count < _FEWEST_FOR_OUTLIERS:
         return math.inf
     return float(np.interp(math.log(count), np.log(_SIZES), _BEYOND))

@@ -3,8 +3,8 @@
 The information of an attitude is the gradient of |f| for a nominal sensor, a function of its upward direction alone.
 Attitudes are exchanged one by one for the best of a list of candidates (Fedorov 1972; Atkinson, Donev and Tobias,
 Optimum Experimental Designs, 2007, ch. 12) from several starts, and on the free sphere then moved to where they are
-best. The sum of variances has a flat bottom: of sets that are as good in it, that is taken in which x, y and z are
-most alike, because a triad is as good as its worst axis.
+best. Many sets come within 1 % of the least sum of variances; the one whose worst axis is known best is taken,
+because a triad is as good as its worst axis.
 """
 
 from __future__ import annotations
