@@ -56,6 +56,7 @@ truth: $(STAMP)
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/truth/run.py
 
 docs: $(STAMP) $(VENV)/.docs
+	$(BIN)/python docs/make_commands.py
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 

@@ -7,7 +7,7 @@ from latex2mathml.converter import convert
 project = "imulab"
 copyright = "2026, the imulab maintainers"
 author = "the imulab maintainers"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 # Notebooks and the gallery are stored without outputs, which are large and change with every run; the build makes them.
@@ -18,6 +18,7 @@ nb_execution_raise_on_error = True
 nb_merge_streams = True
 suppress_warnings = ["mystnb.unknown_mime_type"]  # a figure's JSON, beside its HTML
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+smartquotes = False  # two hyphens begin an option
 html_theme = "furo"
 html_title = "imulab"
 myst_heading_anchors = 2

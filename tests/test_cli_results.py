@@ -179,10 +179,10 @@ def _expanded(word):
     return sorted(str(path) for path in Path().glob(word)) if "*" in word else []
 
 
-def test_the_warm_up_of_the_readme_runs_as_written(tmp_path, monkeypatch, capsys):
+def test_the_warm_up_of_the_gallery_runs_as_written(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    lines = re.findall(r"^    imulab (warmup .*)$", readme, re.MULTILINE)
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^    imulab (warmup .*)$", page, re.MULTILINE)
     assert [line.split()[1] for line in lines] == ["simulate", "fit"]
     for line in lines:
         words = [name for word in shlex.split(line) for name in (_expanded(word) or [word])]

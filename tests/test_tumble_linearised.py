@@ -28,7 +28,7 @@ def fit(data, **options):
 
 
 def test_each_error_of_the_model_is_its_own_unknown_of_the_sources_equation():
-    """The signs and the pairing of products that docs/tumble.md states, from the forward model alone."""
+    """The signs and the pairing of products that docs/tumble_method.md states, from the forward model alone."""
     names, size = reference.names(2), 1e-6
     ups = reference.random_attitudes(np.random.default_rng(1), 40)
     for place, name in enumerate(names):

@@ -130,7 +130,7 @@ def _rest(name: str, kind: str, axes: int, size: float, slow: float = 1.0, part:
         warned=95.0 if size > 0 else None,
         false_alarms=5.0 if size == 0 else None,
         unit="deg/s of bias" if part > 0 else "",
-        source="u(bias) counts what a curve cannot show (docs/gyro_array.md): more than 97 % is no fault",
+        source="u(bias) counts what a curve cannot show (docs/gyro_array_method.md): more than 97 % is no fault",
     )
 
 

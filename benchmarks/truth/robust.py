@@ -78,7 +78,7 @@ def _scenario(
     """Return a scenario that asks for a largest error; a gyro that has failed must be named, a healthy one not."""
     return Scenario(
         GROUP, name, trial, trials, None, 95.0 if fault else None, None if fault else 5.0, largest, unit,
-        source="errors asked for the array, docs/gyro_array.md",
+        source="errors asked for the array, docs/gyro_array_method.md",
     )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """The published first-order iteration of a tumble test (method ``linearised``), and the source's rules for it.
 
-Source: the method's patent, its equation (4) with the products paired as docs/tumble.md says.
+Source: the method's patent, its equation (4) with the products paired as docs/tumble_method.md says.
 """
 
 from __future__ import annotations
