@@ -1,4 +1,4 @@
-"""Write commands.md, the reference of the command line, from the commands themselves: `python docs/make_commands.py`."""
+"""Write commands.md, the reference of the command line, from the commands themselves."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from imulab.cli.app import command
 
 HEAD = """# The command line, command by command
 
-Made from the commands themselves: the same text as `imulab COMMAND --help`. What all commands share (units, intervals, exit status, project file) is
-[told once](index.md#the-command-line).
+Made from the commands themselves: the same text as `imulab COMMAND --help`. What all commands share (units, intervals,
+exit status, project file) is [told once](index.md#the-command-line).
 """
 
 
@@ -37,7 +37,8 @@ def _section(path: str, found: Any) -> str:
     """Return what the page says of one command."""
     arguments = [item for item in found.params if item.param_type_name == "argument"]
     options = [item for item in found.params if item.param_type_name == "option" and not item.hidden]
-    usage = " ".join([path, *(item.make_metavar(_context(found)) for item in arguments), "[OPTIONS]" if options else ""])
+    words = [item.make_metavar(_context(found)) for item in arguments]
+    usage = " ".join([path, *words, "[OPTIONS]" if options else ""])
     parts = [f"## {path}", f"    {usage.strip()}", _plain(found.help or "")]
     rows = [f"| {_spelt(item, found)} | {_cell(item.help or '')} | {_default(item)} |" for item in options]
     if rows:

@@ -43,7 +43,7 @@ def normalised_errors(recording: Recording, **options) -> np.ndarray:
     ids=["white", "correlated over 0.05 s", "correlated over 0.3 s"],
 )
 def test_intervals_cover_with_noise_found_in_the_recording(correlation, low, high, reduced):
-    """5 s holds at 100 Hz. docs/tumble_method.md says that correlation as long as a batch is understated by some percent."""
+    """5 s holds at 100 Hz. Correlation as long as a batch is understated by some percent (docs/tumble_method.md)."""
     covered = []
     for seed in range(60 if reduced else 400):
         recording = simulated(seed=seed, noise=0.0)

@@ -93,7 +93,8 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
     return Figure(
         title,
         lead + "Bars count units. Dotted: median. Red lines: limits that lie near. Red diamonds: units whose "
-        "robust z is so large that a healthy line of this size shows such a unit in one of a hundred cases." + edge_note(beyond),
+        "robust z is so large that a healthy line of this size shows such a unit in one of a hundred cases."
+        + edge_note(beyond),
         traces,
         layout,
         height=grid.height(len(panels)),

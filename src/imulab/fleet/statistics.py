@@ -69,7 +69,8 @@ class ParameterStatistics:
     z
         Robust z of each unit, shape (n,): its distance from the median in robust deviations.
     outlier_limit
-        A healthy line of this size shows a unit beyond this z, either way, in one of a hundred cases; infinite for few units.
+        A healthy line of this size shows a unit beyond this z, either way, in one of a hundred cases; infinite for few
+        units.
     drift, capability
         None where there are too few units, no span of dates, no limits.
     """
