@@ -183,7 +183,7 @@ def fuse(
         first = next(blocks)  # fused before anything is written, so that a refusal leaves no head behind
         write_csv_to(_flushed(first, blocks), sys.stdout.buffer)
         sys.stdout.buffer.flush()
-    _say(fuser, verdict=output is not None)
+    _print_findings(fuser, verdict=output is not None)
 
 
 def _load(name: str, option: str) -> Calibration:
@@ -219,7 +219,7 @@ def _flushed(first: Recording, rest: Iterator[Recording]) -> Iterator[Recording]
         sys.stdout.buffer.flush()
 
 
-def _say(fuser: Fuser, *, verdict: bool) -> None:
+def _print_findings(fuser: Fuser, *, verdict: bool) -> None:
     """Print what there is to know of what was fused; the verdict first, where standard output is not the rate."""
     from imulab.cli.show import verdict_line
     from imulab.verdict import verdict_of

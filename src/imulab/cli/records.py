@@ -90,7 +90,7 @@ def apply(
     if temperature_column and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)
     rows = _Rows()
-    write_out(rows.counted(apply_blocks(chain, _warned(records, blocks))), output)
+    write_out(rows.counted(apply_blocks(chain, _with_warnings(records, blocks))), output)
     by = " and ".join(dict.fromkeys(Path(name).name for name in names))
     what = "standard input" if file == "-" else file
     note(f"{rows.count} rows of {what} corrected by {by}: {output or 'standard output'}")
@@ -109,7 +109,7 @@ class _Rows:
             yield block
 
 
-def _warned(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
+def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
     from imulab.power_on import TAKEN_FROM
     from imulab.procedures.apply import beyond_message, beyond_test_of, warnings_of

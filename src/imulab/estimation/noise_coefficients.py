@@ -135,11 +135,11 @@ def _read(
 
     def one(k: int, index: int) -> Coefficient:
         if index < 0:
-            return _none(f"the noise is also {_markov(found)}, no 1/f noise or random walk: imulab noise fit")
+            return _not_determined(f"the noise is also {_markov(found)}, no 1/f noise or random walk: imulab noise fit")
         return _coefficient(*(float(part[k]) for part in (found.choice.values[0, index], *ends[index])))
 
     white = one(0, candidates[0]) if candidates[0] >= 0 else _white(found)
-    angle = _none("does not show" if band.full else f"would show above {band.highest:.4g} Hz only")
+    angle = _not_determined("does not show" if band.full else f"would show above {band.highest:.4g} Hz only")
     if found.model[NAMES.index("quantisation")] and candidates[0] >= 0:
         angle = one(3, candidates[0])
     flicker, walk = one(1, candidates[1]), one(2, candidates[2])
@@ -174,13 +174,13 @@ def _coefficient(value: float, low: float, high: float) -> Coefficient:
     return Coefficient(value, max(high - value, value - low) / NORMAL_95, (low, high))
 
 
-def _none(reason: str) -> Coefficient:
+def _not_determined(reason: str) -> Coefficient:
     return Coefficient(math.nan, math.nan, reason=reason)
 
 
 def undetermined(reason: str, highest: float = 0.0, filtered: bool = False) -> NoiseCoefficients:
     """Return coefficients none of which is determined, for this reason."""
-    none = _none(reason)
+    none = _not_determined(reason)
     return NoiseCoefficients(none, none, none, none, highest, filtered)
 
 

@@ -171,11 +171,11 @@ def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray
     if len(good) >= 2 * _AROUND:
         part = good if len(good) < len(known) else slice(None)
         for column in values:
-            found[:, part] |= _far(column[part])
+            found[:, part] |= _far_samples(column[part])
     return found[0] & ~found[1], found[1]
 
 
-def _far(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which samples, one or two in a row, are far from the others, and which zeros are, shape (n,).
 
     At rest only, since in motion there are knocks; but single zeros between values of one sign everywhere.

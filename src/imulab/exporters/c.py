@@ -108,12 +108,12 @@ def _amalgamation() -> str:
     return "".join(parts)
 
 
-def _who(records: Sequence[Calibration]) -> str:
+def _unit_name(records: Sequence[Calibration]) -> str:
     serial = next((record.sensor["serial"] for record in records if "serial" in record.sensor), None)
-    return _harmless(serial) if serial else "a unit without serial number"
+    return _comment_text(serial) if serial else "a unit without serial number"
 
 
-def _harmless(text: str) -> str:
+def _comment_text(text: str) -> str:
     """Text that neither ends a C comment nor makes a compiler warn in one."""
     text = printable(text)
     for wrong, right in (("\\", "|"), ("*/", "* /"), ("/*", "/ *"), ("??", "? ?")):
@@ -124,7 +124,7 @@ def _harmless(text: str) -> str:
 def _unit_h(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> str:
     kinds = {table.kind: table for table in tables}
     lines = [
-        f"/* The numbers of {_who(records)}. */",
+        f"/* The numbers of {_unit_name(records)}. */",
         "#ifndef UNIT_H",
         "#define UNIT_H",
         "",
@@ -145,10 +145,12 @@ def _unit_h(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> st
 
 
 def _unit_c(records: Sequence[Calibration], tables: Sequence[DeviceTable]) -> str:
-    lines = [f"/* The numbers of {_who(records)}; made from the records"]
-    lines += [f" *   {record.procedure} {_harmless(record.created)} SHA-256 {_digest(record)}" for record in records]
+    lines = [f"/* The numbers of {_unit_name(records)}; made from the records"]
     lines += [
-        " * by " + _harmless(records[0].software) + ". */",
+        f" *   {record.procedure} {_comment_text(record.created)} SHA-256 {_digest(record)}" for record in records
+    ]
+    lines += [
+        " * by " + _comment_text(records[0].software) + ". */",
         '#include "unit.h"',
         "",
         "#define R(x) ((il_real)(x))",
@@ -240,8 +242,8 @@ def _readme(records: Sequence[Calibration], tables: Sequence[DeviceTable], blob_
     # The output is Markdown and C, not HTML: nothing is escaped.
     environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
     text: str = environment.from_string(_firmware("README.md.j2")).render(
-        serial=_who(records),
-        software=_harmless(records[0].software),
+        serial=_unit_name(records),
+        software=_comment_text(records[0].software),
         blob_size=blob_size,
         kinds={table.kind: table.columns for table in tables},
         first=tables[0].kind,

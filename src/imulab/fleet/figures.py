@@ -76,7 +76,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         )
         out = item.outliers & inside
         if out.any():
-            traces.append(_diamonds(item.serials, values, out, x, y))
+            traces.append(_outlier_marks(item.serials, values, out, x, y))
         grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
         if far is not None:
             far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
@@ -104,7 +104,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
     )
 
 
-def _diamonds(serials: Sequence[str], values: Array, out: np.ndarray, x: str, y: str) -> dict[str, Any]:
+def _outlier_marks(serials: Sequence[str], values: Array, out: np.ndarray, x: str, y: str) -> dict[str, Any]:
     """Mark the units that stand out, at the foot of a histogram."""
     return scatter(
         rounded(values[out]), [0] * int(out.sum()), "markers", text=[s for s, o in zip(serials, out, strict=True) if o],

@@ -110,12 +110,12 @@ def as_recording(
     part: dict[str, Any] = {key: given.get(key) for key in _PART}
     if isinstance(data, str | os.PathLike):
         _refuse(given, _OF_ARRAYS, called, _TITLED)
-        return read(os.fspath(data), **_of(given, _OF_FILES), **part)
+        return read(os.fspath(data), **_only(given, _OF_FILES), **part)
     _refuse(given, _OF_FILES, called, "only files have that")
     if isinstance(data, Recording):
         _refuse(given, _OF_ARRAYS, called, "a recording has its own")
         return _cut(data, **part)
-    arrays = _of(given, ("rate", "unit", "units"))
+    arrays = _only(given, ("rate", "unit", "units"))
     if is_frame(data):
         _refuse(given, ("time",), called, "a data frame has it as the column 'time'")
         return _cut(Recording.from_frame(data, **arrays), **part)  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def as_recording(
         samples = _array(data, called, name)
         named = {"accel": samples} if columns is None else columns(samples)
     whole = {"rate": None, "unit": None, "units": None, **arrays, "name": "arrays"}
-    return _cut(Recording(*columns_of_arrays({**_of(given, ("time",)), **named}, **whole), name="arrays"), **part)
+    return _cut(Recording(*columns_of_arrays({**_only(given, ("time",)), **named}, **whole), name="arrays"), **part)
 
 
 def as_blocks(
@@ -139,12 +139,12 @@ def as_blocks(
     check_keywords(reading, function)
     given = {key: value for key, value in reading.items() if value is not None}
     _refuse(given, _OF_ARRAYS, function.__name__, _TITLED)
-    part = _of(given, _PART)
+    part = _only(given, _PART)
     path, source = Path(data), None
     if path.is_file():
         with path.open("rb") as stream:
             source = Source(str(data), hashlib.file_digest(stream, "sha256").hexdigest())
-    return read_blocks(path, **_of(given, _OF_FILES), **part), source
+    return read_blocks(path, **_only(given, _OF_FILES), **part), source
 
 
 def as_record(record: Record, called: str) -> Calibration:
@@ -212,5 +212,5 @@ def _refuse(given: Mapping[str, Any], keys: Iterable[str], called: str, reason: 
             raise OptionError(f"{called}: {key} does not go with such data: {reason}")
 
 
-def _of(given: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+def _only(given: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return {key: given[key] for key in keys if key in given}

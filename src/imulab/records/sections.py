@@ -153,7 +153,7 @@ def check_sizes(value: Any, where: str = "") -> None:
         for index, item in enumerate(value):
             check_sizes(item, f"{where}[{index}]")
     elif _is_number(value) and not -LARGEST <= value <= LARGEST:
-        raise _wrong(where, f"a number of at most {LARGEST:g}", value)
+        raise _mistake(where, f"a number of at most {LARGEST:g}", value)
 
 
 @cache
@@ -219,14 +219,14 @@ def _made(value: Mapping[str, Any], kind: Any, where: str, counts: _Counts) -> A
 
 def _read_list(value: Any, kind: Any, where: str, counts: _Counts, count: int | str | None) -> list[Any]:
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise _wrong(where, "a list", value)
+        raise _mistake(where, "a list", value)
     if count is not None:
         expected, of = (count, "") if isinstance(count, int) else counts.setdefault(count, (len(value), where))
         if len(value) != expected:
             as_there = f", as {of} has" if of else ""
             raise RecordError(f"{where}: expected {expected} entries{as_there}, found {len(value)}")
         if not value:
-            raise _wrong(where, "1 entry or more", value)
+            raise _mistake(where, "1 entry or more", value)
     if kind is float and set(map(type, value)) <= {float, int}:
         return list(map(float, value))
     return [_read(item, kind, f"{where}[{index}]", counts) for index, item in enumerate(value)]
@@ -234,13 +234,13 @@ def _read_list(value: Any, kind: Any, where: str, counts: _Counts, count: int | 
 
 def _tested(value: Any, kind: Kind, where: str) -> Any:
     if not kind.fits(value):
-        raise _wrong(where, kind.name, value)
+        raise _mistake(where, kind.name, value)
     return value
 
 
 def _named(value: Any, where: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise _wrong(where, "named values", value)
+        raise _mistake(where, "named values", value)
     return value
 
 
@@ -248,6 +248,6 @@ def _at(where: str, key: str) -> str:
     return f"{where}.{key}" if where else key
 
 
-def _wrong(where: str, expected: str, value: Any) -> RecordError:
+def _mistake(where: str, expected: str, value: Any) -> RecordError:
     text = repr(value)
     return RecordError(f"{where}: expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")

@@ -56,10 +56,10 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
     nyquist = 0.5 / spectra[0].interval
     f, p, d = (np.concatenate(each) for each in zip(*((frequencies(s), s.power, s.freedom) for s in spectra)))  # noqa: B905
     highest = nyquist
-    if not _agree(f, p, d, highest, 2) and _rising(f, p, d, nyquist):
+    if not _same_level(f, p, d, highest, 2) and _rising(f, p, d, nyquist):
         return Band(nyquist, True)
     while highest == nyquist or d[f <= highest / 4].sum() > 2 * _MANY:
-        if _agree(f, p, d, highest, 2):
+        if _same_level(f, p, d, highest, 2):
             far, u = _apart(f, p, d, highest, 2)
             full = highest > _FULL * nyquist
             if _SIGMAS * u[0] > _SHARP or (full and far[0] < -_SIGMAS * u[0]):
@@ -70,7 +70,7 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
     return Band(nyquist, True, False)
 
 
-def _agree(f: Array, p: Array, d: Array, highest: float, octaves: int) -> bool:
+def _same_level(f: Array, p: Array, d: Array, highest: float, octaves: int) -> bool:
     """Whether the highest octaves have the same level, each against the highest."""
     far, u = _apart(f, p, d, highest, octaves)
     return bool((np.abs(far) <= _AGREE + _SIGMAS * u).all())
@@ -97,7 +97,7 @@ def _rising(f: Array, p: Array, d: Array, nyquist: float) -> bool:
     a, b = np.linalg.lstsq(np.column_stack([root, root * square]), root * p[top])[0]
     if b <= 0 or a <= 0:
         return False
-    return _agree(f[top], p[top] / (a + b * square), d[top], nyquist, 3)
+    return _same_level(f[top], p[top] / (a + b * square), d[top], nyquist, 3)
 
 
 def within(spectrum: Spectrum, highest: float) -> Spectrum:
@@ -139,9 +139,9 @@ def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
     log = np.concatenate(logarithm)
     freedom = np.concatenate([s.freedom for s in spectra])
     ripple = _ripple(log, freedom)
-    far = _far(log, freedom, ripple)
+    far = _far_bins(log, freedom, ripple)
     ripple = _ripple(log[~far], freedom[~far])  # what is left out is no ripple
-    far = _far(log, freedom, ripple)
+    far = _far_bins(log, freedom, ripple)
     edges = np.cumsum([len(s.power) for s in spectra])[:-1]
     parts, off = [], []
     for spectrum, part, out in zip(spectra, logarithm, np.split(far, edges), strict=True):
@@ -154,7 +154,7 @@ def allow(spectra: Sequence[Spectrum], variances: Sequence[Array]) -> Allowance:
     return Allowance(ripple, tuple(parts), tuple(off))
 
 
-def _far(logarithm: Array, freedom: Array, ripple: float) -> NDArray[np.bool_]:
+def _far_bins(logarithm: Array, freedom: Array, ripple: float) -> NDArray[np.bool_]:
     """Which bins are off by 5 sigma and 10 %, the ripple allowed for."""
     u = np.sqrt(2 / np.maximum(freedom, 1) + ripple**2)
     size = np.abs(logarithm)

@@ -94,8 +94,8 @@ def find_rates(cells: Cells, place: str) -> Rates:
     if not encoder and (table_shift is None or not _significant(solution, LINE, fog, table_noise)):
         origin, shifts[0] = "manifest", 0.0
         warnings.append(
-            f"{place}: no significant FOG line at the table rate{_elsewhere(cells, fog)}; the manifest's rate was used "
-            "as it is"
+            f"{place}: no significant FOG line at the table rate{_strongest_elsewhere(cells, fog)}; the manifest's "
+            "rate was used as it is"
         )
     elif not encoder and refined is not None:
         table_uncertainty = float(np.sqrt(refined.table_gain * table_noise[fog, fog].real))
@@ -236,24 +236,24 @@ def _net_start(cells: Cells, table_shift: float, fog: int, place: str) -> float 
     if near.any():
         index = int(np.argmax(np.where(near, height, 0.0)))
         sign = 1.0 if cells.net_rate > 0 else -1.0
-        return sign * (_about(index, rates, height) - net)
+        return sign * (_peak_rate(index, rates, height) - net)
     far = peak & (height > _PLAUSIBLE) & (height < 1.1 * EARTH_RATE) & (rates > 2 * bin_width)
     for times in (1, 2, 3):
         far &= np.abs(rates - times * abs(cells.table_rate)) > 3 * bin_width
     if far.any():
         candidates = np.flatnonzero(far)
         index = int(candidates[np.argmin(np.abs(rates[candidates] - net))])
-        raise _mismatch(net, _about(index, rates, height), place)
+        raise _mismatch(net, _peak_rate(index, rates, height), place)
     return None
 
 
-def _about(index: int, rates: Array, height: Array) -> float:
+def _peak_rate(index: int, rates: Array, height: Array) -> float:
     """Rate of a peak of a spectrum, by its neighbours."""
     part = slice(max(index - 2, 0), index + 3)
     return interpolated(rates[part], height[part])
 
 
-def _elsewhere(cells: Cells, fog: int) -> str:
+def _strongest_elsewhere(cells: Cells, fog: int) -> str:
     """Where the FOG's strongest line is instead: the rate of another run, perhaps."""
     found = strongest_line(cells, cells.series[fog], 1.5 * abs(cells.net_rate))
     return (

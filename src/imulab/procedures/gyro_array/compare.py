@@ -173,7 +173,7 @@ def _run_methods(
                     "none spoils it"
                 )
                 continue
-            runs.halves[method] = _halves(readings, elements, chosen, part)
+            runs.halves[method] = _half_differences(readings, elements, chosen, part)
             runs.response[method] = responses(logged[part], elements, chosen, calibration, chosen.rate or 1.0)
             runs.rates[method] = fused
         except ImulabError as problem:
@@ -293,7 +293,7 @@ def _moving(drift: Array, usual: Array, size: int, best: np.ndarray) -> bool:
     return bool(len(steps)) and bool((np.median(steps, axis=0) > 10 * usual / math.sqrt(size) + 0.5 * usual).any())
 
 
-def _halves(readings: Array, elements: Elements, options: FuseOptions, kept: slice) -> list[float | None]:
+def _half_differences(readings: Array, elements: Elements, options: FuseOptions, kept: slice) -> list[float | None]:
     """Standard deviation of the difference of the two halves of the array (odd and even elements), each axis."""
     if elements.count < _HALVES or options.method == "covariance":
         return [None] * len(elements.axes)

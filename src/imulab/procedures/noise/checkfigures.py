@@ -34,7 +34,7 @@ def p_text(probability: float) -> str:
     return f"p = {probability:.2g}" if probability >= 1e-12 else "p below 1e-12"
 
 
-def _bare(probability: float) -> str:
+def _number_of(probability: float) -> str:
     return p_text(probability).removeprefix("p ").removeprefix("= ")
 
 
@@ -61,7 +61,7 @@ def exhibits_of_check(check: NoiseCheck) -> Exhibits:
     return Exhibits(
         f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}; {p_text(check.probability)}.",
         [
-            ("p, if nothing changed", _bare(check.probability)),
+            ("p, if nothing changed", _number_of(check.probability)),
             ("false alarms", f"{100 * check.false_alarm:.3g} %"),
             ("not held against it", f"{100 * check.tolerance:.3g} %"),
         ],

@@ -92,7 +92,7 @@ def blend_orders(problem: Problem, choice: OrderChoice) -> Blended:
         top,
         freedom,
         dict(zip(range(2, top + 1), found.noise.tolist(), strict=True)),
-        {order: _leak(problem, solution, order) for order in range(top + 1, HIGHEST_BLENDED + 1)},
+        {order: _effect_of_left_out(problem, solution, order) for order in range(top + 1, HIGHEST_BLENDED + 1)},
     )
 
 
@@ -169,7 +169,7 @@ def _noise(problem: Problem, solution: Solution, cost: float, left: float) -> tu
     return 1.0, float(solution.freedom[0]) if np.isfinite(solution.freedom[0]) else None
 
 
-def _leak(problem: Problem, solution: Solution, order: int) -> tuple[float, float]:
+def _effect_of_left_out(problem: Problem, solution: Solution, order: int) -> tuple[float, float]:
     """``(J'WJ)^-1 J'W J_k``: largest change of a bias and of a scale factor by one unit of a k that is left out."""
     theta = np.zeros((1, parameter_count(order)))
     theta[:, : solution.theta.shape[1]] = solution.theta

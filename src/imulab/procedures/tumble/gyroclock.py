@@ -169,7 +169,7 @@ def compare_clocks(
         Whether delays up to two seconds are to be expected.
     """
     step = max(_KNOT, 2 * float(np.median(np.diff(own))))
-    knots, seen = _carried(time, rate, segments, step)
+    knots, seen = _carried_gravity(time, rate, segments, step)
     moved = np.gradient(seen, axis=1)
     spacing = np.gradient(knots, axis=1)
     speed = moved / np.where(spacing > 0, spacing, np.inf)[:, :, None]
@@ -193,7 +193,7 @@ def compare_clocks(
     return _line((segments.start + segments.stop) / 2, delay)
 
 
-def _carried(time: Array, rate: Array, segments: Segments, step: float) -> tuple[Array, Array]:
+def _carried_gravity(time: Array, rate: Array, segments: Segments, step: float) -> tuple[Array, Array]:
     """Knots of each turn (m, k), the last one repeated, and the direction of gravity there, (m, k, 3).
 
     By how much a turn misses at its end is spread over it in proportion to the angle turned.

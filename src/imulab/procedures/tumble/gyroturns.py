@@ -66,12 +66,12 @@ def find_turns(
     """
     begin, end = holds.leave[:-1], holds.arrive[1:]
     turns = (end > begin) & (time[end] - time[begin] <= _LONGEST_TURN)
-    clipped = _during(beyond_range(output), begin, end) & turns[:, None]
+    clipped = _any_during(beyond_range(output), begin, end) & turns[:, None]
     step = np.diff(time)
     # What lies in a gap is taken as a straight line: no turn is known to a milliradian across a longer one.
     usual = float(np.median(step)), float(np.quantile(step, 0.99))  # the second where stamps come in bursts
     wide = step > max(_GAP_SECONDS, _GAP_STEPS * usual[0], _GAP_BURSTS * usual[1])
-    broken = _during(np.append(wide, False)[:, None], begin, end - 1)[:, 0] & turns
+    broken = _any_during(np.append(wide, False)[:, None], begin, end - 1)[:, 0] & turns
     chosen = np.flatnonzero(turns & ~clipped.any(axis=1) & ~broken)
     notes = []
 
@@ -111,7 +111,7 @@ def find_turns(
     return Segments(mean, between, up[chosen], up[chosen + 1], time[start], time[stop], chosen), notes
 
 
-def _during(flags: NDArray[np.bool_], first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _any_during(flags: NDArray[np.bool_], first: NDArray[np.intp], last: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Whether a flag (n, k) is up from sample `first` to sample `last`, both (m,); shape (m, k)."""
     count = np.vstack([np.zeros((1, flags.shape[1]), dtype=np.int64), np.cumsum(flags, axis=0)])
     result: NDArray[np.bool_] = count[np.maximum(last, first) + 1] > count[first]

@@ -186,9 +186,9 @@ def length_noise(theta: Array, jacobian: Array, covariance: Array, motion: Motio
         Of n attitudes, the same for all problems; `covariance` is not used then.
     """
     if motion is None:
-        return _carried(theta, jacobian, covariance)
-    lengthening = _carried(theta, jacobian, motion.lengthening)[0]
-    expected = _carried(theta, jacobian, motion.usual)[1]
+        return _lengthening(theta, jacobian, covariance)
+    lengthening = _lengthening(theta, jacobian, motion.lengthening)[0]
+    expected = _lengthening(theta, jacobian, motion.usual)[1]
     own = np.empty(jacobian.shape[:2])
     _model.noise(np.ascontiguousarray(theta), np.ascontiguousarray(jacobian), motion.moments, np.empty(0), own)
     # An attitude that was knocked, or moved in other ways, says nothing of the others' noise.
@@ -199,7 +199,7 @@ def length_noise(theta: Array, jacobian: Array, covariance: Array, motion: Motio
     return lengthening, (motion.freedom * own + POOL_DEGREES * usual) / (motion.freedom + POOL_DEGREES)
 
 
-def _carried(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:
+def _lengthening(theta: Array, jacobian: Array, covariance: Array) -> tuple[Array, Array]:
     """Lengthening and variance of |f| by a covariance of the outputs, shapes (b, n)."""
     lengthening, variance = np.empty(jacobian.shape[:2]), np.empty(jacobian.shape[:2])
     _model.noise(

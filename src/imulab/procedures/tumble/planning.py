@@ -96,7 +96,7 @@ def plan_tumble(
         attitudes=whole(attitudes, "attitudes"),
         criterion=criterion,
         candidates=_candidates(from_),
-        already=None if add is None else _already(add),
+        already=None if add is None else _measured_directions(add),
         source=from_ if isinstance(from_, str) else "from_",
         distinct_verticals=distinct,
     )
@@ -186,7 +186,7 @@ def _units(given: object, name: str) -> Array:
     return units
 
 
-def _already(given: Any) -> Array:
+def _measured_directions(given: Any) -> Array:
     """Upward directions of a plan, of a record's attitudes, or of a recording's under an order-1 fit."""
     if isinstance(given, Plan):
         return given.directions

@@ -197,7 +197,7 @@ def scatter(jacobian: Array, seen: Array, own: Array) -> float:
 
     A disturbed hold is no change of the unit. Allowing for scatter that is not there would hide changes.
     """
-    missed, left = _missed(jacobian, seen, own)
+    missed, left = _left_of(jacobian, seen, own)
     freedom = len(own) - left.shape[1]
     if freedom < 1 or chi_square_probability(float((missed**2 / own).sum()), freedom) > SCATTERED:
         return 0.0
@@ -209,12 +209,12 @@ def unexplained(jacobian: Array, seen: Array, own: Array) -> tuple[float, float]
 
     Residuals are those of a fit to the attitudes alone, whatever a record says (`estimate.plausible_excess`).
     """
-    missed, left = _missed(jacobian, seen, own)
+    missed, left = _left_of(jacobian, seen, own)
     excess, freedom = plausible_excess(missed[None], own[None], 1 - (left**2).sum(axis=1)[None])
     return float(excess[0]), float(freedom[0])
 
 
-def _missed(jacobian: Array, seen: Array, own: Array) -> tuple[Array, Array]:
+def _left_of(jacobian: Array, seen: Array, own: Array) -> tuple[Array, Array]:
     """What a weighted fit to the attitudes alone leaves of `seen`, and a basis of what it takes, (n, rank)."""
     white = jacobian / np.sqrt(own)[:, None]
     scale = np.maximum(np.linalg.norm(white, axis=0), np.finfo(float).tiny)

@@ -281,7 +281,7 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
     slope = np.gradient(bins.mean, axis=0) if len(bins) > 1 else 0.0
     excess = bins.variance - np.square(slope) / 12
     noise = _MOVED * (1 + 10 / bins.count[:, None]) * quiet
-    away = np.square(bins.mean - _middling(bins.mean))
+    away = np.square(bins.mean - _running_medians(bins.mean))
     # Its own noise from neighbouring bins: within a bin of a few samples the variance says little.
     steps = np.diff(bins.mean, axis=0)
     usual = np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) if len(steps) else np.inf
@@ -304,7 +304,7 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[Bins, tuple[float, float]]:
     return bins.where(~near), (float(near.sum()), began)
 
 
-def _middling(values: Array) -> Array:
+def _running_medians(values: Array) -> Array:
     """Median of each row and the three on either side, which two bad ones do not move."""
     if len(values) <= 3:
         return np.asarray(np.median(values, axis=0, keepdims=True))

@@ -43,7 +43,7 @@ def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
     table = record_table(record)
     if not record.fit:
-        return _handmade(table)
+        return _exhibits_of_table(table)
     by_kind = axes_by_kind(table)
     fit = drawn_of(record).fit
     chosen, none = fit.row(), fit.row("none")
@@ -116,7 +116,7 @@ def _worst(
     return [(f"at worst, near {at.value:.3g} °C", error)]
 
 
-def _handmade(table: WarmupTable) -> Exhibits:
+def _exhibits_of_table(table: WarmupTable) -> Exhibits:
     low, high = table.temperatures[[0, -1]]
     return Exhibits(
         headline=f"Table of model {table.model}, {low:g} to {high:g} degC, made from a file of coefficients.",

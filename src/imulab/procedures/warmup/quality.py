@@ -32,7 +32,7 @@ _IMPROBABLE = {"rad/s": np.radians(5.0), "m/s^2": 1.0}
 def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]:
     """Return the warnings on a test and the table made from it."""
     return [
-        *_dead(curves),
+        *_dead_columns(curves),
         *_ends(curves, settled),
         *_starts(curves),
         *_sizes(curves),
@@ -40,7 +40,7 @@ def quality_warnings(curves: Curves, chosen: Judged, settled: bool) -> list[str]
         *_drifts(curves, chosen),
         *_temperatures(curves),
         *_single(curves),
-        *_odd(curves),
+        *_odd_cycles(curves),
         *_intervals(curves, chosen),
         *_constants(curves, chosen),
     ]
@@ -64,7 +64,7 @@ def expectations(curves: Curves, chosen: Judged, worst: Worst | None) -> list[st
     return found
 
 
-def _dead(curves: Curves) -> list[str]:
+def _dead_columns(curves: Curves) -> list[str]:
     """Columns that never change while others do, for a cycle or for a while, and rows of zeros."""
     found: list[str] = []
     stuck: dict[str, list[str]] = {}
@@ -194,7 +194,7 @@ def _single(curves: Curves) -> list[str]:
     return [f"one cycle only at {' '.join(alone)} degC: its repeatability is not known there"]
 
 
-def _odd(curves: Curves) -> list[str]:
+def _odd_cycles(curves: Curves) -> list[str]:
     """Cycles that differ from the others at their temperature far more than cycles of this test do."""
     means, _ = curves.group_means()
     apart = np.einsum("cb,cba->ca", curves.seconds, (curves.mean - means[curves.group]) ** 2)
