@@ -99,9 +99,11 @@ function view(now) {
       h("p", { class: "said look" }, sentence(text)))));
 }
 
-function advice(now) {
+export function advice(now) {
   if (now.phase === "computing") return "Computing the record.";
   if (now.phase === "done") return "Done: the record is made.";
+  const off = now.attitudes.find(each => each.aside);
+  if (now.enough && off) return `Enough, but attitude ${off.number} looks knocked: drop it first.`;
   if (now.enough && now.state === "accepted") return "Enough: make the record.";
   return sentence(now.advice);
 }
