@@ -61,6 +61,25 @@ def built(compiler, exported):
     return programs
 
 
+@pytest.fixture(scope="session")
+def core_objects(compiler, exported, tmp_path_factory):
+    """The core, which is the same for every unit, compiled once for each type of numbers."""
+    folder, objects = tmp_path_factory.mktemp("core"), {}
+    for real in ("double", "float"):
+        objects[real] = folder / f"{real}.o"
+        command = [compiler, *STRICT, f"-DIMULAB_REAL={real}", "-c", exported / "imulab.c", "-o", objects[real]]
+        subprocess.run(command, check=True)
+    return objects
+
+
+@pytest.fixture(scope="session")
+def array_recordings():
+    """An array at rest and moving."""
+    array = {"elements": 4, "axes": 3, "unit": "deg/s"}
+    still = il.simulate_array(experiment="static", duration=30.0, **array)
+    return still, il.simulate_array(experiment="moving", duration=40.0, **array)
+
+
 @pytest.fixture
 def c_core(built, tmp_path):
     """Run rows of numbers through a function of the compiled core; tables None takes the numbers in unit.c."""
@@ -328,14 +347,14 @@ int main(void) {
     ],
     ids=str,
 )
-def test_the_self_test_passes_with_the_method_that_was_chosen(compiler, tmp_path, fusion, real):
-    array = {"elements": 4, "axes": 3, "unit": "deg/s"}
-    still = il.simulate_array(experiment="static", duration=30.0, **array)
-    moving = il.simulate_array(experiment="moving", duration=40.0, **array)
-    record = calibrate_array(still, moving, fusion=fusion).calibration
+def test_the_self_test_passes_with_the_method_that_was_chosen(
+    compiler, core_objects, array_recordings, exported, tmp_path, fusion, real
+):
+    record = calibrate_array(*array_recordings, fusion=fusion).calibration
     export("c", [record], tmp_path)
     assert f".method = {METHODS.index(fusion.method)}," in (tmp_path / "unit.c").read_text(encoding="utf-8")
-    files = [tmp_path / name for name in ("imulab.c", "unit.c", "selftest.c")]
+    assert (tmp_path / "imulab.c").read_bytes() == (exported / "imulab.c").read_bytes()
+    files = [core_objects[real], *(tmp_path / name for name in ("unit.c", "selftest.c"))]
     command = [compiler, *STRICT, f"-DIMULAB_REAL={real}", f"-I{tmp_path}", *files, "-o", tmp_path / "t", "-lm"]
     subprocess.run(command, check=True)
     done = subprocess.run([tmp_path / "t"], capture_output=True, text=True, check=False)
