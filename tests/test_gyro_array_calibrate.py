@@ -56,10 +56,11 @@ def in_gauge(sensing: np.ndarray) -> np.ndarray:
     return sensing @ np.linalg.inv(mean)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [1, 3])
-def test_alignment_covers_the_truth(axes):
+def test_alignment_covers_the_truth(axes, reduced):
     within = []
-    for seed in range(12):
+    for seed in range(4 if reduced else 12):
         still, moving, sensing, bias = array_of(seed, axes)
         record = calibrate_array(still, moving).calibration
         truth = in_gauge(sensing)
@@ -87,6 +88,7 @@ def test_the_bias_is_the_plain_mean():
         assert record.parameters[element["name"].replace("gyro", "bias")].value == element["bias"]["value"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "duration", "least"),
     [
@@ -96,10 +98,10 @@ def test_the_bias_is_the_plain_mean():
         (NoiseModel(gauss_markov=0.0, walk=0.0), 60.0, 0.9),
     ],
 )
-def test_the_uncertainty_of_the_bias_holds_what_the_stretch_shows_and_the_rest_is_said(noise, duration, least):
+def test_the_uncertainty_of_the_bias_holds_what_the_stretch_shows_and_the_rest_is_said(noise, duration, least, reduced):
     # Of noise slower than itself a stretch says nothing: the turn-on bias is covered as far as it shows.
     ratios, spreads = [], []
-    for seed in range(20):
+    for seed in range(6 if reduced else 20):
         recording = simulate_array(experiment="static", duration=duration, rate=50.0, seed=seed, **vars(noise))
         record = calibrate_array(recording).calibration
         for i, element in enumerate(record.sections["elements"]):

@@ -177,6 +177,7 @@ BETTER = {("smooth", "knot-cubic"): {3}, ("bent", "exponential (2)"): {3}}
 TESTS = 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["smooth", "bent"])
 def test_the_table_of_models_comes_out_as_stated(law):
     """Entry by entry, pooled over tests: one test's errors are the draw of three cycles at each temperature."""
