@@ -105,6 +105,10 @@ def test_lengths_of_time_are_said_as_people_do(seconds, text):
         ({}, "no noise is given: expected one of white"),
         ({"white": 1.0, "for_": "walk=10%"}, "for_ walk: not among the terms; expected white"),
         ({"white": 1.0, "for_": "much"}, "for_ 'much': expected a fraction such as 0.01 or 1 %"),
+        ({"white": 1.0, "for_": "white=1%,white=2%"}, "for_ 'white=1%,white=2%': white twice; expected each term once"),
+        ({"white": 1.0, "for_": "=5%"}, "for_ '=5%': expected the name of a term before each =, such as walk=10%"),
+        ({"white": 1.0, "for_": "white=300%"}, "for_ white=300%: expected a share above 0 and up to 1"),
+        ({"white": 1.0, "duration": "1 s"}, "duration 1 s: expected at least 5 s, 500 samples, which a fit needs"),
         ({"white": 1.0, "for_": "0 %"}, "for_ 0 %: expected a share above 0"),
         ({"white": 1.0, "duration": -1.0}, "duration -1 s: expected more than 0"),
         ({"white": 1.0, "rate": 0.0}, "rate 0 Hz: expected 0.001"),
@@ -141,3 +145,11 @@ def test_a_record_of_another_procedure_is_refused_by_the_name_of_the_option(tmp_
     il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81).save(tmp_path / "t.json")
     assert main(["noise", "plan", "--from", str(tmp_path / "t.json")]) == 2
     assert "--from: a tumble record; expected one of noise fit" in capsys.readouterr().err
+
+
+def test_a_plan_is_no_shorter_than_what_a_fit_takes():
+    """500 samples, and 100 s for what is slow; what a record does not tell has no percentage."""
+    plan = il.plan_noise(white="0.3 deg/sqrt(h)", walk="3000 deg/h/sqrt(h)", for_="50 %", rate=50.0)
+    assert [each.length for each in plan.terms] == [pytest.approx(10.0), pytest.approx(100.0)]
+    short = il.plan_noise(white="0.3 deg/sqrt(h)", walk="10 deg/h/sqrt(h)", duration="10 s")
+    assert short.shown()[2][1][4] == "not told"

@@ -316,3 +316,10 @@ def test_it_is_no_calibration_to_export(record, tmp_path, target, capsys):
     assert "noise record" in message
     assert "use --to c" not in message
     assert not (tmp_path / "fw").exists()
+
+
+def test_a_log_shorter_than_the_usual_horizon_is_fitted_to_its_own_length():
+    rng = np.random.default_rng(3)
+    record = il.fit_noise({"gyro": rng.standard_normal((600, 3))}, rate=100.0, unit="deg/s").calibration
+    assert record.fit["horizon"]["value"] == pytest.approx(6.0)
+    assert any("horizon 6 s: more than a tenth of the record" in note for note in record.warnings)

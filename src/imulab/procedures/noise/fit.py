@@ -195,7 +195,7 @@ def fit_recordings(
     rests = read_rests(recordings, columns)
     names = chosen_columns(rests[0].recording, columns)
     longest = max(stop[1] - stop[0] for rest in rests for stop in rest.parts) * rests[0].interval
-    if horizon > longest:
+    if horizon > longest and horizon != HORIZON:
         raise OptionError(
             f"horizon {horizon:g} s: expected at most the length of the record, {longest:.4g} s in one stretch"
         )
@@ -203,6 +203,7 @@ def fit_recordings(
     if regress == "temperature" and None in temperatures:
         where = rests[temperatures.index(None)].recording.name
         raise DataError(f"{where}: regress temperature: expected a column temperature that changes, found none")
+    horizon = min(horizon, longest)  # the default is of the usual, longer, records
     candidates = CANDIDATES if terms == "auto" else (terms,)
     found = {name: _column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names}
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}

@@ -12,6 +12,7 @@ import numpy as np
 
 from imulab.errors import OptionError, listed
 from imulab.estimation.noise.duration import accuracy, accuracy_curve, length_for, visible
+from imulab.estimation.noise.rest import FEWEST, SHORT
 from imulab.estimation.noise.terms import NAMES
 from imulab.estimation.noise.use import edge_as_white
 from imulab.procedures.inputs import Record, as_record
@@ -193,7 +194,8 @@ def _row(each: PlannedTerm) -> list[str]:
     wanted = _percent(each.wanted) if each.wanted > 0 else "–"
     needs = "–" if not each.wanted > 0 else "no record" if math.isinf(each.length) else duration_text(each.length)
     value = plain_number(each.value * factor, 3)
-    return [each.column, name, value, unit, f"{plain_number(100 * each.uncertainty, 2)} %", wanted, needs]
+    told = f"{plain_number(100 * each.uncertainty, 2)} %" if each.uncertainty < 1 else "not told"
+    return [each.column, name, value, unit, told, wanted, needs]
 
 
 def plan_noise(
@@ -233,7 +235,8 @@ def plan_noise(
     Raises
     ------
     OptionError
-        There are neither terms nor a record, or a term that is wanted is none of them.
+        There are neither terms nor a record, a term that is wanted is none of them or comes twice, or the duration is
+        shorter than what a fit needs.
     RecordError
         The record is of another procedure.
 
@@ -315,10 +318,21 @@ def _planned(noise: Mapping[str, _Column], wanted: Mapping[str, float], length: 
         for k, term in enumerate(NAMES):
             want = _wanted(wanted, term)
             if column.values[k] > 0:
-                lengths[name, term] = length_for(grid, reached[name][:, k], want) if want > 0 else math.nan
+                needed = length_for(grid, reached[name][:, k], want) if want > 0 else math.nan
+                lengths[name, term] = max(needed, _least(column, slow=k > 0))
+    shortest = max(_least(column, slow=False) for column in noise.values())
+    if length is not None and length < shortest:
+        raise OptionError(
+            f"duration {length:g} s: expected at least {shortest:g} s, {FEWEST} samples, which a fit needs"
+        )
     at = length or max((each for each in lengths.values() if math.isfinite(each)), default=_HOUR)
     terms = [each for name, column in noise.items() for each in _terms(name, column, wanted, lengths, at, length)]
     return NoisePlan(tuple(terms), at, grid, reached)
+
+
+def _least(column: _Column, slow: bool) -> float:
+    """Length of the shortest record that `fit_noise` takes, s, or that it finds a slow term in."""
+    return max(FEWEST * column.interval, SHORT if slow else 0.0)
 
 
 def _terms(
@@ -358,12 +372,19 @@ def _read_wanted(given: float | str | Mapping[str, float | str]) -> dict[str, fl
         pairs = given
     elif isinstance(given, str) and "=" in given:
         parts = [part.partition("=") for part in given.split(",")]
-        pairs = {name.strip(): value for name, _, value in parts}
+        names = [name.strip() for name, _, _ in parts]
+        if "" in names:
+            raise OptionError(f"for_ {given!r}: expected the name of a term before each =, such as walk=10%")
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise OptionError(f"for_ {given!r}: {twice} twice; expected each term once")
+        pairs = dict(zip(names, (value for _, _, value in parts), strict=True))
     else:
         pairs = {_ANY: given}
     wanted = {}
     for name, value in pairs.items():
         wanted[name] = fraction(value, f"for_ {name}".strip())
         if not 1e-6 <= wanted[name] <= 1:
-            raise OptionError(f"for_ {value}: expected a share above 0 and up to 1, such as 10 % or walk=10%")
+            called = f"{name}={value}" if name != _ANY else value
+            raise OptionError(f"for_ {called}: expected a share above 0 and up to 1, such as 10 % or walk=10%")
     return wanted
