@@ -4,12 +4,14 @@ import doctest
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 import imulab
+import madeup
 from imulab.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -131,3 +133,16 @@ def test_every_public_name_has_a_docstring_and_but_for_these_an_example():
     assert not [name for name in names if not getattr(imulab, name).__doc__]
     lacking = {name for name in names if not any(found.examples for found in finder.find(getattr(imulab, name), name))}
     assert lacking <= WITHOUT_EXAMPLE
+
+
+@pytest.mark.parametrize(("language", "compiler"), [("c", "cc"), ("cpp", "c++")])
+def test_the_code_for_firmware_compiles(language, compiler, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"no {compiler}")
+    imulab.export("c", madeup.tumble(), tmp_path)
+    page = (REPOSITORY / "docs" / "runtime.md").read_text(encoding="utf-8")
+    (code,) = re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
+    source = tmp_path / f"shown.{language}"
+    source.write_text(code, encoding="utf-8")
+    flags = ["-Wall", "-Wextra", "-Werror", f"-I{tmp_path}", "-fsyntax-only"]
+    subprocess.run([compiler, *flags, source], check=True, timeout=60)
