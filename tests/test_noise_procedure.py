@@ -323,3 +323,14 @@ def test_a_log_shorter_than_the_usual_horizon_is_fitted_to_its_own_length():
     record = il.fit_noise({"gyro": rng.standard_normal((600, 3))}, rate=100.0, unit="deg/s").calibration
     assert record.fit["horizon"]["value"] == pytest.approx(6.0)
     assert any("horizon 6 s: more than a tenth of the record" in note for note in record.warnings)
+
+
+def test_an_output_of_coarse_steps_is_said():
+    """Steps of 2.5 sigma add 14 % to the white noise."""
+    rate = np.round(0.1 * np.random.default_rng(1).standard_normal((20_000, 1)) / 0.25) * 0.25
+    record = il.fit_noise({"gyro_x": rate[:, 0]}, rate=100.0, unit="deg/s").calibration
+    assert record.value("gyro_x_white") == pytest.approx(1.14 * 0.01 * DEGREE, rel=0.03)
+    assert any("steps of 0.25 deg/s, 2.2 times the noise of a sample" in note for note in record.warnings)
+    fine = np.round(rate / 0.01 + np.random.default_rng(2).standard_normal((20_000, 1)) * 10) * 0.01
+    record = il.fit_noise({"gyro_x": fine[:, 0]}, rate=100.0, unit="deg/s").calibration
+    assert not any("steps of" in note for note in record.warnings)

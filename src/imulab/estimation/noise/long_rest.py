@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from imulab.estimation.column_noise import most_reach
 from imulab.estimation.noise.cosine import Accumulator, Stretch
-from imulab.estimation.noise.rest import FEWEST, LEVELS, MOST, SHARE, Rest, is_clipped, notes_of_gaps
+from imulab.estimation.noise.rest import FEWEST, LEVELS, MOST, SHARE, Rest, is_clipped, notes_of_gaps, notes_of_steps
 from imulab.estimation.ranked import distinct
-from imulab.estimation.sampling import BRIDGED, SAME_RATE, WIDEST_GAP, bridged_line, mislabelled, usual_step
+from imulab.estimation.sampling import BRIDGED, SAME_RATE, WIDEST_GAP, bridged, bridged_line, mislabelled, usual_step
 from imulab.recording import Array, Recording
 from imulab.units import parse_unit
 
@@ -132,6 +132,7 @@ class _Log:
         self._waiting: Recording | None = None
         self._rows = self._bad = 0
         self._first_bad = ""
+        self._coarse: list[str] = []
         self._time = np.empty(0)
         self._usual = self._longest = 0.0
         self._steps, self._duration = 0, 0.0
@@ -180,6 +181,7 @@ class _Log:
                 *(f"{head.name}: {note}" for note in self._notes),
                 *bad,
                 *mislabelled(head, 1 / interval),
+                *self._coarse,
                 *notes_of_gaps(head.name, interval, lengths, filled, self._rows + filled - kept, self._rows),
             ),
             {name: [part.spectra[name] for part in parts] for name in self._names},
@@ -228,6 +230,7 @@ class _Log:
         if len(steps) < FEWEST:
             raise _AsWholeError
         self._head = _rows(block, 0, 0)
+        self._coarse = notes_of_steps(bridged(block, self._names)[0], self._names)
         self._warm = "temperature" in block
         self._usual, self._longest = usual_step(steps)
         self._levels = {name: _Level(columns[name], max(1, round(1 / self._usual))) for name in self._names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,8 +12,10 @@ import numpy as np
 from imulab.errors import DataError
 from imulab.estimation.column_noise import moved_columns
 from imulab.estimation.noise.cosine import Stretch, slow_coefficients, transformed
+from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.ranked import distinct
 from imulab.estimation.sampling import WIDEST_GAP, bridged, sampling_rate, steady_part, usual_step
+from imulab.estimation.steps import deviation_of_steps
 from imulab.recording import Array, Recording, check_time
 from imulab.verdict import Note
 
@@ -132,8 +135,23 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         raise _too_few(recording, left_out)
     # Lines about gaps are said here, for other figures than those of an Allan curve follow from them.
     notes += [line for line in timing if " in time, the longest " not in line]
+    notes += notes_of_steps(recording, names)
     notes += notes_of_gaps(recording.name, usual, list(map(_length, parts)), filled, left_out, len(time))
     return Rest(recording, usual, tuple(parts), filled, tuple(notes))
+
+
+def notes_of_steps(recording: Recording, names: Sequence[str]) -> list[str]:
+    """Say of a recording, by its first samples, which outputs take larger steps than their noise."""
+    notes = []
+    for name in names:
+        samples = recording.column(name)[:_SEEN]
+        step, noise = resolution(samples), deviation_of_steps(samples) / math.sqrt(2)
+        if step > noise > 0:
+            notes.append(
+                f"{recording.name}: column {name}: steps of {step:.3g} {recording.units[name]}, {step / noise:.2g} "
+                "times the noise of a sample: the white noise holds what rounding adds, up to all of it"
+            )
+    return notes
 
 
 def notes_of_gaps(
