@@ -78,3 +78,9 @@ def test_a_latitude_beyond_the_pole_is_refused(degrees):
 def test_a_height_out_of_range_is_refused(height):
     with pytest.raises(OptionError, match=rf"height {height:g} m: expected -500 to 10000 m"):
         normal_gravity(0.5, height)
+
+
+def test_a_place_may_be_a_text_and_degrees_without_one_are_told_how_to_be_written():
+    assert normal_gravity("48.1 deg", "520 m") == normal_gravity(math.radians(48.1), 520.0)
+    with pytest.raises(OptionError, match=r'expected -90 to 90 deg; numbers are rad, degrees are written "48.1 deg"'):
+        normal_gravity(48.1)

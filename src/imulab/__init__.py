@@ -99,6 +99,7 @@ _HOME = {
     "CentrifugeFit": "procedures.centrifuge.fit",
     "ImulabError": "errors",
     "Recording": "recording",
+    "MagFit": "procedures.tumble.mag.fit",
     "TumbleFit": "procedures.tumble.fit",
     "WarmupFit": "procedures.warmup.fit",
     "apply": "procedures.apply",

@@ -61,7 +61,17 @@ def file_name(value: object) -> str | os.PathLike[str]:
 
 
 class ImulabError(Exception):
-    """Base of all errors that name a mistake in the input rather than in imulab; the message is one line."""
+    """Base of all errors that name a mistake in the input rather than in imulab; the message is one line.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> try:
+    ...     il.normal_gravity(0.8, height=1e6)
+    ... except il.ImulabError as error:
+    ...     print(error)
+    height 1e+06 m: expected -500 to 10000 m
+    """
 
     def __init__(self, message: str = "") -> None:
         super().__init__(" ".join(message.splitlines()))  # names out of damaged files may hold ends of lines

@@ -241,7 +241,7 @@ def _of_head(recording: Recording) -> Gravity | None:
     return Gravity(found.value, f"head of {recording.name}", found.standard_uncertainty, Note(said))
 
 
-def normal_gravity(latitude: float, height: float = 0.0) -> float:
+def normal_gravity(latitude: float | str, height: float | str = 0.0) -> float:
     """Return the magnitude of normal gravity.
 
     ``gamma = gamma_e (1 + k sin^2 phi) / sqrt(1 - e^2 sin^2 phi)``, continued to the height h by
@@ -251,9 +251,9 @@ def normal_gravity(latitude: float, height: float = 0.0) -> float:
     Parameters
     ----------
     latitude
-        Geodetic latitude, rad, -pi/2 to pi/2.
+        Geodetic latitude, rad, -pi/2 to pi/2; or a text as on the command line, ``"48.1 deg"``.
     height
-        Height above the ellipsoid, m, -500 to 10000.
+        Height above the ellipsoid, m, -500 to 10000; or a text.
 
     Returns
     -------
@@ -274,12 +274,20 @@ def normal_gravity(latitude: float, height: float = 0.0) -> float:
     >>> latitudes = (0.0, math.pi / 2, math.pi / 4)
     >>> [round(il.normal_gravity(at, height), 5) for at, height in zip(latitudes, (0.0, 0.0, 1000.0))]
     [9.78033, 9.83218, 9.80311]
+    >>> round(il.normal_gravity("48.1 deg", "520 m"), 5)
+    9.80739
     """
+    if isinstance(latitude, str):
+        latitude = in_si(latitude, "latitude", "angle", "deg")
+    if isinstance(height, str):
+        height = in_si(height, "height", "length", "m")
     for called, value in (("latitude", latitude), ("height", height)):
         if not isinstance(value, numbers.Real):
             raise OptionError(f"{called} {quoted(value)}: expected a number, in rad and m")
     if not abs(latitude) <= math.pi / 2 * (1 + 1e-12):
-        raise OptionError(f"latitude {math.degrees(latitude):g} deg: expected -90 to 90 deg")
+        degrees = 2 * math.pi < abs(latitude) <= 90.0
+        hint = f'; numbers are rad, degrees are written "{latitude:g} deg"' if degrees else ""
+        raise OptionError(f"latitude {math.degrees(latitude):g} deg: expected -90 to 90 deg{hint}")
     if not -500.0 <= height <= 10000.0:
         raise OptionError(f"height {height:g} m: expected -500 to 10000 m")
     sine_squared = math.sin(latitude) ** 2

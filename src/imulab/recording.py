@@ -57,6 +57,14 @@ class Recording:
         What the reader did to the data that a user should know.
     corrected_by
         The records that the samples were corrected by, ``NAME sha256:HASH`` each.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import imulab as il
+    >>> recording = il.Recording.from_arrays(accel=np.zeros((100, 3)), rate=50.0, unit="g")
+    >>> list(recording.columns), recording.units["accel_x"]
+    (['time', 'accel_x', 'accel_y', 'accel_z'], 'g')
     """
 
     columns: Mapping[str, Array]

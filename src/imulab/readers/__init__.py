@@ -126,6 +126,13 @@ def read_blocks(
     """Read a recording in blocks of some ten thousand rows, for what does not fit in memory.
 
     Parameters and errors are those of `read`; every block has the metadata, and knows its first row.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.write(il.simulate_tumble(), "recording.csv")
+    >>> sum(len(block) for block in il.read_blocks("recording.csv")) == len(il.read("recording.csv"))
+    True
     """
     selection = Selection(topic, instance, window, element)
     name = name or _name(file)

@@ -106,6 +106,13 @@ class Calibration:
         Further top-level keys that a procedure adds (``table``, ``elements``, ``levels``, ``runs`` ...).
     version
         Version of the schema that the record was read from.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> record = il.fit_tumble(il.simulate_tumble(order=1, gravity=9.81362), gravity=9.81362).calibration
+    >>> record.procedure, record.parameters["bias_x"].unit, record.verdict.state
+    ('tumble', 'm/s^2', 'good')
     """
 
     procedure: str

@@ -30,6 +30,13 @@ def write(blocks: Recording | Iterable[Recording], path: str | Path) -> None:
     ------
     OptionError
         The name ends in neither .csv nor .parquet, or the file cannot be written there.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.write(il.simulate_tumble(), "recording.csv")
+    >>> il.read("recording.csv").units["accel_x"]
+    'm/s^2'
     """
     kind = Path(file_name(path)).suffix.lower()
     if kind not in (".csv", ".parquet"):

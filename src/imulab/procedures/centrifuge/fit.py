@@ -28,7 +28,16 @@ from imulab.records.calibration import Calibration
 
 @dataclass(frozen=True, repr=False)
 class CentrifugeFit(Result):
-    """A reduced centrifuge test: the record, and the runs, levels and estimates behind it."""
+    """A reduced centrifuge test: the record, and the runs, levels and estimates behind it.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> test = il.simulate_centrifuge(levels="1,10", cycles=1, duration="60 s", static_duration="30 s")
+    >>> fit = il.fit_centrifuge(test.manifest, test)
+    >>> fit.calibration.parameters["x_K0"].unit
+    'rad/s/(m/s^2)'
+    """
 
     calibration: Calibration
     runs: tuple[LoadedRun, ...]
@@ -84,6 +93,14 @@ def fit_centrifuge(
     References
     ----------
     CN102636185A; IEEE Std 813, 836, 1057.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> test = il.simulate_centrifuge(levels="1,10", cycles=1, duration="60 s", static_duration="30 s")
+    >>> test.save("test")
+    >>> il.fit_centrifuge("test/manifest.toml").calibration.procedure
+    'centrifuge'
     """
     check_options(method, curve)
     if isinstance(manifest, str | PathLike):

@@ -108,6 +108,13 @@ def load_manifest(path: str | Path, name: str | None = None) -> Manifest:
         The file is missing, is not TOML, or has a key or value that a manifest cannot have.
     UnitError
         A unit is unknown or of another quantity.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.simulate_centrifuge(levels="1,10", cycles=1, duration="60 s", static_duration="30 s").save("test")
+    >>> il.load_manifest("test/manifest.toml").radius
+    2.0
     """
     name = name or str(file_name(path))
     table = load_toml(path, name, "manifest")

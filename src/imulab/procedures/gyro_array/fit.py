@@ -37,7 +37,16 @@ _SHARED = 0.5
 
 @dataclass(frozen=True, repr=False)
 class ArrayFit(Result):
-    """A calibration of an array, with the Allan curves behind it, axis by axis."""
+    """A calibration of an array, with the Allan curves behind it, axis by axis.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> still = il.simulate_array(experiment="static", duration=60.0)
+    >>> fit = il.calibrate_array(still)
+    >>> len(fit.curves), len(fit.curves[0])  # one axis of six gyros
+    (1, 6)
+    """
 
     calibration: Calibration
     curves: tuple[tuple[AllanCurve, ...], ...]

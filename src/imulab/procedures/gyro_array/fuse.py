@@ -64,6 +64,12 @@ class FuseOptions:
         Process noise of `kalman`, rad/s/sqrt(s).
     still
         From when to when the unit is known to be at rest, s: zero-rate updates take the common bias off from then on.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.FuseOptions(method="feedback", memory=0.01).method
+    'feedback'
     """
 
     method: str = "robust"
@@ -131,6 +137,13 @@ class Fused(Drawn):
         Gaps in time, and whatever else a user should know.
     block
         The samples that were fused.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fused = il.fuse(il.simulate_array(experiment="static", duration=10.0))
+    >>> fused.rate.shape == (len(fused.time), 1)
+    True
     """
 
     time: Array

@@ -90,6 +90,13 @@ class NoiseFit(Result):
         The record.
     columns
         The models by column.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_noise(il.simulate_noise(white="0.3 deg/sqrt(h)", rate=50.0, duration="10 min", columns=["gyro_z"]))
+    >>> list(fit.columns)
+    ['gyro_z']
     """
 
     calibration: Calibration

@@ -116,6 +116,13 @@ class Attitudes:
         What a user should know of how they were found.
     numbers
         Where some were set aside: the place of each among all that were found, shape (n,).
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> attitudes = il.find_attitudes(il.simulate_tumble(order=1, seed=1))
+    >>> attitudes.mean.shape, attitudes.covariance.shape, attitudes.unit
+    ((24, 3), (24, 3, 3), 'm/s^2')
     """
 
     mean: Array

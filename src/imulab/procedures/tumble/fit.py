@@ -59,6 +59,13 @@ class TumbleFit(Result):
         ``|f| - g`` of each attitude, m/s^2, shape (n,).
     down_weights
         Factors of Huber's loss, shape (n,); without it ones, and zeros for attitudes set aside.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_tumble(il.simulate_tumble(order=1, gravity=9.81362), gravity=9.81362)
+    >>> fit.residuals.shape, fit.observability.rank
+    ((24,), 9)
     """
 
     calibration: Calibration

@@ -141,6 +141,13 @@ def find_power_cycle(
         axes.
     UnitError
         The axes of one kind have different units.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> cycle = il.find_power_cycle(il.simulate_power_cycle(-20.0, sample_rate=5.0))
+    >>> abs(cycle.temperature + 20.0) < 2.0
+    True
     """
     blocks = [recording] if isinstance(recording, Recording) else recording
     pieces: list[tuple[np.ndarray, Array, Array]] = []

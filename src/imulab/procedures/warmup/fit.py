@@ -54,6 +54,14 @@ class WarmupFit(Result):
         Of power cycles, and of units.
     curves
         The cycles side by side.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> cycles = il.simulate_warmup((-20.0, 0.0, 20.0), cycles=2, rate=5.0)
+    >>> fit = il.fit_warmup(cycles, temperatures=(-20.0, 0.0, 20.0), model="exponential")
+    >>> fit.table.model
+    'exponential'
     """
 
     calibration: Calibration
@@ -128,6 +136,14 @@ def fit_warmup(
 
     Source: start-up zero error compensation of MEMS inertial instruments (patent record 38161583), and
     Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5 (1984) 300 (interpolation of amplitudes).
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> cycles = il.simulate_warmup((-20.0, 0.0, 20.0), cycles=2, rate=5.0)
+    >>> fit = il.fit_warmup(cycles, temperatures=(-20.0, 0.0, 20.0), model="exponential")
+    >>> fit.calibration.procedure
+    'warmup'
     """
     at = check_options(model, temperatures, tolerance, settling_time, exit, taper_time, pool, beyond)
     found = _cycles(cycles, reading, in_si(latest_start, "latest_start", "time", "s"), from_column=temperature_column)

@@ -47,6 +47,14 @@ class MagFit(Result):
         What the attitudes determine.
     set_aside
         Attitudes that were left out, from 0, with how they miss the others.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> recording = il.simulate_tumble(order=1, gravity=9.81362, field="48 uT")
+    >>> fit = il.fit_mag(recording, gravity=9.81362, field="48 uT")
+    >>> fit.calibration.parameters["mag_bias_x"].unit
+    'T'
     """
 
     calibration: Calibration
