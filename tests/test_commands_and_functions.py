@@ -43,6 +43,8 @@ FUNCTIONS = {
     "noise plan": il.plan_noise,
     "noise check": il.check_noise,
     "noise simulate": il.simulate_noise,
+    "thermal simulate": il.simulate_thermal,
+    "thermal fit": il.fit_thermal,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,
@@ -223,6 +225,10 @@ MADE = {
             il.simulate_noise(white=DEGREE * 0.3 / 60, gm=("20 deg/h", 60), duration=100, columns=["gyro_z"]), out
         ),
     ),
+    "thermal simulate": (
+        ["--temperatures", "-20,60", "--attitudes", "3", "--ramps", "1", "--duration", "2 min", "-o", "one"],
+        lambda out: il.simulate_thermal([-20, 60], attitudes=3, ramps=1, duration=120.0).save(out),
+    ),
     "warmup table": (
         ["warm.json", "--per-second", "-o", "one.csv"],
         lambda out: il.warmup_table("warm.json", per_second=True).save(out),
@@ -340,8 +346,9 @@ def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
         lambda: il.plan_noise(white="0.3 deg/sqrt(h)", walk="10 deg/h/sqrt(h)", gm="5 deg/h:100 s"),
         lambda: il.simulate_centrifuge(),
         lambda: il.simulate_warmup(),
+        lambda: il.simulate_thermal(attitudes=2),
     ],
-    ids=["tumble", "warmup", "centrifuge", "noise", "rig", "cycles"],
+    ids=["tumble", "warmup", "centrifuge", "noise", "rig", "cycles", "chamber"],
 )
 def test_results_show_themselves_in_twelve_lines_at_most(made):
     result = made()

@@ -57,6 +57,9 @@ if TYPE_CHECKING:
     from imulab.procedures.noise.plan import plan_noise as plan_noise
     from imulab.procedures.noise.simulate import simulate_noise as simulate_noise
     from imulab.procedures.reports import write_report as write_report
+    from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
+    from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
+    from imulab.procedures.thermal.simulate import simulate_thermal as simulate_thermal
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
     from imulab.procedures.tumble.compare import check_tumble as check_tumble
     from imulab.procedures.tumble.fit import TumbleFit as TumbleFit
@@ -100,6 +103,7 @@ _HOME = {
     "ImulabError": "errors",
     "Recording": "recording",
     "MagFit": "procedures.tumble.mag.fit",
+    "ThermalFit": "procedures.thermal.fit",
     "TumbleFit": "procedures.tumble.fit",
     "WarmupFit": "procedures.warmup.fit",
     "apply": "procedures.apply",
@@ -112,6 +116,7 @@ _HOME = {
     "NoiseFit": "procedures.noise.fit",
     "fit_noise": "procedures.noise.fit",
     "fit_centrifuge": "procedures.centrifuge.fit",
+    "fit_thermal": "procedures.thermal.fit",
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
     "fleet_status": "fleet.run",
@@ -129,6 +134,7 @@ _HOME = {
     "simulate_fleet": "procedures.tumble.simulated_line",
     "simulate_noise": "procedures.noise.simulate",
     "simulate_power_cycle": "procedures.warmup.simulate",
+    "simulate_thermal": "procedures.thermal.simulate",
     "simulate_tumble": "procedures.tumble.simulate",
     "simulate_warmup": "procedures.warmup.simulate",
     "warmup_table": "procedures.warmup.spreadsheet",

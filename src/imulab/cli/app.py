@@ -31,6 +31,7 @@ _GROUPS = {
     "centrifuge": "Measure how a gyroscope's g-sensitive drift changes with g.",
     "warmup": "Tabulate and subtract the bias after power-on.",
     "noise": "Model the noise of sensors at rest, for filters.",
+    "thermal": "Calibrate an accelerometer triad over temperature.",
     "fleet": "Calibrate many units, and watch the line.",
 }
 _SINGLE = ("convert", "export", "allan", "live", "open")
@@ -67,6 +68,8 @@ _SUMMARIES = {
     "noise plan": "Say how long to record for a wanted accuracy.",
     "noise check": "Hold a new log against a noise record.",
     "noise simulate": "Simulate a log at rest.",
+    "thermal simulate": "Simulate a unit at several temperatures.",
+    "thermal fit": "Fit one model to recordings at several temperatures.",
     "fleet run": "Calibrate every unit of a manifest that has no record.",
     "fleet status": "Say what is done, failed and missing.",
     "fleet report": "Draw the statistics of the line.",

@@ -1,0 +1,162 @@
+"""Are these recordings of one unit over temperature? One clear sentence for each way in which they may not be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from imulab.columns import triad
+from imulab.errors import DataError
+from imulab.procedures.thermal.choices import LEAST_SPAN, SETTLE
+from imulab.procedures.thermal.holds import Holds
+from imulab.recording import Recording, check_finite
+from imulab.units import parse_unit
+
+_KELVIN = 150.0  # degC; no unit is calibrated above it, and every kelvin above -120 degC is
+_JUMP, _QUICK = 5.0, 2.0  # K; s
+
+
+def prepared(recordings: Sequence[Recording], column: str | None, settle: float | None) -> list[Recording]:
+    """Return recordings with a column temperature, without what lies inside the settling time.
+
+    Raises
+    ------
+    DataError
+        They are of two units, of two sensors' temperatures, one is there twice, or their temperature cannot be.
+    """
+    given = [_with_temperature(recording, column) for recording in recordings]
+    _check_together(given)
+    for recording in given:
+        _check_temperature(recording)
+    low = min(float(recording.si("temperature").min()) for recording in given)
+    high = max(float(recording.si("temperature").max()) for recording in given)
+    if high - low < LEAST_SPAN:
+        where = given[0].name if len(given) == 1 else f"{given[0].name} and {len(given) - 1} more"
+        raise DataError(
+            f"{where}: column temperature: spans {high - low:.1f} K ({low:.1f} to {high:.1f} degC); expected at least "
+            f"{LEAST_SPAN:g} K: imulab tumble fit calibrates at one temperature"
+        )
+    return [_settled(recording, settle) for recording in given]
+
+
+def _with_temperature(recording: Recording, column: str | None) -> Recording:
+    """Return the recording with the chosen column as its temperature."""
+    candidates = [
+        name
+        for name, unit in recording.units.items()
+        if name.startswith("temperature") and parse_unit(unit).quantity == "temperature"
+    ]
+    if column is not None:
+        recording.column(column)
+        if column not in candidates:
+            raise DataError(
+                f"{recording.name}: column {column}: expected a temperature, found {recording.units[column]}"
+            )
+        return recording.with_columns(
+            {"temperature": recording.column(column)}, {"temperature": recording.units[column]}
+        )
+    if len(candidates) > 1:
+        raise DataError(
+            f"{recording.name}: {len(candidates)} columns of temperature: {' '.join(candidates)}; expected one, that "
+            "of the unit's own sensor: choose it with --temperature-column"
+        )
+    if candidates:
+        return _called(recording, candidates[0])
+    raise DataError(
+        f"{recording.name}: no column temperature; found {' '.join(recording.columns)}: expected what the unit's own "
+        "thermometer says (--temperature-column NAME where it is called otherwise)"
+    )
+
+
+def _called(recording: Recording, column: str) -> Recording:
+    return recording.with_columns({"temperature": recording.column(column)}, {"temperature": recording.units[column]})
+
+
+def _check_together(recordings: Sequence[Recording]) -> None:
+    first = recordings[0]
+    seen: dict[str, str] = {}
+    for recording in recordings:
+        for key in ("serial", "element"):
+            mine, its = first.metadata.get(key), recording.metadata.get(key)
+            if mine and its and mine != its:
+                raise DataError(
+                    f"{recording.name}: {key} {its}, but {first.name} is of {key} {mine}; expected recordings of "
+                    "one unit"
+                )
+        unit, other = first.triad_unit("accel"), recording.triad_unit("accel")
+        if unit != other:
+            raise DataError(
+                f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
+                "expected one unit"
+            )
+        if recording.source is not None:
+            if recording.source.sha256 in seen:
+                raise DataError(
+                    f"{recording.name}: the same recording as {seen[recording.source.sha256]}, which would count twice"
+                )
+            seen[recording.source.sha256] = recording.name
+
+
+def _check_temperature(recording: Recording) -> None:
+    check_finite(recording, ["temperature"])
+    values, time = recording.si("temperature"), recording.time
+    if not values.size:
+        raise DataError(f"{recording.name}: no samples")
+    if values.min() > _KELVIN:
+        raise DataError(
+            f"{recording.name}: column temperature: {values.min():.1f} to {values.max():.1f} degC cannot be; are these "
+            "kelvins? expected a title such as 'temperature [K]'"
+        )
+    if time is not None and values.size > 1:
+        jump = np.abs(np.diff(values))
+        index = int(np.argmax(jump))
+        if jump[index] > _JUMP and time[index + 1] - time[index] < _QUICK:
+            raise DataError(
+                f"{recording.name}: {recording.place(index + 1)}, column temperature: jumps from {values[index]:.1f} "
+                f"to {values[index + 1]:.1f} degC in {time[index + 1] - time[index]:.2g} s; expected a "
+                "thermometer of the unit, which follows within minutes"
+            )
+
+
+def _settled(recording: Recording, settle: float | None) -> Recording:
+    """Return what lies after the settling time: by default where the head says that time counts from power-on."""
+    time = recording.time
+    if settle is None:
+        settle = SETTLE if "power_on_temperature" in recording.metadata else 0.0
+    if time is None or not settle:
+        return recording
+    kept = time >= settle
+    if np.count_nonzero(kept) < 2:
+        raise DataError(
+            f"{recording.name}: ends {time[-1]:.0f} s after power-on, inside the settling time of {settle:g} s; "
+            "expected a longer recording, or another --settle"
+        )
+    return replace(
+        recording,
+        columns={name: values[kept] for name, values in recording.columns.items()},
+        first_row=recording.first_row + int(np.argmax(kept)),
+    )
+
+
+def check_holds(holds: Holds, gravity: float, nominal: float | None) -> None:
+    """Check that the holds can be those of accelerometers under `gravity`, m/s^2, `nominal` m/s^2 per output.
+
+    Raises
+    ------
+    DataError
+        The magnitudes are nowhere near it, or an axis is dead.
+    """
+    if nominal is not None:
+        length = np.linalg.norm(holds.mean, axis=1) * nominal
+        far = np.flatnonzero((length < gravity / 2) | (length > 2 * gravity))
+        if far.size:
+            raise DataError(
+                f"{holds.label(int(far[0]))}: columns accel_x accel_y accel_z: the specific force at rest is "
+                f"{length[far[0]]:.4g} m/s^2, expected {gravity:.4g} m/s^2: is the unit wrong?"
+            )
+    span = np.ptp(holds.mean, axis=0)
+    if span.min() <= 0:
+        name = triad("accel")[int(np.argmin(span))]
+        raise DataError(f"{holds.recordings[0].name}: column {name}: the same output in every hold: a dead axis")

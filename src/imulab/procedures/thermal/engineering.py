@@ -1,0 +1,38 @@
+"""The units in which people read a thermal record: mg, percent, mrad, and what each changes by in a kelvin."""
+
+from __future__ import annotations
+
+from imulab.procedures.procedure import Row
+from imulab.records.calibration import Calibration
+from imulab.records.comparison import Change
+from imulab.units import STANDARD_GRAVITY
+
+
+def shown(name: str, unit: str) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which a coefficient is read."""
+    kelvin = unit[unit.index("/K") :] if "/K" in unit else ""
+    if name.startswith("bias"):
+        return (1e6 if kelvin else 1e3) / STANDARD_GRAVITY, ("µg" if kelvin else "mg") + kelvin
+    if name.startswith("misalignment"):
+        return (1e6 if kelvin else 1e3), ("µrad" if kelvin else "mrad") + kelvin
+    return 1.0, unit
+
+
+def rows(record: Calibration) -> list[Row]:
+    """Return the coefficients in the units in which people read them."""
+    found = []
+    for name, p in record.parameters.items():
+        factor, unit = shown(name, p.unit)
+        u = p.standard_uncertainty
+        found.append(Row(name, p.value * factor, None if u is None else u * factor, unit))
+    return found
+
+
+def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
+    """Return the factor from SI and the unit in which the change of a coefficient is read."""
+    return shown(change.name, change.unit)
+
+
+def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
+    """Return whether a coefficient means the same in both records: powers of T - T0 with the same T0 and degree."""
+    return all(first.model[key] == second.model[key] for key in ("reference", "degrees", "output_unit"))

@@ -1,0 +1,163 @@
+"""What a thermal record shows: each parameter over temperature with its band, what is left, and how it predicts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imulab.procedures.thermal.engineering import rows as engineering_rows
+from imulab.procedures.thermal.model import AXES, GROUPS
+from imulab.procedures.thermal.record import predicted
+from imulab.procedures.thermal.sections import Thermal, thermal_of
+from imulab.records.calibration import Calibration
+from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.traces import DASHES, axis, band, rounded, scatter
+from imulab.units import STANDARD_GRAVITY
+
+_POINTS = 81
+_COLOURS = (GOOD, "#b58a1b", "#7a4f9a")
+_READ = (
+    ("bias", 1e3 / STANDARD_GRAVITY, "mg"),
+    ("scale factor", 1e6, "ppm from the middle"),
+    ("misalignment", 1e3, "mrad"),
+)
+_MICRO_G = 1e6 / STANDARD_GRAVITY
+
+
+def exhibits(record: Calibration) -> Exhibits:
+    """Return the figures and tables of a record."""
+    found = thermal_of(record)
+    low, high = found.model.range
+    temperature = np.linspace(low, high, _POINTS)
+    values, spread = predicted(record, found.model.degrees, temperature)
+    fit = found.fit
+    worst = float(spread[:3].max()) * _MICRO_G
+    degrees = ", ".join(map(str, found.model.degrees))
+    headline = (
+        f"{low:.0f} to {high:.0f} degC, degrees {degrees}: |f| - g is {plain_number(fit.rms.value * _MICRO_G, 3)} µg "
+        f"rms over {fit.holds} holds; biases are known to {plain_number(worst, 2)} µg or better."
+    )
+    tau = fit.turn_on
+    told = "not known" if tau.from_ == "unknown" else f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg ({tau.from_})"
+    facts = [
+        ("recordings", str(fit.recordings)),
+        ("temperatures", str(fit.temperatures)),
+        ("biases, power cycle to power cycle", told),
+        ("left-out temperatures", _left(found)),
+    ]
+    items: list[Figure | ReportTable] = [
+        _coefficients(record),
+        *(_over_temperature(k, temperature, values, spread) for k in range(3)),
+        _residuals(found),
+    ]
+    if fit.left_out:
+        items.append(_predicted(found))
+    if fit.degrees:
+        items.append(_compared(found))
+    return Exhibits(headline, facts, items)
+
+
+def _left(found: Thermal) -> str:
+    rows = found.fit.left_out
+    return f"{plain_number(max(row.rms for row in rows) * _MICRO_G, 2)} µg rms at worst" if rows else "–"
+
+
+def _coefficients(record: Calibration) -> ReportTable:
+    rows = []
+    for row in engineering_rows(record):
+        value, u = format_uncertain(row.value, row.standard_uncertainty)
+        rows.append([row.name, value, u, row.unit])
+    reference = record.model["reference"]["value"]
+    return ReportTable(
+        f"Coefficients of powers of T - {reference:g} degC",
+        "bias_x is the value at that temperature, bias_x_1 its change per kelvin, bias_x_2 the coefficient of the "
+        "square ... Outside the range each law is held at its end.",
+        ["parameter", "value", "u", "unit"],
+        rows,
+    )
+
+
+def _over_temperature(group: int, temperature: Any, values: Any, spread: Any) -> Figure:
+    name, factor, unit = _READ[group]
+    traces: list[dict[str, Any]] = []
+    for k in range(3):
+        own, u = values[3 * group + k], 2 * spread[3 * group + k]
+        if group == 1:
+            middle = own[len(own) // 2]
+            own, u = own / middle - 1, u / middle
+        label = GROUPS[group][1][k]
+        traces += [
+            band(temperature, (own - u) * factor, (own + u) * factor, _COLOURS[k], showlegend=False),
+            scatter(rounded(temperature), rounded(own * factor), "lines", name=label,
+                    line={"color": _COLOURS[k], "dash": DASHES[k]}),
+        ]  # fmt: skip
+    return Figure(
+        title=f"{name.capitalize()} over temperature",
+        caption="Bands: two standard uncertainties, all that power cycles differ by included.",
+        traces=traces,
+        layout={"xaxis": axis("temperature, degC"), "yaxis": axis(f"{name}, {unit}"), "legend": LEGEND},
+    )
+
+
+def _residuals(found: Thermal) -> Figure:
+    held = found.data.holds
+    rate = np.array(held.rate)
+    traces = []
+    for label, which, symbol, colour in (
+        ("warming", rate > 0, "triangle-up", "#c8553d"),
+        ("cooling", rate < 0, "triangle-down", GOOD),
+        ("steady", rate == 0, "circle", INK),
+    ):
+        if which.any():
+            traces.append(
+                scatter(
+                    rounded(np.array(held.temperature)[which]), rounded(np.array(held.residual)[which] * _MICRO_G, 4),
+                    "markers", name=label, marker={"symbol": symbol, "color": colour, "size": 7},
+                    error_y={"type": "data", "array": rounded(np.array(held.standard_uncertainty)[which] * _MICRO_G, 3),
+                             "thickness": 1},
+                )
+            )  # fmt: skip
+    return Figure(
+        title="Residual |f| - g of each hold over temperature",
+        caption="Bars: the hold's own standard uncertainty. Warming and cooling apart: where they differ, the unit "
+        "lags behind its thermometer, or does not come back.",
+        traces=traces,
+        layout={"xaxis": axis("temperature, degC"), "yaxis": axis("|f| - g, µg"), "legend": LEGEND},
+    )
+
+
+def _predicted(found: Thermal) -> ReportTable:
+    rows = [
+        [f"{row.temperature:.1f}", str(row.holds), plain_number(row.rms * _MICRO_G, 3), f"{row.chi_square:.2f}"]
+        for row in found.fit.left_out
+    ]
+    return ReportTable(
+        "Temperatures left out",
+        "| |f| - g | at each interior temperature under the fit to all others; chi-square per hold is about 1 where "
+        "the stated uncertainty holds there.",
+        ["degC", "holds", "rms, µg", "chi-square"],
+        rows,
+    )
+
+
+def _compared(found: Thermal) -> ReportTable:
+    rows, chosen = [], None
+    for number, row in enumerate(found.fit.degrees):
+        chosen = number if row.chosen else chosen
+        rows.append(
+            [
+                ", ".join(map(str, row.degrees)),
+                "–" if row.left_out is None else plain_number(row.left_out * _MICRO_G, 3),
+                "–" if row.probability is None else f"{row.probability:.3f}",
+            ]
+        )
+    return ReportTable(
+        "Degrees compared",
+        f"Of {', '.join(kind.replace('_', ' ') for kind, _ in GROUPS)} on axes {' '.join(AXES)}. A lower degree is "
+        "taken where its step is insignificant (probability above 0.01) and left-out temperatures are predicted "
+        "no worse.",
+        ["degrees", "left out, µg", "probability"],
+        rows,
+        highlight=chosen,
+    )

@@ -1,0 +1,186 @@
+"""Recordings at several temperatures to one calibration over temperature."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Unpack
+
+import numpy as np
+
+from imulab.errors import OptionError, RecordError
+from imulab.estimation.least_squares import Observability
+from imulab.gravity import Gravity, at_place, local_gravity
+from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.result import Result
+from imulab.procedures.thermal.checks import check_holds, prepared
+from imulab.procedures.thermal.choices import degrees_of
+from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose
+from imulab.procedures.thermal.holds import Holds, find_holds
+from imulab.procedures.thermal.model import GROUPS, Laws
+from imulab.procedures.thermal.record import make_record
+from imulab.procedures.thermal.solve import Problem
+from imulab.quantities import in_si
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.units import conversion_factor, parse_unit
+
+_SENSORS = [f"{kind}_{axis}" for kind, axes in GROUPS for axis in axes]
+
+
+@dataclass(frozen=True, repr=False)
+class ThermalFit(Result):
+    """Result of a calibration over temperature.
+
+    Attributes
+    ----------
+    calibration
+        The record: coefficients of each parameter in powers of T - T0, in SI, with their covariance.
+    observability
+        Rank and condition number of the joint rows.
+    degrees
+        The degrees that were compared, where they were chosen from the data.
+    left_out
+        The error at each interior temperature, predicted from all others, m/s^2.
+    """
+
+    calibration: Calibration
+    observability: Observability
+    degrees: tuple[Step, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+def fit_thermal(
+    data: Data | Sequence[Data],
+    *,
+    degrees: str | Degrees = "auto",
+    gravity: float | str | Gravity | None = None,
+    latitude: float | str | None = None,
+    height: float | str | None = None,
+    prior: Record | None = None,
+    tilt: float | str = "0.2 mrad",
+    turn_on_scatter: float | str | None = None,
+    settle: float | str | None = None,
+    temperature_column: str | None = None,
+    **reading: Unpack[Reading],
+) -> ThermalFit:
+    """Calibrate an accelerometer triad over temperature from recordings of one unit, each a power cycle.
+
+    Minimises ``sum_p w_p (|f(M_p, T_p)| - g)^2`` over the holds of all recordings, each parameter a polynomial of the
+    temperature; holds in which the temperature drifts and nothing is moved add that they share one direction.
+
+    Parameters
+    ----------
+    data
+        One recording or several: files, recordings or data frames with columns ``accel_*`` and ``temperature``.
+    degrees
+        Of bias, scale factor and misalignment, as ``"3,2,1"``; ``"auto"``: from there down, as data allow.
+    gravity, latitude, height
+        As for `fit_tumble`.
+    prior
+        A tumble record of the unit (order 1) made at a known temperature, or its file: counts as one recording.
+    tilt
+        Standard deviation of the direction of a hold in which the temperature drifts, rad.
+    turn_on_scatter
+        Standard deviation of each bias from one power cycle to the next, m/s^2; from the recordings if not given.
+    settle
+        Left out at the start of each recording, s; if not given 300 s where its head has ``power_on_temperature``.
+    temperature_column
+        The column of the unit's own thermometer, where there are several.
+    reading
+        How files are to be understood: `layout`, `topic`, `instance`, `window`, `element`.
+
+    Raises
+    ------
+    ObservabilityError
+        The holds cannot separate the coefficients; the message names them.
+    DataError
+        The recordings cannot be those of one unit over temperature.
+    OptionError
+        An option has an unknown value.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_thermal(il.simulate_thermal(attitudes=12))
+    >>> fit.calibration.model["degrees"][0]
+    3
+    """
+    single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
+    given: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
+    if not given:
+        raise OptionError("fit_thermal: data: expected one recording or more, found none")
+    wanted = degrees_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
+    recordings = prepared(
+        [as_recording(one, reading, fit_thermal) for one in given],
+        temperature_column,
+        None if settle is None else in_si(settle, "settle", "time", "s"),
+    )
+    local = local_gravity(at_place(gravity, latitude, height), recordings[0])
+    holds = find_holds(recordings)
+    unit = parse_unit(holds.unit)
+    nominal = conversion_factor(unit.symbol, "m/s^2") if unit.quantity == "acceleration" else None
+    check_holds(holds, local.value, nominal)
+    scale, zero = _scaling(holds, local.value, nominal)
+    leaning = in_si(tilt, "tilt", "angle", "rad")
+    scatter = None
+    if turn_on_scatter is not None:
+        scatter = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "m/s^2") / local.value
+    for name, value in (("tilt", leaning), ("turn_on_scatter", scatter)):
+        if value is not None and not (0 <= value < np.inf and (value > 0 or name != "tilt")):
+            raise OptionError(f"{name} {value:g}: expected a size above 0")
+    known = None if prior is None else _known(as_record(prior, "fit_thermal: prior"), holds, local.value, scale)
+    problem = _problem(holds, scale, zero, leaning, known)
+    laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
+    name = recordings[0].name + (f" and {len(recordings) - 1} more" if len(recordings) > 1 else "")
+    solution, steps, held, view = choose(problem, laws, wanted, scatter, name)
+    options = {
+        "degrees": wanted if isinstance(wanted, str) else list(wanted),
+        "gravity": local.value,
+        "tilt": leaning,
+        **({} if scatter is None else {"turn_on_scatter": scatter * local.value}),
+        **({} if settle is None else {"settle": in_si(settle, "settle", "time", "s")}),
+    }
+    record = make_record(holds, problem, solution, steps, held, view, local, scale, options, name)
+    return ThermalFit(record, view, tuple(steps), tuple(held))
+
+
+def _scaling(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array, Array]:
+    """Return the nominal scale factor, output per g, and the biases to start from, in g."""
+    if nominal is not None:
+        return np.full(3, gravity / nominal), np.zeros(3)
+    high, low = holds.mean.max(axis=0), holds.mean.min(axis=0)
+    scale = np.maximum((high - low) / 2, (high - low).max() / 20)
+    return scale, (high + low) / 2 / scale
+
+
+def _problem(holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[float, Array, Array] | None) -> Problem:
+    return Problem(
+        holds.mean / scale,
+        holds.covariance / (scale[:, None] * scale),
+        holds.temperature,
+        holds.step,
+        holds.shared,
+        holds.recording,
+        holds.group,
+        tilt,
+        zero,
+        known,
+    )
+
+
+def _known(record: Calibration, holds: Holds, gravity: float, scale: Array) -> tuple[float, Array, Array]:
+    """Return the parameters of a tumble record at its temperature, with their covariance, in units of g."""
+    if record.procedure != "tumble" or not record.covariance.names or record.model.get("order") != 1:
+        raise RecordError("prior: expected a tumble record of order 1 that states uncertainties (tumble fit --order 1)")
+    if "temperature" not in record.model:
+        raise RecordError("prior: the record does not say at which temperature it was made")
+    if record.model["output_unit"] != holds.unit:
+        raise RecordError(
+            f"prior: made for outputs in {record.model['output_unit']}, the recordings are in {holds.unit}"
+        )
+    factor = np.concatenate([np.full(3, 1 / gravity), gravity / scale, np.ones(3)])
+    values = np.array([record.value(name) for name in _SENSORS]) * factor
+    covariance = record.cov(*_SENSORS) * np.outer(factor, factor)
+    return float(record.model["temperature"]["value"]), values, covariance

@@ -1,0 +1,108 @@
+"""What code reads of a thermal record, with types."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeVar
+
+from imulab.errors import RecordError
+from imulab.records.calibration import Calibration
+from imulab.records.sections import Length, Part, Positive, Quantity, Size, part
+
+T = TypeVar("T")
+PerHold = Annotated[list[T], "holds"]
+Three = Annotated[list[T], 3]
+
+
+class Gravity(Part):
+    """``model.gravity``."""
+
+    value: Positive
+    unit: str
+
+
+class Model(Part):
+    """``model``; the range of temperature in degC."""
+
+    order: int
+    degrees: Three[int]
+    range: Annotated[list[float], 2]
+    reference: Quantity
+    gravity: Gravity
+    output_unit: str
+
+
+class LeftOut(Part):
+    """One row of ``fit.left_out``: degC, and rms in m/s^2."""
+
+    temperature: float
+    holds: int
+    rms: Size
+    chi_square: Size
+
+
+class Degrees(Part):
+    """One row of ``fit.degrees``."""
+
+    degrees: Three[int]
+    left_out: Size | None
+    probability: float | None
+    chosen: bool
+
+
+class TurnOn(Part):
+    """``fit.turn_on``: what biases and scale factors move by from one power cycle to the next."""
+
+    bias: Length
+    scale_factor: Length
+    rank: int
+    from_: str
+
+
+class Fit(Part):
+    """``fit``."""
+
+    recordings: int
+    holds: int
+    temperatures: int
+    rms: Length
+    excess: Length
+    turn_on: TurnOn
+    left_out: list[LeftOut]
+    degrees: list[Degrees]
+
+
+class Held(Part):
+    """``data.holds``: of each its recording, temperature, degC, its change, K/s, and what is left of |f| - g."""
+
+    recording: PerHold[str]
+    temperature: PerHold[float]
+    rate: PerHold[float]
+    residual: PerHold[float]
+    standard_uncertainty: PerHold[float]
+
+
+class Data(Part):
+    """``data``."""
+
+    holds: Held
+
+
+class Thermal(Part):
+    """A thermal record."""
+
+    model: Model
+    fit: Fit
+    data: Data
+
+
+def check(record: Calibration) -> None:
+    """Check the sections of a record as it is read from its file; raises RecordError."""
+    found = part(record, Thermal)
+    low, high = found.model.range
+    if not low < high:
+        raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
+
+
+def thermal_of(record: Calibration) -> Thermal:
+    """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
+    return part(record, Thermal)

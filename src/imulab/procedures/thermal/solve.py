@@ -1,0 +1,361 @@
+"""Least squares of ``|f(M_p, T_p)| = g`` over the holds of all recordings, with what is common to some of them.
+
+Rows are the magnitudes of all holds and, where holds were not moved between, their components across the common
+direction u (two unknowns for each such group). Their covariance is
+
+    V = noise + excess + sum over what several rows share: an error of the reading of the temperature, N(0, u_T^2), and
+    an offset of each bias (and scale factor) per power cycle, N(0, tau^2)
+
+tau^2 is where the generalised sum of squares exceeds that with free offsets by q, the rank that free offsets add (the
+method of moments of Mandel and Paule, for a vector). Everything is in units of g.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.estimation.least_squares import chi_square_probability, plausible_excess
+from imulab.procedures.thermal.model import Laws, forces
+from imulab.recording import Array
+
+_PASSES, _STEPS = 4, 12
+_RESTS = 1e-10
+_LOOSE = 0.01
+"""What temperature is taken to change, in g, while the fit starts."""
+_SEEN = 1e-7
+"""Share of the largest singular value below which offsets are not told from the laws."""
+
+_TELLS = 0.1
+"""Share of what an offset moves by itself that must be left beside the laws for it to tell how far offsets go."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Holds in units of g: readings (n, 3), covariances of the mean (n, 3, 3), temperature, change, as in `Holds`.
+
+    `tilt`: standard deviation of the direction of an unmoved hold, rad; `zero`: biases to start from, shape (3,);
+    `known`: a prior as rows of nine parameters, ``(temperature, values (9,), covariance (9, 9))``.
+    """
+
+    reading: Array
+    covariance: Array
+    temperature: Array
+    step: Array
+    shared: NDArray[np.bool_]
+    recording: NDArray[np.int64]
+    group: NDArray[np.int64]
+    tilt: float
+    zero: Array
+    known: tuple[float, Array, Array] | None = None
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The linearised rows at some coefficients: residuals (N,), Jacobian (N, c), own covariance as blocks.
+
+    `offsets` are the derivatives by an offset of bias (and scale factor) of each power cycle, (N, 3 R) each; `errors`
+    the loadings of errors of the temperature; `owner` the hold of each row, -1 for a prior's; `magnitude` those that
+    are magnitudes.
+    """
+
+    residual: Array
+    jacobian: Array
+    noise: Array
+    offsets: tuple[Array, Array]
+    errors: Array
+    owner: NDArray[np.int64]
+    magnitude: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Between recordings: tau of bias and scale factor, rank q that free offsets add, variance of one offset."""
+
+    tau: Array = field(default_factory=lambda: np.zeros(2))
+    rank: int = 0
+    spread: Array = field(default_factory=lambda: np.zeros(2))
+    probability: float | None = None
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What was found: coefficients (c,), their covariance, rows, excess (g), tau, and degrees of freedom of each."""
+
+    laws: Laws
+    coefficients: Array
+    covariance: Array
+    rows: Rows
+    excess: float
+    excess_freedom: float
+    scatter: Scatter
+    by_tau: Array
+    chi_square: float
+    freedom: int
+    converged: bool
+
+    def degrees_of_freedom(self, weights: Array) -> float:
+        """Return Satterthwaite's degrees of freedom of ``weights . coefficients``."""
+        whole = float(weights @ self.covariance @ weights)
+        own = 1 / self.excess_freedom if np.isfinite(self.excess_freedom) else 0.0
+        if self.scatter.rank:
+            share = float(weights @ self.by_tau @ weights) * self.scatter.spread[0] / max(whole, 1e-300)
+            own += min(share, 1.0) ** 2 / self.scatter.rank
+        return 1 / own if own > 0 else np.inf
+
+
+def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
+    """Return the rows at these coefficients; `directions` are those of the unmoved groups, shape (G, 3)."""
+    n, count = len(problem.reading), int(problem.recording.max(initial=0)) + 1
+    design = laws.design(problem.temperature)
+    parameters = design @ coefficients
+    force, change = forces(parameters, problem.reading)
+    length = np.linalg.norm(force, axis=1)
+    unit = force / length[:, None]
+    sensed = -change[:, :, 0:3] / parameters[:, None, 3:6]  # df / d reading
+    noise = np.einsum("nij,njk,nlk->nil", sensed, problem.covariance, sensed)
+    along = np.einsum("ni,nij,nj->n", unit, noise, unit)
+    lengthening = 0.5 * (np.trace(noise, axis1=1, axis2=2) - along)
+    by_heat = np.einsum("nij,njc,c->ni", change, laws.slope(problem.temperature), coefficients)
+    member = np.flatnonzero(problem.group >= 0)
+    base, across = _frames(unit, directions, problem.group)
+    basis = np.concatenate([unit[:, None, :], across], axis=1)  # (n, 3, 3): along, two across
+    rows = np.concatenate([np.arange(n) * 3, (member[:, None] * 3 + np.array([1, 2])).ravel()])
+    owner, kind = rows // 3, rows % 3
+    pick = basis[owner, kind]  # (N, 3)
+    full = np.einsum("nai,nij,nbj->nab", basis, noise, basis)
+    full[:, 1, 1] += problem.tilt**2
+    full[:, 2, 2] += problem.tilt**2
+    own = np.where(owner[:, None] == owner, full[owner[:, None], kind[:, None], kind[None, :]], 0.0)
+    jacobian = np.einsum("Ni,Nij,Njc->Nc", pick, change[owner], design[owner])
+    turns = np.zeros((len(rows), 2 * len(directions)))
+    side = kind > 0
+    turns[side, 2 * problem.group[owner[side]] + kind[side] - 1] = -1.0
+    residual = np.where(
+        side, np.einsum("Ni,Ni->N", pick, force[owner] - base[owner]), (length - 1 - lengthening)[owner]
+    )
+    felt = np.einsum("Ni,Nij->Nj", pick, change[owner])
+    offsets = tuple(_per_recording(felt[:, 3 * k : 3 * k + 3], problem.recording[owner], count) for k in (0, 1))
+    heat = np.einsum("Ni,Ni->N", pick, by_heat[owner]) * problem.step[owner]
+    errors = _errors(heat, owner, problem, count)
+    found = Rows(
+        residual, np.hstack([jacobian, turns]), own, (offsets[0], offsets[1]), errors, owner.astype(np.int64), ~side
+    )
+    return found if problem.known is None else _with_prior(found, problem.known, laws, coefficients)
+
+
+def _frames(unit: Array, directions: Array, group: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the direction of each hold's group, and two unit vectors across it, shapes (n, 3) and (n, 2, 3)."""
+    base = unit.copy()
+    base[group >= 0] = directions[group[group >= 0]]
+    helper = np.eye(3)[np.argmin(np.abs(base), axis=1)]
+    first = np.cross(base, helper)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    return base, np.stack([first, np.cross(base, first)], axis=1)
+
+
+def _per_recording(felt: Array, recording: NDArray[np.int64], count: int) -> Array:
+    columns = np.zeros((len(felt), count, 3))
+    columns[np.arange(len(felt)), recording] = felt
+    return columns.reshape(len(felt), -1)
+
+
+def _errors(heat: Array, owner: NDArray[np.int64], problem: Problem, count: int) -> Array:
+    """Loadings of the temperature's errors: one for a recording, or for each hold of one that drifts."""
+    number = np.where(problem.shared, problem.recording, count + np.arange(len(problem.recording)))[owner]
+    which, index = np.unique(number, return_inverse=True)
+    loadings = np.zeros((len(heat), len(which)))
+    loadings[np.arange(len(heat)), index] = heat
+    return loadings
+
+
+def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array) -> Rows:
+    """Add the nine parameters of a prior at its temperature, which counts as one recording."""
+    temperature, values, covariance = known
+    design = laws.design(np.array([temperature]))[0]
+    n, extra = len(rows.residual), rows.jacobian.shape[1] - laws.size
+    noise = np.zeros((n + 9, n + 9))
+    noise[:n, :n], noise[n:, n:] = rows.noise, covariance
+    offsets = []
+    for k, given in enumerate(rows.offsets):
+        own = np.zeros((n + 9, given.shape[1] + 3))
+        own[:n, :-3] = given
+        own[n + 3 * k : n + 3 * k + 3, -3:] = np.eye(3)
+        offsets.append(own)
+    return Rows(
+        np.append(rows.residual, design @ coefficients - values),
+        np.vstack([rows.jacobian, np.hstack([design, np.zeros((9, extra))])]),
+        noise,
+        (offsets[0], offsets[1]),
+        np.vstack([rows.errors, np.zeros((9, rows.errors.shape[1]))]),
+        np.append(rows.owner, np.full(9, -1)),
+        np.append(rows.magnitude, np.zeros(9, dtype=np.bool_)),
+    )
+
+
+def together(rows: Rows, excess: float, tau: Array) -> Array:
+    """Return V, shape (N, N)."""
+    whole = rows.noise + rows.errors @ rows.errors.T
+    whole[np.diag_indices(len(whole))] += np.where(rows.owner >= 0, excess, 0.0)
+    for size, offsets in zip(tau, rows.offsets, strict=True):
+        if size > 0:
+            whole += size**2 * offsets @ offsets.T
+    return whole
+
+
+def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
+    """Return what multiplies by the inverse of the Cholesky factor of V."""
+    from scipy.linalg import solve_triangular
+
+    factor = np.linalg.cholesky(together(rows, excess, tau))
+
+    def white(columns: Array) -> Array:
+        found: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
+        return found
+
+    return white
+
+
+def solve(problem: Problem, laws: Laws, *, tau: float | None = None) -> Solution:
+    """Fit the laws; `tau` is the scatter of the biases from one power cycle to the next, g, if it is known."""
+    coefficients = _start(problem, laws)
+    directions = _directions(problem, laws, coefficients)
+    excess, excess_freedom, scatter, converged = 0.0, np.inf, Scatter(), False
+    if tau is not None:
+        scatter = Scatter(np.array([tau, 0.0]))
+    for number in range(_PASSES):
+        coefficients, directions, rows, converged = _iterate(
+            problem, laws, coefficients, directions, excess, scatter.tau, _RESTS if number else 1e-6
+        )
+        if not converged:
+            break
+        before = excess, scatter.tau
+        if number < _PASSES - 1:
+            excess, excess_freedom = _excess(rows, excess)
+            if tau is None:
+                scatter = between(rows, excess)
+        if number and np.allclose([excess, *scatter.tau**2], [before[0], *before[1] ** 2], rtol=1e-3, atol=1e-16):
+            break
+    white = whitener(rows, excess, scatter.tau)
+    jacobian, residual = white(rows.jacobian), white(rows.residual)
+    inverse = np.linalg.pinv(jacobian, rcond=1e-13)
+    loading = inverse @ white(rows.offsets[0])
+    count = laws.size
+    left = residual - jacobian @ (inverse @ residual)
+    return Solution(
+        laws, coefficients, (inverse @ inverse.T)[:count, :count], rows, float(np.sqrt(excess)), excess_freedom,
+        scatter,
+        (loading @ loading.T)[:count, :count], float(left @ left), len(residual) - jacobian.shape[1], converged,
+    )  # fmt: skip
+
+
+def _start(problem: Problem, laws: Laws) -> Array:
+    """Return the coefficients to start from: those of a fit without temperature, its outliers not told yet."""
+    flat = replace(laws, degrees=(0, 0, 0))
+    start = nominal(flat, problem.zero)
+    start, _, _, _ = _iterate(problem, flat, start, _directions(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3)
+    whole, at = np.zeros(laws.size), 0
+    for group, degree in enumerate(laws.degrees):
+        for axis in range(3):
+            whole[at] = start[3 * group + axis]
+            at += degree + 1
+    return whole
+
+
+def nominal(laws: Laws, zero: Array) -> Array:
+    """Return the coefficients of an ideal sensor with these biases, shape (3,)."""
+    start, at = np.zeros(laws.size), 0
+    for group, degree in enumerate(laws.degrees):
+        for axis in range(3):
+            start[at] = (zero[axis], 1.0, 0.0)[group]
+            at += degree + 1
+    return start
+
+
+def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
+    """Mean direction of each unmoved group at these coefficients."""
+    count = int(problem.group.max(initial=-1)) + 1
+    force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
+    found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
+    found /= np.linalg.norm(found, axis=1)[:, None]
+    return found
+
+
+def _iterate(
+    problem: Problem, laws: Laws, coefficients: Array, directions: Array, excess: float, tau: Array, tolerance: float
+) -> tuple[Array, Array, Rows, bool]:
+    """Gauss-Newton steps with V as it is."""
+    rows = linearise(problem, laws, coefficients, directions)
+    for _ in range(_STEPS):
+        white = whitener(rows, excess, tau)
+        jacobian = white(rows.jacobian)
+        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
+        coefficients = coefficients + step[: laws.size]
+        directions = _directions(problem, laws, coefficients)
+        rows = linearise(problem, laws, coefficients, directions)
+        if np.abs(step[: laws.size]).max() < tolerance:
+            return coefficients, directions, rows, True
+    return coefficients, directions, rows, False
+
+
+def _excess(rows: Rows, excess: float) -> tuple[float, float]:
+    """Return the variance that magnitudes scatter with beyond their own, whatever power cycles did, and its freedom."""
+    white = whitener(rows, excess, np.zeros(2))
+    columns = white(np.hstack([rows.jacobian, rows.offsets[0]]))
+    u, values, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+    u = u[:, values > _SEEN * values[0]]
+    given = white(rows.residual)
+    left = given - u @ (u.T @ given)
+    own = np.diag(rows.noise)
+    spare = 1 - (u**2).sum(axis=1)
+    used = rows.magnitude & (rows.owner >= 0)
+    residual = left[used] * np.sqrt(own[used] + excess)
+    found, freedom = plausible_excess(residual[None], own[used][None], spare[used][None])
+    return float(found[0]), float(freedom[0])
+
+
+def between(rows: Rows, excess: float) -> Scatter:
+    """Return the scatter of biases between power cycles, and of scale factors where that is significant at 5 %."""
+    white = whitener(rows, excess, np.zeros(2))
+    residual, laws = white(rows.residual), white(rows.jacobian)
+    bias, scale = (white(given) for given in rows.offsets)
+    s, force = _modes(np.hstack([laws, bias]), scale, residual)
+    second, probability = 0.0, None
+    if len(s):
+        probability = chi_square_probability(float((force**2).sum()), len(s))
+        if probability < 0.05:
+            second = _moments(s, force)
+            white = whitener(rows, excess, np.array([0.0, second]))
+            residual, laws, bias = white(rows.residual), white(rows.jacobian), white(rows.offsets[0])
+    s, force = _modes(laws, bias, residual)
+    if not len(s):
+        return Scatter(np.array([0.0, second]), 0, np.zeros(2), probability)
+    tau = _moments(s, force)
+    typical = 1 / float(np.mean(s**2)) if len(s) else 0.0
+    return Scatter(np.array([tau, second]), len(s), np.array([tau**2 + typical, 0.0]), probability)
+
+
+def _modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, Array]:
+    """Return the singular values of the offsets beside the laws, and what the residual has along each."""
+    columns = laws / np.maximum(np.linalg.norm(laws, axis=0), 1e-300)
+    u, values, _ = np.linalg.svd(columns, full_matrices=False)
+    u = u[:, values > _SEEN * values[0]]
+    beside = offsets - u @ (u.T @ offsets)
+    v, s, _ = np.linalg.svd(beside, full_matrices=False)
+    seen = s > _TELLS * np.linalg.norm(offsets, axis=0).max()
+    return s[seen], v[:, seen].T @ (residual - u @ (u.T @ residual))
+
+
+def _moments(s: Array, force: Array) -> float:
+    """Return the tau at which ``sum force^2 / (1 + s^2 tau^2)`` is the number of terms; 0 where it is less at once."""
+    if (force**2).sum() <= len(s):
+        return 0.0
+    low, high = 0.0, float(np.sqrt((force**2).sum())) / float(s.min())
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if (force**2 / (1 + (s * middle) ** 2)).sum() > len(s) else (low, middle)
+    return 0.5 * (low + high)
