@@ -19,6 +19,7 @@ COMMANDS = {
     "warmup": "warmup fit",
     "centrifuge": "centrifuge reduce",
     "noise": "noise fit",
+    "thermal": "thermal fit",
 }
 FUNCTIONS = {
     "tumble": il.fit_tumble,
@@ -26,6 +27,7 @@ FUNCTIONS = {
     "warmup": il.fit_warmup,
     "centrifuge": il.fit_centrifuge,
     "noise": il.fit_noise,
+    "thermal": il.fit_thermal,
 }
 OF_FILES = ("layout", "topic", "instance", "window", "element", "interval", "method", "memory")
 """Options that say how files are read, what is taken of their heads, and what a record carries along."""
