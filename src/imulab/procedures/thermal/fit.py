@@ -43,6 +43,13 @@ class ThermalFit(Result):
         The degrees that were compared, where they were chosen from the data.
     left_out
         The error at each interior temperature, predicted from all others, m/s^2.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_thermal(il.simulate_thermal(attitudes=12), degrees="2,1,1")
+    >>> fit.calibration.parameters["bias_x_1"].unit
+    'm/s^2/K'
     """
 
     calibration: Calibration
