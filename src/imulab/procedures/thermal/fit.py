@@ -130,10 +130,10 @@ def fit_thermal(
     nominal = conversion_factor(unit.symbol, "m/s^2") if unit.quantity == "acceleration" else None
     check_holds(holds, local.value, nominal)
     scale, zero = _scaling(holds, local.value, nominal)
-    leaning = in_si(tilt, "tilt", "angle", "rad")
+    leaning = in_si(tilt, "tilt", "angle", "mrad")
     scatter = None
     if turn_on_scatter is not None:
-        scatter = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "m/s^2") / local.value
+        scatter = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "mg") / local.value
     for name, value in (("tilt", leaning), ("turn_on_scatter", scatter)):
         if value is not None and not (0 <= value < np.inf and (value > 0 or name != "tilt")):
             raise OptionError(f"{name} {value:g}: expected a size above 0")
