@@ -16,7 +16,7 @@ from imulab.live.formats import STRAIGHTENED, Stream, UnknownFormatError
 from imulab.live.sources import open_source
 from imulab.readers import Layout, load_layout
 from imulab.recording import Recording
-from streams import RNG, mavlink, motioncal, msp, native, terminal, ximu3
+from streams import drawn, mavlink, motioncal, msp, native, terminal, ximu3
 
 pytest.importorskip("pymavlink", reason="pymavlink is in the extra [live]")
 FORMATS: dict[str, Callable[[], tuple[list[bytes], dict[str, np.ndarray]]]] = {
@@ -54,7 +54,7 @@ def test_each_is_recognised_and_equals_what_was_sent(name):
 def test_pieces_may_be_cut_anywhere(name):
     pieces, sent = FORMATS[name]()
     whole = b"".join(pieces)
-    cuts = np.sort(RNG.integers(0, len(whole), 300)).tolist()
+    cuts = np.sort(drawn().integers(0, len(whole), 300)).tolist()
     parts = [whole[a:b] for a, b in zip([0, *cuts], [*cuts, len(whole)], strict=True)]
     _, found = decoded(parts)
     np.testing.assert_allclose(found.columns["accel_y"], sent["accel_y"], rtol=1e-15)
@@ -91,7 +91,7 @@ def _samples(name: str, pieces: list[bytes]) -> list[int]:
 def test_garbage_between_messages_of_mavlink_loses_none():
     pieces, sent = mavlink("HIGHRES_IMU", 2)
     for k in (60, 160, 250):
-        pieces[k] += bytes(RNG.integers(0, 256, 40).tolist()) + b"\xfd\xfe\xff"
+        pieces[k] += bytes(drawn().integers(0, 256, 40).tolist()) + b"\xfd\xfe\xff"
     stream, found = decoded(pieces)
     np.testing.assert_array_equal(found.columns["gyro_z"], sent["gyro_z"])
     assert stream.counts.damaged >= 3
@@ -148,7 +148,7 @@ def test_a_device_that_starts_again_goes_on_in_time():
 
 def test_arrival_times_are_straightened():
     pieces, _ = motioncal(1000)
-    stream, late = Stream("device"), RNG.exponential(0.02, 1000)
+    stream, late = Stream("device"), drawn().exponential(0.02, 1000)
     late[500] = 0.4  # a driver that slept
     arrivals = np.maximum.accumulate(0.01 * np.arange(1000) + late)
     blocks = [b for piece, t in zip(pieces, arrivals.tolist(), strict=True) for b in stream.feed(piece, t)]
@@ -235,7 +235,7 @@ def test_a_guess_of_json_lines():
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (bytes(RNG.integers(128, 255, 4000).tolist()), "garbage: .* baud rate is probably another"),
+        (bytes(drawn().integers(128, 255, 4000).tolist()), "garbage: .* baud rate is probably another"),
         (b"\0" * 3000, "garbage"),
         (b"x" * 3000, "no line of text has an end"),
         (b"hello\nworld\n" * 100, "unknown format: 'world'"),
