@@ -9,6 +9,7 @@ import pytest
 import imulab as il
 from conftest import sap5_table
 from imulab.cli import main
+from imulab.columns import triad
 from imulab.errors import ObservabilityError
 from imulab.recording import Recording
 from reference import magnetometer as reference
@@ -485,3 +486,79 @@ def test_a_target_without_magnetometers_says_that_they_are_left_out(tmp_path):
     record = il.fit_mag(table(*simulated(46)[2]), gravity=G, order=1).calibration
     il.export("ros", record, tmp_path, lossy=True, tell=told.append)
     assert any("no place for magnetometers" in message for message in told)
+
+
+def slow(recording, every=5, kept=None):
+    """The recording with a magnetometer that has a sample in one row of `every`, and no number in the others."""
+    there = np.arange(len(recording)) % every == 2
+    if kept is not None:
+        there &= kept
+    return recording.with_columns({c: np.where(there, recording.column(c), np.nan) for c in triad("mag")}, {})
+
+
+def test_a_magnetometer_slower_than_its_log_is_fitted_by_the_samples_it_has():
+    recording = il.simulate_tumble(attitudes=16, order=1, hold="3 s", gravity=G, field="48 uT")
+    every = il.fit_mag(recording, gravity=G, order=1, field="48 uT").calibration
+    record = il.fit_mag(slow(recording), gravity=G, order=1, field="48 uT").calibration
+    truth = {name[6:]: float(text) for name, text in recording.metadata.items() if name.startswith("truth_")}
+    for name in truths_named(record):
+        parameter = record.parameters[name]
+        assert abs(parameter.value - truth[name]) < 4.5 * parameter.standard_uncertainty
+        assert parameter.standard_uncertainty > 1.2 * every.parameters[name].standard_uncertainty
+    held = slow(recording)
+    held.columns["mag_y"][7] = np.inf
+    assert "row 8, column mag_y: expected a finite number, found inf" in refuse(held, order=1)
+    torn = slow(recording)
+    torn.columns["mag_z"][12] = np.nan
+    assert "row 13, column mag_z" in refuse(torn, order=1)
+
+
+def truths_named(record):
+    return [name for name in record.parameters if name.startswith("mag_") or name == "dip"]
+
+
+def test_an_attitude_without_samples_of_the_magnetometer_is_named_and_can_be_left_out():
+    recording = il.simulate_tumble(attitudes=14, order=1, hold="3 s", gravity=G, field="48 uT")
+    found = il.find_attitudes(recording)
+    silent = (recording.time < found.start[4]) | (recording.time > found.stop[4])
+    lacking = slow(recording, kept=silent)
+    said = refuse(lacking, order=1)
+    assert "attitude 5 (" in said
+    assert "0 samples of mag_x mag_y mag_z; expected 2 or more: leave it out with --drop 5" in said
+    assert il.fit_mag(lacking, gravity=G, order=1, drop=["5"]).calibration.fit["mag"]["attitudes"] == 13
+    assert "drop says which" in refuse(found.only(np.arange(12)), order=1)
+
+
+@pytest.fixture(scope="module")
+def nine_axes():
+    return il.simulate_tumble(attitudes=16, order=1, hold="3 s", gravity=G, field="48 uT")
+
+
+def test_gyroscopes_of_the_record_are_kept(nine_axes):
+    six = il.fit_gyro(il.fit_tumble(nine_axes, order=1, gravity=G), nine_axes).calibration
+    nine = il.fit_mag(nine_axes, accel=six, gravity=G, field="48 uT").calibration
+    of_gyro = [name for name in six.parameters if name.startswith("gyro_")]
+    assert len(of_gyro) > 11
+    for name in of_gyro:
+        assert nine.parameters[name] == six.parameters[name]
+    np.testing.assert_array_equal(nine.cov(*of_gyro[:12]), six.cov(*of_gyro[:12]))
+    assert nine.model["gyro_output_unit"] == "deg/s"
+    assert nine.fit["gyro"] == six.fit["gyro"]
+    assert nine.data["gyro"] == six.data["gyro"]
+    assert [w for w in nine.warnings if w.startswith("gyro")] == [w for w in six.warnings if w.startswith("gyro")]
+    corrected = il.apply(nine, nine_axes)
+    np.testing.assert_array_equal(corrected.triad("gyro"), il.apply(six, nine_axes).triad("gyro"))
+    other = il.simulate_tumble(attitudes=16, order=1, hold="3 s", gravity=G, field="48 uT", seed=9)
+    wrong = il.fit_mag(other, accel=six, gravity=G).calibration
+    assert not [name for name in wrong.parameters if name.startswith("gyro_")]
+    assert any("its gyroscopes were left out" in w for w in wrong.warnings)
+
+
+def test_a_record_of_these_attitudes_says_how_they_were_fitted_and_counts_once(nine_axes):
+    alone = il.fit_mag(nine_axes, gravity=G).calibration
+    accel = il.fit_tumble(nine_axes, gravity=G).calibration
+    both = il.fit_mag(nine_axes, accel=accel, gravity=G).calibration
+    assert both.parameters == alone.parameters
+    assert both.covariance == alone.covariance
+    assert "accel: a record of order 0" in refuse(nine_axes, order="auto", accel=il.fit_tumble(nine_axes, order=0))
+    assert "cross terms" in refuse(nine_axes, order="auto", accel=il.fit_tumble(nine_axes, order=1, cross=True))

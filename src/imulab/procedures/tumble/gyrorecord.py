@@ -80,6 +80,29 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
     )
 
 
+def with_gyro_of(record: Calibration, known: Calibration) -> Calibration:
+    """Return the record with the gyroscope triad of another record of the same unit, if that has one."""
+    if "gyro_output_unit" not in known.model:
+        return record
+    names = [name for name in known.covariance.names if name.startswith("gyro_")]
+    joined = _diagonal_blocks(record.covariance.array(), known.covariance.block(names))
+    sources = {source.file: source for source in (*known.sources, *record.sources)}
+    return replace(
+        record,
+        parameters={
+            **record.parameters,
+            **{name: p for name, p in known.parameters.items() if name.startswith("gyro_")},
+        },
+        covariance=Covariance((*record.covariance.names, *names), tuple(map(tuple, joined.tolist()))),
+        model={**record.model, "gyro_output_unit": known.model["gyro_output_unit"]},
+        sources=tuple(sources.values()),
+        fit={**record.fit, **{key: part for key, part in known.fit.items() if key == "gyro"}},
+        data={**record.data, **{key: part for key, part in known.data.items() if key == "gyro"}},
+        warnings=(*record.warnings, *(w for w in known.warnings if w.startswith("gyro"))),
+        verdict=UNJUDGED,
+    )
+
+
 def _parameters(fit: GyroFit) -> dict[str, Parameter]:
     sigma = np.sqrt(np.diag(fit.covariance))
     found = {f"gyro_bias_{a}": Parameter(float(fit.bias[i]), float(sigma[9 + i]), "rad/s") for i, a in enumerate(_AXES)}

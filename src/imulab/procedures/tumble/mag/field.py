@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.errors import DataError
-from imulab.estimation.rows import leave_out
+from imulab.errors import DataError, OptionError
+from imulab.estimation.rows import LeftOut, leave_out
 from imulab.procedures.tumble.attitude_table import stated_covariance
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes
 from imulab.recording import Array, Recording, check_finite
@@ -28,8 +29,8 @@ _FIELDS = (5e-6, 2e-4)
 class FieldMeans:
     """Outputs of the magnetometers in each attitude.
 
-    `mean` has shape (n, 3), `covariance` (n, 3, 3), or None for a table that does not state it; `unit` is that of the
-    columns, `notes` what was left out.
+    `mean` has shape (n, 3), `covariance` (n, 3, 3), or None for a table that does not state it, not a number where an
+    attitude was not asked for; `unit` is that of the columns, `notes` what was left out.
     """
 
     mean: Array
@@ -38,13 +39,18 @@ class FieldMeans:
     notes: tuple[str, ...] = ()
 
 
-def field_means(attitudes: Attitudes) -> FieldMeans:
-    """Return the magnetometers' outputs in attitudes of a recording that has them.
+def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
+    """Return the magnetometers' outputs in the attitudes `kept`, from 0, of a recording that has them.
+
+    A magnetometer that is slower than its log has samples in some of the rows, and no numbers in the others.
 
     Raises
     ------
     DataError
-        No such columns, a constant or saturated axis, outputs in one plane, too few attitudes.
+        No such columns, no samples in an attitude, a constant or saturated axis, outputs in one plane, too few
+        attitudes.
+    OptionError
+        Some of the attitudes were taken out by hand.
     UnitError
         The columns have different units.
     """
@@ -62,44 +68,73 @@ def field_means(attitudes: Attitudes) -> FieldMeans:
             f"{recording.name}: columns {' '.join(names)}: expected a unit of field or output such as uT, mgauss or "
             f"count, found {unit!r}"
         )
-    check_finite(recording, names)
-    if attitudes.pieces is None and attitudes.trace is None:
+    if attitudes.pieces is not None:
+        found = _of_stretches(attitudes, kept, recording, names, unit)
+    elif attitudes.trace is None:
         found = _of_table(attitudes, recording, names, unit)
     else:
-        found = _of_stretches(attitudes, recording, names, unit)
-    _check(found, attitudes, names)
+        raise OptionError(f"{recording.name}: expected all attitudes that were found; drop says which to leave out")
+    _check(replace(found, mean=found.mean[kept]), recording.name, names)
     return found
 
 
 def _of_table(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
+    check_finite(recording, names)
     rows = attitudes.start.astype(np.int64) - recording.first_row
     covariance = stated_covariance(recording, names, unit)
     return FieldMeans(recording.triad("mag")[rows], None if covariance is None else covariance[rows], unit)
 
 
-def _of_stretches(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:
+def _of_stretches(
+    attitudes: Attitudes, kept: NDArray[np.intp], recording: Recording, names: list[str], unit: str
+) -> FieldMeans:
     """Means over the stretches at rest, and their covariance from batches, shrunk towards what all have in common."""
-    left_out = leave_out(recording, names)
+    left_out, there = _readings(recording, names)
     samples = left_out.recording.triad("mag")
     pieces = attitudes.pieces
     assert pieces is not None
-    mean, own = np.empty((len(attitudes), 3)), np.empty((len(attitudes), 3, 3))
+    mean, own = np.full((len(attitudes), 3), np.nan), np.full((len(attitudes), 3, 3), np.nan)
+    freedom = np.ones(len(attitudes))
     rest = np.zeros(len(samples), dtype=np.bool_)
-    for number in range(len(attitudes)):
+    for number in kept.tolist():
         index = np.concatenate([np.arange(a, b) for a, b, at in pieces.tolist() if at == number])
+        index = index[there[index]]
+        if len(index) < 2:
+            raise DataError(
+                f"{recording.name}: {attitudes.label(number)}: {len(index)} samples of {' '.join(names)}; expected 2 "
+                f"or more: leave it out with --drop {number + 1}"
+            )
         rest[index] = True
         mean[number] = samples[index].mean(axis=0)
-        batches = np.array([samples[part].mean(axis=0) for part in np.array_split(index, min(_BATCHES, len(index)))])
-        own[number] = np.cov(batches.T) / len(batches)
-    freedom = _BATCHES - 1.0
+        parts = np.array_split(index, min(_BATCHES, len(index)))
+        batches = np.array([samples[part].mean(axis=0) for part in parts])
+        own[number], freedom[number] = np.cov(batches.T) / len(batches), len(batches) - 1.0
     level = np.trace(own, axis1=1, axis2=2)
-    usual = level <= 3 * np.median(level)
-    covariance = (freedom * own + POOL_DEGREES * own[usual].mean(axis=0)) / (freedom + POOL_DEGREES)
+    usual = level <= 3 * np.median(level[kept])
+    weight = freedom[:, None, None]
+    covariance = (weight * own + POOL_DEGREES * own[usual].mean(axis=0)) / (weight + POOL_DEGREES)
     step = np.array([_step(samples[rest, axis]) for axis in range(3)])
     covariance[:, range(3), range(3)] += np.where(
-        covariance[:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
+        covariance[kept][:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
     )
     return FieldMeans(mean, covariance, unit, tuple(left_out.notes(rest)))
+
+
+def _readings(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[np.bool_]]:
+    """Return what is left out among the rows that hold a sample of the magnetometers, and which rows these are."""
+    there = np.logical_not(np.isnan(recording.triad("mag")).all(axis=1))
+    filled = {name: np.where(there, recording.column(name), 0.0) for name in names}
+    check_finite(recording.with_columns(filled, {}), names)
+    if there.all():
+        return leave_out(recording, names), there
+    found = leave_out(replace(recording, columns={name: recording.column(name)[there] for name in names}), names)
+    columns = {name: np.array(recording.column(name)) for name in names}
+    kinds = {kind: np.zeros(len(recording), dtype=np.bool_) for kind in found.kinds}
+    for name in names:
+        columns[name][there] = found.recording.column(name)
+    for kind, rows in found.kinds.items():
+        kinds[kind][there] = rows
+    return LeftOut(recording.with_columns(columns, {}), found.names, kinds), there
 
 
 def _step(values: Array) -> float:
@@ -108,8 +143,8 @@ def _step(values: Array) -> float:
     return float(np.diff(different).min()) if len(different) > 1 else 0.0
 
 
-def _check(found: FieldMeans, attitudes: Attitudes, names: list[str]) -> None:
-    name, n = attitudes.recording.name, len(attitudes)
+def _check(found: FieldMeans, name: str, names: list[str]) -> None:
+    n = len(found.mean)
     if n < FEWEST:
         raise DataError(f"{name}: {n} attitudes; a magnetometer needs {FEWEST} or more, better 16, at several headings")
     span = np.ptp(found.mean, axis=0)

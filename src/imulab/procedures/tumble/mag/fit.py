@@ -16,6 +16,7 @@ from imulab.procedures.inputs import Reading, Record, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.choices import HEMISPHERES, LOSSES, MAG_ORDERS
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
+from imulab.procedures.tumble.gyrorecord import with_gyro_of
 from imulab.procedures.tumble.mag.field import FEWEST
 from imulab.procedures.tumble.mag.judge import FALSE_ALARM, Disturbed, Seen, leave_one_out, most_disturbed, seen
 from imulab.procedures.tumble.mag.prepare import check_seen, prepare
@@ -90,7 +91,7 @@ def fit_mag(
         A file, recording, data frame or arrays by name with both triads; without a time each row is an attitude.
     accel
         Tumble record of the accelerometers, or its file: of these data it says how they were fitted; of another test it
-        is prior knowledge.
+        is prior knowledge. Gyroscopes that it holds are kept.
     same_direction
         Groups of attitudes, numbers from 1 or texts such as ``"9-16"``, in which one axis of the body points the same
         way.
@@ -165,6 +166,8 @@ def fit_mag(
     }  # fmt: skip
     given = {name: value for name, value in options.items() if value not in (None, [])}
     record = with_mag(ready, joint, what, aside, given)
+    if known is not None and not ready.notes:
+        record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
 
 

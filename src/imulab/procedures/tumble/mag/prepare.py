@@ -24,7 +24,7 @@ from imulab.procedures.tumble.mag.solve import Pair
 from imulab.procedures.tumble.mag.start import find_start
 from imulab.procedures.tumble.prior import known_of
 from imulab.procedures.tumble.record import Scaling
-from imulab.procedures.tumble.sections import model_of
+from imulab.procedures.tumble.sections import data_of, model_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -44,23 +44,19 @@ def prepare(
     drop: Sequence[int | str],
 ) -> Ready:
     """Fit the accelerometers by themselves, find where the joint fit starts, and refuse what it cannot see."""
-    means = field_means(attitudes)
     name, count = attitudes.recording.name, len(attitudes)
     dropped = _numbers(drop, count, "drop")
     kept = np.setdiff1d(np.arange(count), dropped)
+    means = field_means(attitudes, kept)
     groups = [_numbers(group, count, "same-direction") for group in same_direction]
     if known is not None:
         check_prior(known)
     local = local_gravity(_gravity(gravity, known), attitudes.recording)
-    if known is not None:
-        if str(order) not in ("auto", str(model_of(known).order)):
-            raise OptionError(f"order {order} with a record of order {model_of(known).order}: expected that or auto")
-        order = model_of(known).order
-    order = order if order == "auto" else int(order)
+    order, loss = _as_before(known, order, attitudes)
     used = attitudes.only(kept) if dropped.size else attitudes
     check_attitudes(used, local.value)
     scaling = nominal_scaling(used, local.value)
-    estimate = estimate_triad(used, local, scaling, order, "auto")
+    estimate = estimate_triad(used, local, scaling, order, loss)
     kept = kept[estimate.found.aside.others(len(kept))] if estimate.found.aside.index else kept
     if len(kept) < FEWEST:
         raise DataError(f"{name}: {len(kept)} attitudes are left; a magnetometer needs {FEWEST} or more")
@@ -80,7 +76,29 @@ def prepare(
         check_seen(seen(pair, start), kept, name)
     except np.linalg.LinAlgError:
         raise DataError(f"{name}: the attitudes determine no field: are both triads of the same attitudes?") from None
-    return Ready(estimate, scaling, local, means, kept, mag, pair, start, notes)
+    return Ready(estimate, scaling, local, means, kept, mag, pair, start, order, loss, notes)
+
+
+def _as_before(known: Calibration | None, order: int | str, attitudes: Attitudes) -> tuple[int | str, str]:
+    """Return order and loss of the accelerometers' own fit: as asked, or as their record says that they were fitted."""
+    if known is None:
+        return order if order == "auto" else int(order), "auto"
+    own = model_of(known).order
+    if own < 1:
+        raise OptionError(f"accel: a record of order {own}; magnetometers need one of 1 or more")
+    if str(order) not in ("auto", str(own)):
+        raise OptionError(f"order {order} with a record of order {own}: expected that or auto")
+    if not made_of(known, attitudes):
+        return own, "auto"
+    asked, loss = known.options.get("order"), known.options.get("loss")
+    return "auto" if asked == "auto" else own, "square" if loss == "square" else "auto"
+
+
+def made_of(known: Calibration, attitudes: Attitudes) -> bool:
+    """Return whether a record was made from these attitudes, or from the recording that they are from."""
+    held = data_of(known).attitudes
+    same = held is not None and np.array_equal(held.mean, attitudes.mean)
+    return same or made_from(known, attitudes.recording)
 
 
 def _numbers(given: str | Sequence[int | str], count: int, option: str) -> NDArray[np.intp]:
@@ -124,7 +142,7 @@ def _prior(
     known: Calibration | None, attitudes: Attitudes, estimate: Estimate, scaling: Scaling, local: Gravity
 ) -> tuple[tuple[Array, Array] | None, list[str]]:
     """Mean and rows of a record of another test as prior knowledge, unless these attitudes contradict it."""
-    if known is None or made_from(known, attitudes.recording):
+    if known is None or made_of(known, attitudes):
         return None, []
     if model_of(known).output_unit != attitudes.unit:
         raise RecordError(
@@ -138,9 +156,10 @@ def _prior(
         distance = float(off @ np.linalg.solve(own.covariance + held.covariance, off))
         p = chi_square_probability(distance, len(off))
         if p < _DISAGREES:
+            gyroscopes = "; its gyroscopes were left out" if "gyro_output_unit" in known.model else ""
             return None, [
                 f"mag: the accelerometers of {attitudes.recording.name} contradict their record (p = {p:.2g}): it was "
-                "not used; they were calibrated anew from these attitudes"
+                f"not used; they were calibrated anew from these attitudes{gyroscopes}"
             ]
     return (held.mean, np.linalg.inv(np.linalg.cholesky(held.covariance))), []
 

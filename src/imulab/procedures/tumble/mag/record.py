@@ -38,7 +38,7 @@ def with_mag(
     """Return the record of both triads: parameters, covariance, and residuals of |m| and dip of each attitude."""
     accel = make_record(
         ready.estimate, ready.gravity, ready.scaling,
-        {"order": ready.estimate.problem.order, "method": "norm", "loss": "auto", "gravity": ready.gravity.value},
+        {"order": ready.order, "method": "norm", "loss": ready.loss, "gravity": ready.gravity.value},
     )  # fmt: skip
     names, values, matrix, units = _values(ready, joint)
     parameters = _parameters(names, values, matrix, units, joint.freedom[: len(names)])

@@ -93,6 +93,8 @@ class Ready:
         How the magnetometers are scaled.
     pair, start
         What is fitted, and from where.
+    order, loss
+        As asked for the accelerometers by themselves.
     notes
         What a user should know already.
     """
@@ -105,4 +107,6 @@ class Ready:
     mag: MagScaling
     pair: Pair
     start: Array
+    order: int | str
+    loss: str
     notes: list[str] = field(default_factory=list)
