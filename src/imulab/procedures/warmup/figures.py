@@ -9,7 +9,7 @@ import numpy as np
 from imulab.procedures.warmup.engineering import engineering_unit
 from imulab.procedures.warmup.grid import axis_style, grid, temperature_colour, temperature_mark
 from imulab.procedures.warmup.model import WarmupTable, evaluate, record_table
-from imulab.procedures.warmup.sections import Cycle, Fit, drawn_of
+from imulab.procedures.warmup.sections import Cycle, Fit, Warmup, drawn_of
 from imulab.procedures.warmup.tables import (
     axes_by_kind,
     largest_text,
@@ -45,7 +45,8 @@ def exhibits(record: Calibration) -> Exhibits:
     if not record.fit:
         return _exhibits_of_table(table)
     by_kind = axes_by_kind(table)
-    fit = drawn_of(record).fit
+    drawn = drawn_of(record)
+    fit = drawn.fit
     chosen, none = fit.row(), fit.row("none")
     head, (label, factor) = next(iter(by_kind.values())), engineering_unit(table.units[0])
     before, after = (rms_of(row.training, head) * factor for row in (none, chosen))
@@ -65,16 +66,16 @@ def exhibits(record: Calibration) -> Exhibits:
     ]
     items: list[Figure | ReportTable] = []
     for kind, index in by_kind.items():
-        items.append(models_table(record, table, kind, index))
+        items.append(models_table(drawn, table, kind, index))
     if fit.repeatability.unit is not None:
         items.append(units_table(fit, table, by_kind, fit.repeatability.unit))
     for kind, index in by_kind.items():
-        items.append(_cycles(record, table, kind, index))
+        items.append(_cycles(drawn, table, kind, index))
     for kind, index in by_kind.items():
-        items.append(_residuals(record, table, kind, index))
+        items.append(_residuals(drawn, table, kind, index))
     for kind, index in by_kind.items():
-        items.append(_by_temperature(record, table, kind, index))
-    items += [_over_temperature(table), tests_table(record, table)]
+        items.append(_by_temperature(drawn, table, kind, index))
+    items += [_over_temperature(table), tests_table(drawn, table)]
     return Exhibits(
         headline=f"The {chosen.model} table leaves {left} of "
         f"{plain_number(before, 2)} {label} rms in the {table.settling_time:g} s after power-on"
@@ -125,13 +126,13 @@ def _exhibits_of_table(table: WarmupTable) -> Exhibits:
     )
 
 
-def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
+def _cycles(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
     time = np.linspace(0.0, table.settling_time * (1 - 1e-9), _POINTS)
     cells: list[list[dict[str, Any]]] = []
     for i in index:
         traces: list[dict[str, Any]] = []
-        for cycle in drawn_of(record).data.cycles:
+        for cycle in drawn.data.cycles:
             at = cycle.calibration_temperature
             colour, mark = temperature_colour(at, table.temperatures), temperature_mark(at, table.temperatures)
             traces.append(
@@ -169,10 +170,10 @@ def _cycles(record: Calibration, table: WarmupTable, kind: str, index: list[int]
     )
 
 
-def _residuals(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
+def _residuals(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
     cells: list[list[dict[str, Any]]] = [[] for _ in index]
-    data = drawn_of(record).data
+    data = drawn.data
     for at in data.knots:
         members = [cycle for cycle in data.cycles if cycle.calibration_temperature == at]
         time, left = _mean_residual(table, members)
@@ -218,9 +219,8 @@ def _inside(table: WarmupTable, temperature: float) -> float:
     return float(np.clip(temperature, table.temperatures[0], table.temperatures[-1]))
 
 
-def _by_temperature(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> Figure:
+def _by_temperature(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> Figure:
     label, factor = engineering_unit(table.units[index[0]])
-    drawn = drawn_of(record)
     fit, knots = drawn.fit, drawn.data.knots
     chosen = fit.row()
     lines = [

@@ -7,18 +7,17 @@ import numpy as np
 from imulab.estimation.ranked import rms
 from imulab.procedures.warmup.engineering import engineering_unit
 from imulab.procedures.warmup.model import WarmupTable
-from imulab.procedures.warmup.sections import Fit, drawn_of, model_of
-from imulab.records.calibration import Calibration
+from imulab.procedures.warmup.sections import Fit, Warmup
 from imulab.report.elements import ReportTable, plain_number
 
 _LOST = "in noise"
 
 
-def models_table(record: Calibration, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
+def models_table(drawn: Warmup, table: WarmupTable, kind: str, index: list[int]) -> ReportTable:
     """Return the models that were compared, over the axes of one kind."""
     label, factor = engineering_unit(table.units[index[0]])
     rows, highlight = [], None
-    fit = drawn_of(record).fit
+    fit = drawn.fit
     for number, row in enumerate(fit.models):
         if row.chosen:
             highlight = number
@@ -36,7 +35,7 @@ def models_table(record: Calibration, table: WarmupTable, kind: str, index: list
             ]
         )
     floor = rms_text(fit.repeatability.cycle, index, factor, f" {label}")
-    what = "unit" if model_of(record).pool == "type" else "cycle"
+    what = "unit" if drawn.model.pool == "type" else "cycle"
     return ReportTable(
         title=f"Models compared, {kind}, {label}",
         caption="Root mean square over all axes and the time t after power-on up to T_M, from which the unit is "
@@ -73,11 +72,10 @@ def units_table(fit: Fit, table: WarmupTable, kinds: dict[str, list[int]], units
     )
 
 
-def tests_table(record: Calibration, table: WarmupTable) -> ReportTable:
+def tests_table(drawn: Warmup, table: WarmupTable) -> ReportTable:
     """Return what each calibration temperature showed, over the axes of the first kind."""
     label, factor = engineering_unit(table.units[0])
     head = next(iter(axes_by_kind(table).values()))
-    drawn = drawn_of(record)
     chosen = drawn.fit.row()
     rows = []
     for k, at in enumerate(drawn.data.knots):
