@@ -53,7 +53,7 @@ def test_a_command_has_the_option_as_defined(name, option):
 
 @pytest.mark.parametrize(("name", "option"), CASES, ids=lambda case: getattr(case, "name", case))
 def test_the_function_has_the_same_default(name, option):
-    parameter = inspect.signature(FUNCTIONS[name]).parameters.get(option.name)
+    parameter = inspect.signature(FUNCTIONS[name]).parameters.get(option.keyword)
     if parameter is None:
         assert option.name in OF_FILES
         return

@@ -201,7 +201,8 @@ def labelled(label: str, names: Iterable[str]) -> Iterator[None]:
         word = str(error).partition(" ")[0].rstrip(":")
         if word not in names:
             raise
-        shown = word.strip("_").replace("_", "-") if label.startswith("--") else word
+        shown = word.strip("_")
+        shown = shown.replace("_", "-") if label.startswith("--") else shown
         raise type(error)(label.format(shown) + str(error)[len(word) :]) from None
 
 

@@ -28,7 +28,7 @@ def with_options(options: Sequence[Option]) -> Callable[[Callable[..., Any]], Ca
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         def run(**given: Any) -> Any:
-            texts = {option.name: _text(given.pop(option.name)) for option in options}
+            texts = {option.name: _text(given.pop(option.keyword)) for option in options}
             return command(options=texts, **given)
 
         parameters: list[Parameter] = []
@@ -47,11 +47,11 @@ def _parameter(option: Option) -> Parameter:
     """An option as a parameter of a command, which typer reads."""
     if option.switch:
         kind: Any = Annotated[bool, typer.Option(option.flag, help=option.help)]
-        return Parameter(option.name, Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        return Parameter(option.keyword, Parameter.KEYWORD_ONLY, default=False, annotation=kind)
     offered = _beginning(option.choices) if option.choices else None
     info = typer.Option(option.flag, metavar=option.shows, help=option.help, autocompletion=offered)
     return Parameter(
-        option.name, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info]
+        option.keyword, Parameter.KEYWORD_ONLY, default=option.default, annotation=Annotated[str | None, info]
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from keyword import iskeyword
 from typing import Any
 
 from imulab.errors import OptionError, listed
@@ -49,6 +50,11 @@ class Option:
     choices: tuple[str, ...] = ()
     switch: bool = False
     names_file: bool = False
+
+    @property
+    def keyword(self) -> str:
+        """Its name as a parameter in Python, which ``with`` cannot be."""
+        return self.name + "_" * iskeyword(self.name)
 
     @property
     def flag(self) -> str:

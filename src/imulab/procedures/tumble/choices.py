@@ -14,3 +14,5 @@ SENSITIVITIES = ("auto", "yes", "no")
 CLOCKS = ("gyro", "accel")
 MAG_ORDERS = ("1", "2", "auto")
 HEMISPHERES = ("north", "south")
+FURTHER = ("gyro", "mag")
+"""Triads that can be fitted on the attitudes of the accelerometers."""

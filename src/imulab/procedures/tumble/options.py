@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Sequence
 
 import numpy as np
 
 from imulab.errors import OptionError, listed
-from imulab.procedures.tumble.choices import FROM_DATA, HIGHEST_ORDER, LOSSES, METHODS
+from imulab.procedures.tumble.choices import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, METHODS
 from imulab.procedures.tumble.montecarlo import check_trials
 from imulab.procedures.tumble.prior import GROUPS
+
+_FAINTEST, _STRONGEST = 1e-6, 1e-2  # T
 
 
 def check_method(method: str, order: int | str) -> None:
@@ -37,6 +40,8 @@ def check_options(
     nonlinearity: tuple[float, float] | None = None,
     cross: bool = False,
     threshold: Sequence[float] | None = None,
+    further: Sequence[str] = (),
+    field: float | None = None,
 ) -> None:
     """Check what can be checked before there is data.
 
@@ -54,13 +59,7 @@ def check_options(
     if loss == "huber" and method == "linearised":
         raise OptionError("loss huber needs method norm, found method linearised")
     if threshold is not None:
-        if method != "linearised":
-            raise OptionError(f"threshold needs method linearised, found method {method}")
-        if len(threshold) != 3 or not all(0 < value < np.inf for value in threshold):
-            raise OptionError(
-                f"threshold {' '.join(f'{value:g}' for value in threshold)}: expected three changes above 0, of scale "
-                "factors (1), biases (m/s^2) and misalignments (rad)"
-            )
+        _check_threshold(threshold, method)
     if with_prior and (method != "norm" or loss == "huber"):
         raise OptionError(f"a prior needs method norm and loss square or auto, found method {method} and loss {loss}")
     if ageing and not with_prior:
@@ -81,6 +80,14 @@ def check_options(
         raise OptionError(
             f"cross needs method norm and an order of 1 to {HIGHEST_ORDER}, and goes with no prior and no monte-carlo"
         )
+    if "mag" in further:
+        _check_with_mag(
+            method=None if method == "norm" else method, order=order if order in (0, "blend") else None,
+            cross=cross or None, prior=with_prior or None, nonlinearity=nonlinearity, monte_carlo=monte_carlo,
+        )  # fmt: skip
+    check_field(field)
+    if field is not None and "mag" not in further:
+        raise OptionError("field without magnetometers: expected it with mag, or with gyro,mag")
     if monte_carlo is None:
         return
     check_trials(monte_carlo)
@@ -88,3 +95,53 @@ def check_options(
         raise OptionError(f"monte-carlo needs method norm, found method {method}")
     if with_prior:
         raise OptionError("monte-carlo draws the attitudes anew, not a prior: expected one of the two options")
+
+
+def _check_threshold(threshold: Sequence[float], method: str) -> None:
+    if method != "linearised":
+        raise OptionError(f"threshold needs method linearised, found method {method}")
+    if len(threshold) != 3 or not all(0 < value < np.inf for value in threshold):
+        raise OptionError(
+            f"threshold {' '.join(f'{value:g}' for value in threshold)}: expected three changes above 0, of scale "
+            "factors (1), biases (m/s^2) and misalignments (rad)"
+        )
+
+
+def further_triads(given: str | Sequence[str], called: str) -> tuple[str, ...]:
+    """Return the names of further triads, given as a text such as ``"gyro,mag"`` or one by one.
+
+    Raises
+    ------
+    OptionError
+        There is no such triad, or one is named twice.
+    """
+    names = tuple(name.strip() for name in given.split(",")) if isinstance(given, str) else tuple(given)
+    for name in names:
+        if name not in FURTHER:
+            raise OptionError(f"{called} {name!r}: expected gyro, mag or both, as in gyro,mag")
+    if len(set(names)) < len(names):
+        raise OptionError(f"{called} {','.join(names)}: expected each triad once")
+    return names
+
+
+def _check_with_mag(**others: object) -> None:
+    """Refuse what the joint fit of accelerometers and magnetometers does not have."""
+    for name, value in others.items():
+        if value is not None:
+            shown = name.replace("_", "-") + (f" {value}" if isinstance(value, str | int) and value is not True else "")
+            raise OptionError(
+                f"with_ mag does not go with {shown}: both triads are fitted together by method norm, order auto or 1 "
+                "to 5, from these attitudes alone"
+            )
+
+
+def check_field(field: float | None) -> None:
+    """Check that a magnitude, T, can be that of the field.
+
+    Raises
+    ------
+    OptionError
+        It is far from any on Earth.
+    """
+    if field is not None and not (isinstance(field, numbers.Real) and _FAINTEST < field < _STRONGEST):
+        raise OptionError(f"field {field:g} T: expected its magnitude, such as 48.2uT (25 to 65 uT on Earth)")

@@ -13,6 +13,7 @@ from imulab.procedures.options import (
     Option,
     choice,
     file_option,
+    measure,
     part_of,
     read_options,
     switch,
@@ -20,7 +21,7 @@ from imulab.procedures.options import (
     whole,
 )
 from imulab.procedures.procedure import Files, Task
-from imulab.procedures.tumble.choices import LOSSES, METHODS, ORDERS
+from imulab.procedures.tumble.choices import FURTHER, LOSSES, METHODS, ORDERS
 from imulab.quantities import labelled, quantity
 from imulab.units import STANDARD_GRAVITY
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-_NAMED = ("order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo")
+_NAMED = ("order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo", "with_", "field")
 _CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
 
 
@@ -54,6 +55,8 @@ def _fit(
         monte_carlo=values["monte_carlo"],
         cross=values["cross"],
         threshold=values["threshold"],
+        with_=values["with"],
+        field=values["field"],
         progress=progress,
     ).calibration
 
@@ -108,6 +111,12 @@ def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     return record
 
 
+def _further(text: str, called: str) -> tuple[str, ...]:
+    from imulab.procedures.tumble.options import further_triads
+
+    return further_triads(text, called)
+
+
 def _order(text: str, called: str) -> int | str:
     if text not in ORDERS:
         raise OptionError(f"{called} {text!r}: expected one of {listed(ORDERS, text)}")
@@ -148,6 +157,14 @@ OPTIONS = (
         _threshold,
         shows="5ppm,2ug,3arcsec",
     ),
+    Option("with", "Further triads on the same attitudes, in one record.", _further, shows="gyro,mag", choices=FURTHER),
+    measure(
+        "field",
+        "With mag: magnitude of the local field, uT; else the field is 1.",
+        "magnetic field",
+        "uT",
+        shows="48.2uT",
+    ),
     *READING,
     ELEMENT,
 )
@@ -158,12 +175,13 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.procedures.tumble.options import check_options
 
     values = read_options(OPTIONS, texts, label)
-    values["ageing"] = values["ageing"] or ()
+    values["ageing"], values["with"] = values["ageing"] or (), values["with"] or ()
     with labelled(label, _NAMED):
         check_options(
             values["order"], values["method"], values["loss"],
             monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
             nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
+            further=values["with"], field=values["field"],
         )  # fmt: skip
     values["gravity"] = gravity_option(values["gravity"], values["latitude"], values["height"], label)
     return {**values, "part": part_of(values)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Unpack
@@ -23,6 +22,7 @@ from imulab.procedures.tumble.mag.prepare import check_seen, prepare
 from imulab.procedures.tumble.mag.record import with_mag
 from imulab.procedures.tumble.mag.scaling import Ready
 from imulab.procedures.tumble.mag.solve import Joint, solve
+from imulab.procedures.tumble.options import check_field
 from imulab.quantities import in_si
 from imulab.records.calibration import Calibration
 
@@ -31,7 +31,6 @@ _GAIN = 0.9
 _SIGNIFICANT = 0.01
 _MOST_ASIDE = 5
 """At most one attitude of so many is set aside."""
-_FAINTEST, _STRONGEST = 1e-6, 1e-2  # T
 
 
 @dataclass(frozen=True, repr=False)
@@ -160,7 +159,8 @@ def fit_mag(
     check_seen(what, np.delete(ready.kept, [one.index for one in aside]), name)
     _check_result(joint, ready, hemisphere)
     options = {
-        "loss": loss, "mag_order": mag_order, "field": magnitude, "hemisphere": hemisphere,
+        "loss": loss, "mag_order": mag_order if mag_order == "auto" else int(mag_order),
+        "field": magnitude, "hemisphere": hemisphere,
         "drop": list(map(str, drop)),
         "same_direction": [group if isinstance(group, str) else list(group) for group in same_direction],
     }  # fmt: skip
@@ -181,8 +181,7 @@ def _check_options(
         raise OptionError(f"order {quoted(order)}: expected auto or 1 to 5")
     if hemisphere is not None and hemisphere not in HEMISPHERES:
         raise OptionError(f"hemisphere {quoted(hemisphere)}: expected north or south")
-    if field is not None and not (isinstance(field, numbers.Real) and _FAINTEST < field < _STRONGEST):
-        raise OptionError(f"field {field:g} T: expected its magnitude, such as 48.2uT (25 to 65 uT on Earth)")
+    check_field(field)
 
 
 def _solved(ready: Ready, loss: str, mag_order: str) -> tuple[Joint, tuple[Disturbed, ...]]:

@@ -13,8 +13,8 @@ from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity, local_gravity
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_from
+from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
 from imulab.procedures.tumble.findings import Estimate
-from imulab.procedures.tumble.fit import estimate_triad, nominal_scaling
 from imulab.procedures.tumble.mag.field import FEWEST, FieldMeans, check_magnitude, field_means
 from imulab.procedures.tumble.mag.judge import Seen, seen
 from imulab.procedures.tumble.mag.model import ACCELEROMETERS, MAGNETOMETERS, triad
@@ -51,7 +51,7 @@ def prepare(
     groups = [_numbers(group, count, "same-direction") for group in same_direction]
     if known is not None:
         check_prior(known)
-    local = local_gravity(_gravity(gravity, known), attitudes.recording)
+    local = _gravity(gravity, known, attitudes)
     order, loss = _as_before(known, order, attitudes)
     used = attitudes.only(kept) if dropped.size else attitudes
     check_attitudes(used, local.value)
@@ -130,12 +130,15 @@ def _check_groups(places: Sequence[Sequence[int]], name: str) -> None:
         )
 
 
-def _gravity(given: float | str | Gravity | None, known: Calibration | None) -> float | str | Gravity | None:
-    """Gravity as given, else that of the accelerometers' record."""
+def _gravity(given: float | str | Gravity | None, known: Calibration | None, attitudes: Attitudes) -> Gravity:
+    """Gravity as given, else that of the accelerometers' record, else as for the accelerometers."""
+    local = local_gravity(given, attitudes.recording)
     if given is not None or known is None:
-        return given
+        return local
     stated = model_of(known).gravity
-    return Gravity(stated.value, stated.from_, stated.standard_uncertainty or 0.0)
+    if made_of(known, attitudes) and stated.value == local.value:
+        return local
+    return local_gravity(Gravity(stated.value, stated.from_, stated.standard_uncertainty or 0.0), attitudes.recording)
 
 
 def _prior(
