@@ -12,11 +12,12 @@ demo: $(ALONE)
 	$(BIN)/imulab demo demo
 
 # The tests start many processes: each would compile what it imports again where the environment forbids to keep it.
+# Three workers for two cores: a good part of the tests waits for a browser, a port or a killed process.
 test test-all: export PYTHONDONTWRITEBYTECODE =
 
 test: core $(STAMP)
-	$(BIN)/python -m pytest -n 2 -m "not slow"
-	$(BIN)/python -m pytest -n 2 -m slow --reduced
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m slow --reduced
 
 test-all: core $(STAMP)
 	$(BIN)/python -m pytest -n 2

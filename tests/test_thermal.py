@@ -67,6 +67,7 @@ def errors(trials, temperatures, count, turn_on):
     return np.array(standard), np.array(held)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("temperatures", "count", "turn_on"),
     [
