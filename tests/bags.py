@@ -36,6 +36,18 @@ def imu(types, kind, stamp, accel, gyro, frame="imu_link", accel_cov=0.0, gyro_c
     )
 
 
+def magnetic_field(types, kind, stamp, field, frame="imu_link", first_covariance=0.0):
+    t = types.types
+    header = {"stamp": t["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "frame_id": frame}
+    if kind == "bag":
+        header["seq"] = 0
+    return t["sensor_msgs/msg/MagneticField"](
+        header=t["std_msgs/msg/Header"](**header),
+        magnetic_field=t["geometry_msgs/msg/Vector3"](*map(float, field)),
+        magnetic_field_covariance=np.array([first_covariance] + [0.0] * 8),
+    )
+
+
 def temperature(types, kind, stamp, value, frame="imu_link"):
     t = types.types
     header = {"stamp": t["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "frame_id": frame}

@@ -127,7 +127,11 @@ def file_option(name: str, help: str, shows: str) -> Option:  # noqa: A002
 LAYOUT = file_option("layout", "Columns of a foreign file; see imulab show --formats.", "NAME|L.toml")
 READING = (
     LAYOUT,
-    text_option("topic", "Topic of a bag or log, where there are several.", shows="TOPIC"),
+    text_option(
+        "topic",
+        "Topic of a bag or log, where there are several; with a comma, the magnetometer's beside it.",
+        shows="TOPIC",
+    ),
     whole("instance", "Sensor of a flight log, from 0; the first if not given."),
     Option("window", "Part to read, s; either side may be left out.", span, shows="FROM:TO"),
 )

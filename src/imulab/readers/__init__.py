@@ -53,7 +53,7 @@ def read(
     layout
         Where the columns of a foreign file are: the path of a layout file, or a `Layout`.
     topic
-        Which topic of a bag or log, where there are several.
+        Which topic of a bag or log, where there are several; with a comma between, the magnetometer's beside it.
     instance
         Which sensor of a flight log, from 0; by default the first.
     window

@@ -1,4 +1,4 @@
-"""ArduPilot DataFlash (.bin): IMU, or ACC and GYR.
+"""ArduPilot DataFlash (.bin): IMU, or ACC and GYR, and MAG.
 
 Source: ArduPilot AP_Logger (LogStructure.h): messages A3 95, u8 type, payload; messages of type 128 (FMT) give each
 type's length, name, field types and field names. Time is ``TimeUS`` (``TimeMS`` in old logs), since boot.
@@ -19,6 +19,7 @@ from imulab.readers import logs
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Array, Recording
+from imulab.verdict import Note
 
 MAGIC = b"\xa3\x95\x80"
 _FMT = 128
@@ -51,9 +52,11 @@ _FIELDS = {
     "IMU": ("AccX", "AccY", "AccZ", "GyrX", "GyrY", "GyrZ"),
     "ACC": ("AccX", "AccY", "AccZ"),
     "GYR": ("GyrX", "GyrY", "GyrZ"),
+    "MAG": ("MagX", "MagY", "MagZ"),
 }
+_MAG = dict.fromkeys(triad("mag"), "mgauss")
 _NAME = re.compile(
-    r"(IMU|ACC|GYR)([1-9]?)"
+    r"(IMU|ACC|GYR|MAG)([1-9]?)"
 )  # before ArduPilot 4.1 each instance had its own message: IMU, IMU2, ACC1 ...
 
 
@@ -105,7 +108,7 @@ class _Contents:
 
 
 def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
-    """Yield the samples of one accelerometer and gyroscope.
+    """Yield the samples of one accelerometer and gyroscope, and of a magnetometer.
 
     Raises
     ------
@@ -199,12 +202,15 @@ def _define(contents: _Contents, payload: bytes, name: str) -> None:
         wanted = _FIELDS[sensor]
         instance = None if "I" in fields else int(match[2] or 1) - 1
         missing = [key for key in wanted if key not in fields]
-        if missing or not ({"TimeUS", "TimeMS"} & set(fields)):
-            lacks = missing[0] if missing else "TimeUS"
+        lacks = missing[0] if missing else "" if {"TimeUS", "TimeMS"} & set(fields) else "TimeUS"
+        odd = offset > length - 3 or any(fields[key].kind[0] == "S" for key in (*wanted, "I") if key in fields)
+        if sensor == "MAG" and (lacks or odd):
+            sensor = None  # the rest of the log can be read without it
+        elif lacks:
             raise ReadError(f"{name}: message {title} has no field {lacks}; found {' '.join(fields) or 'none'}")
-        if offset > length - 3 or any(fields[key].kind[0] == "S" for key in (*wanted, "I") if key in fields):
+        elif odd:
             raise ReadError(f"{name}: message {title}: fields of {offset} bytes in {length - 3}")
-    elif offset > length - 3:
+    if sensor is None and offset > length - 3:
         fields = {}
     contents.formats[kind] = _Format(title, fields, max(length - 3, 0), sensor, instance)
 
@@ -221,20 +227,22 @@ def _choose(
     contents: _Contents, selection: Selection, name: str
 ) -> tuple[list[LoggedStream], dict[int, list[tuple[int, int | None, tuple[str, ...]]]]]:
     """Return the streams, and for each message type its stream, instance and fields."""
-    if selection.topic not in (None, "IMU", "ACC", "GYR"):
-        raise OptionError(f"{name}: topic {selection.topic!r}; of a DataFlash log these can be read: IMU ACC GYR")
-    there: dict[tuple[str, int], tuple[int, int | None]] = {}
+    wanted, magnetometer = selection.beside("MAG")
+    if wanted not in (None, "IMU", "ACC", "GYR"):
+        raise OptionError(f"{name}: topic {wanted!r}; of a DataFlash log these can be read: IMU ACC GYR MAG:N")
+    every: dict[tuple[str, int], tuple[int, int | None]] = {}
     for kind, instance in contents.counts:
         form = contents.formats[kind]
-        there[str(form.sensor), instance] = (kind, instance if form.instance is None else None)
+        every[str(form.sensor), instance] = (kind, instance if form.instance is None else None)
+    there = {place: source for place, source in every.items() if place[0] != "MAG"}
     titles = {title for title, _ in there}
     if not titles:
-        found = " ".join(sorted(contents.other)) or "none"
+        found = " ".join(sorted(contents.other | {title for title, _ in every})) or "none"
         raise ReadError(f"{name}: no IMU, ACC or GYR messages; messages found: {found}")
     instance = selection.instance or 0
-    topic = selection.topic or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
+    topic = wanted or ("IMU" if "IMU" in titles else "ACC" if "ACC" in titles else "GYR")
     samples = {title: contents.counts[there[title, instance][0], instance] for title, n in there if n == instance}
-    if not selection.topic and samples.get("ACC", 0) > logs.PLAINLY_MORE * samples.get("IMU", np.inf):
+    if not wanted and samples.get("ACC", 0) > logs.PLAINLY_MORE * samples.get("IMU", np.inf):
         gyros = samples.get("GYR", 0)
         if samples["IMU"] > logs.PLAINLY_MORE * gyros:
             contents.notes.append(
@@ -252,6 +260,14 @@ def _choose(
     several = sum(title == topic for title, _ in there)
     if several > 1:
         contents.notes.append(f"instance {instance} of {several} of {topic}")
+    streams, sources = _inertial(contents, there, topic, instance)
+    _add_magnetometer(contents, every, (magnetometer, instance), streams, sources, name)
+    return streams, sources
+
+
+def _inertial(
+    contents: _Contents, there: dict[tuple[str, int], tuple[int, int | None]], topic: str, instance: int
+) -> tuple[list[LoggedStream], dict[int, list[tuple[int, int | None, tuple[str, ...]]]]]:
     sources: dict[int, list[tuple[int, int | None, tuple[str, ...]]]] = {}
     kind, number = there[topic, instance]
     form = contents.formats[kind]
@@ -273,6 +289,34 @@ def _choose(
     return streams, sources
 
 
+def _add_magnetometer(
+    contents: _Contents,
+    every: dict[tuple[str, int], tuple[int, int | None]],
+    wanted: tuple[int | None, int],
+    streams: list[LoggedStream],
+    sources: dict[int, list[tuple[int, int | None, tuple[str, ...]]]],
+    name: str,
+) -> None:
+    """Add the magnetometer that was asked for, or else that of the same instance as the rest, or the first there is."""
+    asked, instance = wanted
+    places = sorted(place for title, place in every if title == "MAG")
+    if asked is not None and asked not in places:
+        raise OptionError(
+            f"{name}: no MAG of instance {asked}; instances found: {' '.join(map(str, places)) or 'none'}"
+        )
+    if not places:
+        return
+    place = asked if asked is not None else instance if instance in places else places[0]
+    if len(places) > 1:
+        others = ", ".join(f"MAG:{other}" for other in places if other != place)
+        contents.notes.append(Note(f"instance {place} of {len(places)} of MAG; a topic chooses: {others}"))
+    kind, number = every["MAG", place]
+    healthy = tuple(key for key in ("Health",) if key in contents.formats[kind].fields)
+    sources[kind] = [(len(streams), number, (*_FIELDS["MAG"], *healthy))]
+    streams.append(LoggedStream("magnetometer", _MAG, placed=True))
+    contents.notes.append(Note("MAG holds fields that ArduPilot has already corrected by its COMPASS_ parameters"))
+
+
 # --- samples -----------------------------------------------------------------------------------------------------
 
 
@@ -287,5 +331,8 @@ def _pieces(
                 for slot, instance, keys in parts:
                     mine = rows if instance is None else rows[form.column(rows, "I") == instance]
                     values = np.column_stack([form.column(mine, key) for key in keys])
+                    if form.sensor == "MAG" and "Health" in keys:
+                        # The field of a compass that does not answer is the last one that it gave.
+                        mine, values = mine[values[:, 3] != 0], values[values[:, 3] != 0, :3]
                     if len(mine):
                         yield Piece(slot, form.ticks(mine), values)

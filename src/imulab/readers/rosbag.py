@@ -1,15 +1,16 @@
-"""sensor_msgs/Imu (and Temperature) out of ROS 1 bags, MCAP and ROS 2 sqlite files.
+"""sensor_msgs/Imu (with MagneticField and Temperature) out of ROS 1 bags, MCAP and ROS 2 sqlite files.
 
 The payloads of a topic have a fixed size, so that a NumPy view reads thousands at once. Sources: the definitions of
-sensor_msgs/Imu and std_msgs/Header; OMG DDS-XTypes 1.3, 7.4 (plain CDR: little or big endian, doubles aligned to 8
-bytes behind a head of 4); ROS wiki "Messages" (ROS 1: little endian, not aligned). A covariance of -1 at its first
-place, or a reading of NaN, says that a quantity is not reported.
+sensor_msgs/Imu, sensor_msgs/MagneticField and std_msgs/Header; OMG DDS-XTypes 1.3, 7.4 (plain CDR: little or big
+endian, doubles aligned to 8 bytes behind a head of 4); ROS wiki "Messages" (ROS 1: little endian, not aligned). A
+covariance of -1 at its first place, or a reading of NaN, says that a quantity is not reported.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -23,18 +24,25 @@ from imulab.readers.rosfolder import files_of
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Array, Recording
+from imulab.units import parse_unit
+from imulab.verdict import Note
 
-_IMU, _TEMPERATURE = "sensor_msgs/Imu", "sensor_msgs/Temperature"
-_DOUBLES = {_IMU: 37, _TEMPERATURE: 2}
+_IMU, _TEMPERATURE, _FIELD = "sensor_msgs/Imu", "sensor_msgs/Temperature", "sensor_msgs/MagneticField"
+_DOUBLES = {_IMU: 37, _TEMPERATURE: 2, _FIELD: 12}
 _GYRO_AT, _ACCEL_AT = 13, 25  # behind quaternion and its covariance, behind the rate and its covariance
 _ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
 _GYRO = dict.fromkeys(triad("gyro"), "rad/s")
+_MAG = dict.fromkeys(triad("mag"), "T")
+_MOST_FIELD = 1e-3
+"""T; ten times and more what a magnetometer of a moving unit sees, hard iron included, or can put out."""
+_EARTH = (15e-6, 120e-6)
+"""T; fields on Earth with the hard iron of an ordinary unit, so narrow that one unit at most fits a number."""
 _ENOUGH = 4096  # samples to find out what a topic reports; a chunk may hold only one
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
-    """Yield the samples of one Imu topic, or of an accelerometer's and a gyroscope's.
+    """Yield the samples of one Imu topic, or of an accelerometer's and a gyroscope's, with the magnetometer beside it.
 
     Raises
     ------
@@ -46,12 +54,14 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
     selection.refuse(name, "a ROS bag", topic=False)
     files = [open_container(file, name) for file in (files_of(path, name) if path.is_dir() else [path])]
     topics = [topic for file in files for topic in file.topics]
-    chosen = _choose(topics, selection.topic, name)
     notes: list[str] = []
+    chosen, field = _choose(topics, selection.topic, name)
     slots = {topic: slot for slot, topic in enumerate(chosen)}
-    warm = _temperature(topics, chosen, notes)
-    if warm is not None:
-        slots[warm] = len(slots)
+    field = field or _beside(topics, _FIELD, chosen, "magnetometer", notes)
+    warm = _beside(topics, _TEMPERATURE, chosen, "temperature", notes)
+    for topic in (field, warm):
+        if topic is not None:
+            slots[topic] = len(slots)
     there, pieces = _reported(_pieces(files, slots, name), name, chosen[0])
     if len(chosen) == 2:
         taken = [slice(0, 3), slice(3, 6)]
@@ -71,6 +81,10 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
             for what, is_there in zip(("accelerometer", "gyroscope"), there, strict=True)
             if not is_there
         ]
+    if field is not None:
+        taken.append(slice(0, 3))
+        streams.append(LoggedStream("magnetometer", _MAG, placed=True))
+        pieces = _in_tesla(pieces, slots[field], field, notes)
     if warm is not None:
         taken.append(slice(0, 1))
         streams.append(LoggedStream("temperature", {"temperature": "degC"}, slow=True))
@@ -81,44 +95,55 @@ def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
         per_second=1_000_000_000,
         origin=None,
         metadata=lambda epoch: {
-            "topic": ",".join(chosen),
+            "topic": ",".join([*chosen, *([field] if field is not None else [])]),
             "epoch": f"{epoch // 10**9}.{epoch % 10**9:09d} s",
         },
-        notes=tuple(notes),
+        notes=notes,
     )
 
 
 # --- topics --------------------------------------------------------------------------------------------------------
 
 
-def _choose(topics: list[Topic], wanted: str | None, name: str) -> list[str]:
-    there = list(dict.fromkeys(topic.name for topic in topics if topic.type == _IMU))
+def _choose(topics: list[Topic], wanted: str | None, name: str) -> tuple[list[str], str | None]:
+    """Return the topics of an Imu, one or two, and that of a magnetometer if one is asked for."""
+    there = _of_type(topics, _IMU)
     if not there:
         found = ", ".join(dict.fromkeys(f"{t.name} ({t.type})" for t in topics)) or "none"
         raise ReadError(f"{name}: no topic of sensor_msgs/Imu; topics found: {found}")
-    if wanted is None:
+    fields = _of_type(topics, _FIELD)
+    entries = wanted.split(",") if wanted is not None else []
+    named = [entry if entry.startswith("/") or entry in (*there, *fields) else f"/{entry}" for entry in entries]
+    field = next((entry for entry in named if entry in fields), None)
+    chosen = [entry for entry in named if entry != field]
+    if not chosen:
         if len(there) > 1:
             raise OptionError(f"{name}: several Imu topics, choose one with --topic: {' '.join(there)}")
         logging.getLogger(__name__).info("%s: topic %s, the only one of an Imu", name, there[0])
-        return there
-    chosen = [entry if entry.startswith("/") or entry in there else f"/{entry}" for entry in wanted.split(",")]
+        return there, field
     for entry in chosen:
         if entry not in there:
-            raise OptionError(f"{name}: no Imu topic {entry}; Imu topics found: {listed(there, entry)}")
+            also = f"; of MagneticField: {' '.join(fields)}" if fields else ""
+            raise OptionError(f"{name}: no Imu topic {entry}; Imu topics found: {listed(there, entry)}{also}")
     if len(chosen) > 2 or len(set(chosen)) < len(chosen):
         raise OptionError(f"{name}: topic {wanted!r}: expected one, or the accelerometer's and the gyroscope's: A,G")
-    return chosen
+    return chosen, field
 
 
-def _temperature(topics: list[Topic], chosen: list[str], notes: list[str]) -> str | None:
-    """Return the temperature topic that belongs to the chosen ones, if any: in their namespace, or the only one."""
-    names = list(dict.fromkeys(topic.name for topic in topics if topic.type == _TEMPERATURE))
+def _of_type(topics: list[Topic], kind: str) -> list[str]:
+    return list(dict.fromkeys(topic.name for topic in topics if topic.type == kind))
+
+
+def _beside(topics: list[Topic], kind: str, chosen: list[str], what: str, notes: list[str]) -> str | None:
+    """Return the topic of a type that belongs to the chosen ones, if any: in their namespace, or the only one."""
+    names = _of_type(topics, kind)
     near = [name for name in names if name.rpartition("/")[0] == chosen[0].rpartition("/")[0]]
     near = near or [name for name in names if name.startswith(f"{chosen[0]}/")] or names
     if len(near) == 1:
         return near[0]
     if near:
-        notes.append(f"temperature left out: several topics could be it: {' '.join(near)}")
+        left = f"{what} left out: several topics could be it: {' '.join(near)}"
+        notes.append(left if kind != _FIELD else Note(f"{left}; --topic {chosen[0]},{near[0]} takes the first"))
     return None
 
 
@@ -134,7 +159,34 @@ def _pieces(files: list[Container], slots: dict[str, int], name: str) -> Iterato
             for number in np.unique(records.keys).tolist():
                 topic = mine[number]
                 ticks, values = _decoded(records, records.of(number), topic, name)
-                yield Piece(slots[topic.name], ticks, _readings(values) if topic.type == _IMU else values[:, :1])
+                yield Piece(slots[topic.name], ticks, _READINGS[topic.type](values))
+
+
+def _in_tesla(pieces: Iterator[Piece], stream: int, topic: str, notes: list[str]) -> Iterator[Piece]:
+    """Pass pieces on, a magnetometer's in tesla: drivers that write another unit are found out by its size."""
+    factor = None
+    for piece in pieces:
+        if piece.stream != stream:
+            yield piece
+            continue
+        size = np.linalg.norm(piece.values, axis=1)
+        if factor is None and np.isfinite(size).any():
+            usual = float(np.median(size[np.isfinite(size)]))
+            factor, said = _unit_of_field(usual, topic)
+            notes += said
+        yield replace(piece, values=piece.values * factor) if factor else piece
+
+
+def _unit_of_field(size: float, topic: str) -> tuple[float, list[Note]]:
+    """Return the factor to tesla of a field of this usual size, stated as tesla, and what is said of it."""
+    if size <= _MOST_FIELD:
+        return 1.0, []
+    wrong = f"{topic} says that the field is {size:.3g} T, which none on Earth is"
+    for unit in ("mT", "gauss", "uT", "mgauss", "nT"):
+        factor = parse_unit(unit).factor
+        if _EARTH[0] <= size * factor <= _EARTH[1]:
+            return factor, [Note(f"{wrong}: its readings are taken as {unit}")]
+    return 1.0, [Note(f"{wrong}, and no other unit fits: its readings are left as they are")]
 
 
 def _reported(pieces: Iterator[Piece], name: str, topic: str) -> tuple[list[bool], Iterator[Piece]]:
@@ -160,6 +212,14 @@ def _readings(values: Array) -> Array:
         unknown = values[:, at + 3] == -1
         readings[:, place : place + 3] = np.where(unknown[:, None], np.nan, values[:, at : at + 3])
     return readings
+
+
+def _field(values: Array) -> Array:
+    """Return magnetic fields, shape (n, 3), NaN where the covariance says that they are not reported."""
+    return np.where(values[:, 3:4] == -1, np.nan, values[:, :3])
+
+
+_READINGS: dict[str, Callable[[Array], Array]] = {_IMU: _readings, _FIELD: _field, _TEMPERATURE: lambda v: v[:, :1]}
 
 
 def _decoded(records: logs.Records, indices: logs.Integers, topic: Topic, name: str) -> tuple[logs.Integers, Array]:

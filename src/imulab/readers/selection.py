@@ -26,7 +26,8 @@ class Selection:
     Attributes
     ----------
     topic
-        ROS topic (two, separated by a comma: the accelerometer's and the gyroscope's), ULog topic or DataFlash message.
+        ROS topic (two, separated by a comma: the accelerometer's and the gyroscope's), ULog topic or DataFlash message;
+        with a comma between, a magnetometer's beside it (``sensor_mag:1``: instance 1 of these).
     instance
         Number of the sensor in a flight log, from 0.
     window
@@ -54,6 +55,22 @@ class Selection:
     def ends(self) -> Ends | None:
         """The window's first and last time, s; None where there is no window."""
         return span(self.window, "window") if isinstance(self.window, str) else self.window
+
+    def beside(self, title: str) -> tuple[str | None, int | None]:
+        """Return the topic without an entry such as ``sensor_mag:1`` of this title, and the number in that entry.
+
+        Raises
+        ------
+        OptionError
+            There is no number behind the colon.
+        """
+        entries = self.topic.split(",") if self.topic is not None else []
+        mine = [entry for entry in entries if entry.partition(":")[0] == title]
+        others = ",".join(entry for entry in entries if entry not in mine)
+        number = mine[0].partition(":")[2] if mine else ""
+        if len(mine) > 1 or not (number.isdecimal() or (mine in ([], [title]))):
+            raise OptionError(f"topic {self.topic!r}: expected {title} or {title}:N once, N its instance from 0")
+        return (others or None), (int(number) if number else None)
 
     def of(self, blocks: Iterator[Recording], name: str) -> Iterator[Recording]:
         """Pass on the rows of the element within the window; errors as for `of_element` and `windowed`."""

@@ -4,6 +4,7 @@ Logs interleave the samples of several sensors. The accelerometer's samples (or 
 clock; the others are interpolated linearly between their neighbours, as they pass, without holding the file. Before a
 stream's first sample and after its last nothing is known of it, and nothing is made up: rows end with the first stream
 that ends, and the few rows before one that begins a little later are left out; more of them hold no numbers of it.
+Magnetometers are not interpolated: each of their samples stands in the row nearest in time, other rows hold no number.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from imulab.errors import ReadError
 from imulab.estimation.sampling import WIDEST_GAP
 from imulab.recording import Array, Recording
+from imulab.verdict import Note
 
 Ticks = NDArray[np.int64]
 
@@ -28,11 +30,21 @@ _MUCH = 0.1
 
 @dataclass(frozen=True, slots=True)
 class LoggedStream:
-    """The columns of one stream, what to call it, and whether its values are slow enough to bridge any gap."""
+    """The columns of one stream, and what to call it.
+
+    `slow`: its values change so little that any gap is bridged. `placed`: each sample goes into the row of the clock
+    that is nearest in time, and is not interpolated. Rows end with neither kind.
+    """
 
     what: str
     units: Mapping[str, str]
     slow: bool = False
+    placed: bool = False
+
+    @property
+    def bounds(self) -> bool:
+        """Whether rows begin and end with this stream."""
+        return not (self.slow or self.placed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +69,9 @@ class _Buffer:
         self.first: int | None = None
         self.last: int | None = None
         self.left_out = 0
+        self.total = 0
+        self.rows = 0
+        self.exact = True
 
     def add(self, piece: Piece) -> None:
         if piece.ticks.size:
@@ -64,6 +79,7 @@ class _Buffer:
             self.last = last if self.last is None else max(self.last, last)
         self._waiting.append(piece)
         self.count += len(piece.ticks)
+        self.total += len(piece.ticks)
 
     def join(self) -> None:
         """Put the pieces together."""
@@ -89,7 +105,7 @@ def on_one_clock(
     per_second: int,
     origin: int | None,
     metadata: Callable[[int], Mapping[str, str]],
-    notes: tuple[str, ...] = (),
+    notes: Sequence[str] = (),
 ) -> Iterator[Recording]:
     """Yield blocks on the clock of the first stream.
 
@@ -105,6 +121,8 @@ def on_one_clock(
         Tick of time 0; None: the clock's first sample.
     metadata
         Of the recording, for a given origin.
+    notes
+        What is known of the data; what is added to a list while pieces are taken is in the blocks from there on.
 
     Raises
     ------
@@ -140,7 +158,8 @@ def on_one_clock(
         if not ticks.size:
             continue
         origin = int(ticks[0]) if origin is None else origin
-        block = _block(buffers, ticks, values, origin, per_second, name)
+        following = int(clock.ticks[0]) if clock.count else None
+        block = _block(buffers, (ticks, following), values, origin, per_second, name)
         if held is not None:
             yield held
         held = replace(block, metadata=metadata(origin), first_row=row, notes=(*notes, *block.notes))
@@ -150,7 +169,8 @@ def on_one_clock(
         if apart:
             raise ReadError(f"{name}: the {clock.stream.what} and the {apart[0]} have no time in common")
         raise ReadError(f"{name}: no samples of the {clock.stream.what}")
-    yield replace(held, notes=(*held.notes, *_left_out(clock, others), *_ends(buffers, per_second)))
+    more = (*_left_out(clock, others), *_ends(buffers, per_second), *_placements(clock, others, row - 1, per_second))
+    yield replace(held, notes=(*held.notes, *more))
 
 
 def _with_end(pieces: Iterable[Piece]) -> Iterator[Piece | None]:
@@ -173,7 +193,9 @@ def _ready(clock: _Buffer, others: list[_Buffer]) -> int:
     if any(other.count == 0 for other in others):
         return 0
     horizon = min(int(other.ticks[-1]) for other in others)
-    return int(np.searchsorted(np.maximum.accumulate(clock.ticks), horizon, side="right"))
+    ready = int(np.searchsorted(np.maximum.accumulate(clock.ticks), horizon, side="right"))
+    # Which samples are nearer to the last row than to the next is known when the next is there.
+    return max(ready - 1, 0) if any(other.stream.placed for other in others) else ready
 
 
 def _bounds(clock: _Buffer, other: _Buffer, *, ended: bool) -> tuple[float, float]:
@@ -181,7 +203,7 @@ def _bounds(clock: _Buffer, other: _Buffer, *, ended: bool) -> tuple[float, floa
 
     Rows before it are left out where they are few, and kept without its values where they are many.
     """
-    if other.stream.slow or other.first is None or other.last is None:
+    if not other.stream.bounds or other.first is None or other.last is None:
         return -np.inf, np.inf
     late = other.first - clock.first if clock.first is not None else 0
     low = other.first if 0 < late <= WIDEST_GAP * np.nan_to_num(other.step) else -np.inf
@@ -200,14 +222,22 @@ def _kept(clock: _Buffer, others: list[_Buffer], ready: int, *, ended: bool) -> 
     return kept
 
 
-def _block(buffers: list[_Buffer], ticks: Ticks, values: Array, origin: int, per_second: int, name: str) -> Recording:
-    """Return rows of the clock with the other streams at their ticks, and a note for each that was interpolated."""
-    clock = buffers[0]
+def _block(
+    buffers: list[_Buffer], rows: tuple[Ticks, int | None], values: Array, origin: int, per_second: int, name: str
+) -> Recording:
+    """Return rows of the clock with the other streams at their ticks, and a note for each that was interpolated.
+
+    `rows`: their ticks, and the tick of the row behind them if there is one.
+    """
+    clock, ticks = buffers[0], rows[0]
     columns: dict[str, Array] = {"time": (ticks - origin) / per_second}
     units = {"time": "s"}
     notes = []
     for buffer in buffers:
-        if buffer is not clock:
+        if buffer.stream.placed:
+            _check_rising(buffer, origin, per_second, name)
+            values = _placed(buffer, clock.step, *rows)
+        elif buffer is not clock:
             values, moved = _interpolated(buffer, ticks, origin, per_second, name)
             if moved:
                 notes.append(_note(buffer, clock, per_second))
@@ -227,7 +257,7 @@ def _left_out(clock: _Buffer, others: list[_Buffer]) -> list[str]:
 
 def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
     """Say by how much the first stream that ends ends before the others, and warn where that is much of them."""
-    timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and not b.stream.slow]
+    timed = [(b.last, b.first, b) for b in buffers if b.last is not None and b.first is not None and b.stream.bounds]
     end, _, first = min(timed, key=lambda one: one[0])
     messages = []
     for last, start, buffer in timed:
@@ -243,10 +273,46 @@ def _ends(buffers: list[_Buffer], per_second: int) -> list[str]:
     return messages
 
 
-def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:
-    """Values of a stream at the clock's ticks, shape (n, columns), and whether any had to be interpolated."""
-    if buffer.count == 0:
-        return np.full((len(ticks), buffer.values.shape[1]), np.nan), False
+def _placements(clock: _Buffer, others: list[_Buffer], rows: int, per_second: int) -> list[str]:
+    """Say of each stream that was not interpolated how many of its samples stand in how many rows."""
+    notes: list[str] = []
+    for other in others:
+        if not other.stream.placed or (other.exact and other.total == other.rows == rows):
+            continue
+        notes.append(
+            Note(
+                f"{other.stream.what}{_rate(other, per_second)} not interpolated: {other.rows} of its {other.total} "
+                f"samples stand in the rows of the {clock.stream.what}{_rate(clock, per_second)} nearest in time; the "
+                f"other {rows - other.rows} of {rows} rows hold none (nan)"
+            )
+        )
+    return notes
+
+
+def _placed(buffer: _Buffer, step: float, ticks: Ticks, following: int | None) -> Array:
+    """Values of a stream in the rows nearest in time to each sample, shape (n, columns), NaN in the other rows.
+
+    Samples further than a step of the clock from any row have none, and of several in one row the nearest stays.
+    """
+    middles = ticks[:-1] + np.diff(ticks) // 2
+    end = buffer.count
+    if following is not None:
+        end = int(np.searchsorted(buffer.ticks, ticks[-1] + (following - ticks[-1]) // 2, side="right"))
+    at = buffer.ticks[:end]
+    row = np.searchsorted(middles, at)
+    off = np.abs(at - ticks[row])
+    near = np.flatnonzero(np.logical_not(off > step))
+    near = near[np.argsort(-off[near], kind="stable")]
+    values = np.full((len(ticks), buffer.values.shape[1]), np.nan)
+    values[row[near]] = buffer.values[near]
+    buffer.rows += len(np.unique(row[near]))
+    buffer.exact = buffer.exact and not off.any()
+    buffer.drop(end)
+    return values
+
+
+def _check_rising(buffer: _Buffer, origin: int, per_second: int, name: str) -> None:
+    """Refuse a stream whose time runs backwards: nothing could be looked up in it."""
     step = np.diff(buffer.ticks)
     if step.size and step.min() < 0:
         index = int(np.argmax(step < 0))
@@ -255,6 +321,13 @@ def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, n
             f"{name}: the time of the {buffer.stream.what} runs backwards: "
             f"expected more than {before:.9g} s, found {after:.9g} s"
         )
+
+
+def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, name: str) -> tuple[Array, bool]:
+    """Values of a stream at the clock's ticks, shape (n, columns), and whether any had to be interpolated."""
+    if buffer.count == 0:
+        return np.full((len(ticks), buffer.values.shape[1]), np.nan), False
+    _check_rising(buffer, origin, per_second, name)
     outside = (ticks < buffer.ticks[0]) | (ticks > buffer.ticks[-1])
     known, wanted = (buffer.ticks - origin).astype(np.float64), (ticks - origin).astype(np.float64)
     values = np.column_stack([np.interp(wanted, known, column) for column in buffer.values.T])
@@ -270,11 +343,12 @@ def _interpolated(buffer: _Buffer, ticks: Ticks, origin: int, per_second: int, n
     return values, not met.all()
 
 
-def _note(buffer: _Buffer, clock: _Buffer, per_second: int) -> str:
-    def rate(step: float) -> str:
-        return f" ({per_second / step:.6g} Hz)" if step > 0 else ""
+def _rate(buffer: _Buffer, per_second: int) -> str:
+    return f" ({per_second / buffer.step:.6g} Hz)" if buffer.step > 0 else ""
 
+
+def _note(buffer: _Buffer, clock: _Buffer, per_second: int) -> str:
     return (
-        f"{buffer.stream.what}{rate(buffer.step)} interpolated to the clock of the "
-        f"{clock.stream.what}{rate(clock.step)}"
+        f"{buffer.stream.what}{_rate(buffer, per_second)} interpolated to the clock of the "
+        f"{clock.stream.what}{_rate(clock, per_second)}"
     )

@@ -1,4 +1,4 @@
-"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined where that has plainly more samples.
+"""PX4 ULog: sensor_accel and sensor_gyro, or sensor_combined where that has plainly more samples, and sensor_mag.
 
 Source: the file format in the PX4 user guide ("ULog File Format", version 1): a header of 16 bytes, then messages
 u16 size, u8 type, payload. Time is ``timestamp_sample`` (``timestamp`` where a log has none), microseconds since boot.
@@ -19,6 +19,7 @@ from imulab.readers import logs
 from imulab.readers.selection import Selection
 from imulab.readers.streams import LoggedStream, Piece, on_one_clock
 from imulab.recording import Recording
+from imulab.verdict import Note
 
 MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
@@ -39,6 +40,10 @@ _SIZES = {
 _TOPICS = ("sensor_accel", "sensor_gyro", "sensor_combined")
 _ACCEL = dict.fromkeys(triad("accel"), "m/s^2")
 _GYRO = dict.fromkeys(triad("gyro"), "rad/s")
+_MAGS = ("sensor_mag", "vehicle_magnetometer")
+"""Magnetometers, gauss: as measured, and as PX4 has corrected and turned them."""
+_MAG = dict.fromkeys(triad("mag"), "gauss")
+_VECTORS = ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga")
 _NO_ACCEL = 2**31 - 1
 _KEPT = {"sys_name": "autopilot", "ver_hw": "hardware", "sys_uuid": "autopilot_uuid"}
 
@@ -65,7 +70,7 @@ class _Contents:
 
 
 def blocks(path: Path, name: str, selection: Selection) -> Iterator[Recording]:
-    """Yield the samples of one accelerometer and gyroscope.
+    """Yield the samples of one accelerometer and gyroscope, and of a magnetometer.
 
     Raises
     ------
@@ -157,9 +162,9 @@ def _choose(
     contents: _Contents, selection: Selection, name: str
 ) -> tuple[list[LoggedStream], dict[int, tuple[int, str, dict[str, _Field]]]]:
     """Return the streams, and for each subscription its stream, its topic and where its fields are."""
-    topic = selection.topic
+    topic, magnetometer = selection.beside(_MAGS[0])
     if topic is not None and topic not in _TOPICS:
-        raise OptionError(f"{name}: topic {topic!r}; of a ULog these can be read: {' '.join(_TOPICS)}")
+        raise OptionError(f"{name}: topic {topic!r}; of a ULog these can be read: {' '.join(_TOPICS)} {_MAGS[0]}:N")
     there = {
         (title, instance): number
         for number, (title, instance) in contents.subscriptions.items()
@@ -186,10 +191,10 @@ def _choose(
     several = [f"{title} {number}" for title, number in sorted(there) if title in wanted]
     if len(several) > len(chosen):
         contents.notes.append(f"instance {instance} of {', '.join(several)}")
+    mag = _magnetometer(contents, magnetometer, instance, name)
     streams: list[LoggedStream] = []
     sources: dict[int, tuple[int, str, dict[str, _Field]]] = {}
-    for title in chosen:
-        number = there[title, instance]
+    for title, number in [(title, there[title, instance]) for title in chosen] + mag:
         fields = _fields(contents, title, name)
         needed = max(f.offset + np.dtype(f.kind).itemsize * f.count for f in fields.values())
         if contents.smallest[number] < needed:
@@ -202,10 +207,38 @@ def _choose(
             streams.append(LoggedStream("accelerometer", {**_ACCEL, **warm}))
         elif title == "sensor_gyro":
             streams.append(LoggedStream("gyroscope", _GYRO))
+        elif title in _MAGS:
+            streams.append(LoggedStream("magnetometer", _MAG, placed=True))
         else:
             streams += [LoggedStream("accelerometer", _ACCEL), LoggedStream("gyroscope", _GYRO)]
             contents.notes.append("sensor_combined holds outputs that PX4 has already corrected")
     return streams, sources
+
+
+def _magnetometer(contents: _Contents, wanted: int | None, instance: int, name: str) -> list[tuple[str, int]]:
+    """Return the magnetometer's topic and number, none where the log has none; note which of several it is.
+
+    `wanted` is the instance that was asked for; where none was, it is that of the accelerometer, or else the first.
+    """
+    there = {
+        (title, place): number
+        for number, (title, place) in contents.subscriptions.items()
+        if contents.counts.get(number) and title in _MAGS
+    }
+    title = next((title for title in _MAGS if any(title == other for other, _ in there)), None)
+    places = sorted(place for other, place in there if other == title)
+    if wanted is not None and (title != _MAGS[0] or wanted not in places):
+        found = ", ".join(f"{other} {place}" for other, place in sorted(there)) or "none"
+        raise OptionError(f"{name}: no {_MAGS[0]} of instance {wanted}; magnetometers found: {found}")
+    if title is None:
+        return []
+    place = wanted if wanted is not None else instance if instance in places else places[0]
+    if title != _MAGS[0]:
+        contents.notes.append(Note(f"{title} holds fields that PX4 has already corrected and turned"))
+    elif len(places) > 1:
+        others = ", ".join(f"{title}:{other}" for other in places if other != place)
+        contents.notes.append(Note(f"instance {place} of {len(places)} of {title}; a topic chooses: {others}"))
+    return [(title, there[title, place])]
 
 
 def _raw_or_combined(samples: dict[str, int], raw: list[str], notes: list[str]) -> list[str]:
@@ -239,7 +272,7 @@ def _fields(contents: _Contents, title: str, name: str) -> dict[str, _Field]:
         offset += np.dtype(_SIZES[match[1]]).itemsize * count
     needed = _needed(title, layout)
     for key in needed:
-        if key not in layout or layout[key].count != (3 if key in ("gyro_rad", "accelerometer_m_s2") else 1):
+        if key not in layout or layout[key].count != (3 if key in _VECTORS else 1):
             raise ReadError(f"{name}: {title} has no field {key}; found {' '.join(layout)}")
     return {key: layout[key] for key in needed}
 
@@ -249,6 +282,8 @@ def _needed(title: str, layout: dict[str, _Field]) -> list[str]:
         relative = ["accelerometer_timestamp_relative"] if "accelerometer_timestamp_relative" in layout else []
         return ["timestamp", "gyro_rad", "accelerometer_m_s2", *relative]
     stamp = "timestamp_sample" if "timestamp_sample" in layout else "timestamp"
+    if title == _MAGS[1]:
+        return [stamp, "magnetometer_ga"]
     warm = ["temperature"] if title == "sensor_accel" and "temperature" in layout else []
     return [stamp, "x", "y", "z", *warm]
 
