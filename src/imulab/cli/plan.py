@@ -12,7 +12,6 @@ from imulab.procedures.tumble.model import parameter_units
 from imulab.procedures.tumble.plan import roll_pitch
 from imulab.procedures.tumble.planned import TumblePlan
 from imulab.procedures.tumble.planning import plan_tumble
-from imulab.procedures.tumble.sheet import plan_recording
 from imulab.records.json_text import json_text
 from imulab.shown import aligned
 from imulab.units import STANDARD_GRAVITY
@@ -29,7 +28,7 @@ def run(*, output: str | None, report: str | None, json: bool, **options: Any) -
         to_csv = stack.enter_context(replacing(output)) if output else None
         to_sheet = stack.enter_context(replacing(report)) if report else None
         if to_csv:
-            write_csv_to(plan_recording(plan), to_csv)
+            write_csv_to(plan.recording(), to_csv)
         if to_sheet:
             to_sheet.write(plan.sheet().encode("utf-8"))
     if json:
@@ -49,6 +48,22 @@ def _as_json(plan: TumblePlan) -> str:
     # A bias in units of g is so many times gravity, a k_n in 1/g^(n-1) so many times its inverse power.
     powers = {"m/s^2": 1, "1/(m/s^2)": -1} | {f"1/(m/s^2)^{n}": -n for n in range(2, plan.order)}
     predicted = plan.uncertainties(plan.noise)
+    headings = plan.headings
+    attitudes = [
+        {"up": up, "roll": {"value": roll, "unit": "rad"}, "pitch": {"value": pitch, "unit": "rad"}}
+        for up, (roll, pitch) in zip(plan.directions.tolist(), angles.tolist(), strict=True)
+    ]
+    parameters = {
+        name: {"standard_uncertainty": u * STANDARD_GRAVITY ** powers.get(unit, 0), "unit": unit}
+        for (name, u), unit in zip(predicted.items(), units, strict=True)
+    }
+    if headings is not None:
+        for index, (attitude, north) in enumerate(zip(attitudes, headings.north.tolist(), strict=True)):
+            attitude |= {"north": north, "facing": headings.facing(index)}
+        parameters |= {
+            name: {"standard_uncertainty": u, "unit": "1" if name.startswith(("mag_bias", "mag_scale")) else "rad"}
+            for name, u in headings.uncertainties().items()
+        }
     return json_text(
         {
             "order": plan.order,
@@ -57,14 +72,8 @@ def _as_json(plan: TumblePlan) -> str:
             "noise": {"value": plan.noise * STANDARD_GRAVITY, "unit": "m/s^2"},
             "already": plan.already,
             "warnings": [] if plan.finding is None else [plan.finding],
-            "attitudes": [
-                {"up": up, "roll": {"value": roll, "unit": "rad"}, "pitch": {"value": pitch, "unit": "rad"}}
-                for up, (roll, pitch) in zip(plan.directions.tolist(), angles.tolist(), strict=True)
-            ],
+            "attitudes": attitudes,
             "again": [list(pair) for pair in plan.again],
-            "parameters": {
-                name: {"standard_uncertainty": u * STANDARD_GRAVITY ** powers.get(unit, 0), "unit": unit}
-                for (name, u), unit in zip(predicted.items(), units, strict=True)
-            },
+            "parameters": parameters,
         }
     )

@@ -87,6 +87,12 @@ def plan(
             "demands; the default follows --method.",
         ),
     ] = None,
+    with_: Annotated[
+        str | None,
+        one_of(
+            ("mag",), "Give each attitude a heading too, for the magnetometers beside the accelerometers.", "--with"
+        ),
+    ] = None,
     json: AsJson = False,
 ) -> None:
     """Choose the attitudes to measure, and predict the uncertainty of every parameter."""
@@ -94,7 +100,7 @@ def plan(
 
     run(
         output=output, report=report, json=json, attitudes=attitudes, noise=noise, order=order, criterion=criterion,
-        from_=source, add=add, method=method, distinct_verticals=distinct_verticals,
+        from_=source, add=add, method=method, distinct_verticals=distinct_verticals, with_=with_,
     )  # fmt: skip
 
 

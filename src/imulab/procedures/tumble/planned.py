@@ -10,8 +10,10 @@ import numpy as np
 from imulab.atomic_write import write_text
 from imulab.procedures.tumble.engineering import predicted_rows
 from imulab.procedures.tumble.findings import freedom_finding
+from imulab.procedures.tumble.mag.headings import Headings
 from imulab.procedures.tumble.plan import Plan, roll_pitch, turning
 from imulab.procedures.tumble.sheet import attitude_picture, plan_recording
+from imulab.recording import Recording
 from imulab.report import render_plan
 from imulab.report.elements import GOOD, Figure
 from imulab.report.plots import Plot
@@ -34,12 +36,15 @@ class TumblePlan(Shown, Plan):
         What said so, in brackets; empty where it was given as a number.
     distinct_verticals
         Whether no two attitudes have the same of x, y and z vertical.
+    headings
+        Which way each attitude faces, for a magnetometer; None where that was not asked for.
     """
 
     criterion: str
     noise: float
     noise_from: str
     distinct_verticals: bool
+    headings: Headings | None = None
 
     @property
     def finding(self) -> str | None:
@@ -68,26 +73,35 @@ class TumblePlan(Shown, Plan):
             lead += " Of the new attitudes no two have the same of x, y and z vertical, nor one that had it before."
         if self.finding is not None:
             lead += f" Too few to check the order: {self.finding}."
-        return lead
+        return lead if self.headings is None else lead + self.headings.lead
+
+    @property
+    def predicted(self) -> list[tuple[str, str, str]]:
+        """Predicted uncertainties as people read them: name, text and unit."""
+        rows = predicted_rows(self.uncertainties(self.noise))
+        return rows if self.headings is None else rows + self.headings.rows()
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return the plan in a few sentences, and the predicted uncertainties."""
-        rows = [list(row) for row in predicted_rows(self.uncertainties(self.noise))]
-        return self.lead, ["parameter", "predicted u", "unit"], rows
+        return self.lead, ["parameter", "predicted u", "unit"], [list(row) for row in self.predicted]
 
     def save(self, path: str | Path) -> None:
-        """Write the attitudes as CSV: number, upward direction in the body frame, roll and pitch.
+        """Write the attitudes as CSV: number, upward direction in the body frame (and that of north), roll and pitch.
 
         Raises
         ------
         OptionError
             The file cannot be written.
         """
-        write_csv(plan_recording(self), path)
+        write_csv(self.recording(), path)
+
+    def recording(self) -> Recording:
+        """Return the same as a table."""
+        return plan_recording(self, None if self.headings is None else self.headings.north)
 
     def sheet(self) -> str:
         """Return the sheet to print, a picture for each attitude, as HTML text."""
-        return render_plan("Tumble plan", self.lead, self._pictures(), predicted_rows(self.uncertainties(self.noise)))
+        return render_plan("Tumble plan", self.lead, self._pictures(), self.predicted)
 
     def report(self, path: str | Path) -> None:
         """Write the sheet to print as an HTML file; errors as for `save`."""
@@ -106,13 +120,17 @@ class TumblePlan(Shown, Plan):
 
     def _pictures(self) -> list[dict[str, str]]:
         angles = np.degrees(roll_pitch(self.directions))
-        return [
-            {
-                "number": str(number),
-                "picture": attitude_picture(up),
-                "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
-                "roll": f"{roll:.1f}",
-                "pitch": f"{pitch:.1f}",
-            }
-            for number, (up, (roll, pitch)) in enumerate(zip(self.directions, angles, strict=True), start=1)
-        ]
+        pictures = []
+        for index, (up, (roll, pitch)) in enumerate(zip(self.directions, angles, strict=True)):
+            north = None if self.headings is None else self.headings.north[index]
+            pictures.append(
+                {
+                    "number": str(index + 1),
+                    "picture": attitude_picture(up, north),
+                    "facing": "" if self.headings is None else self.headings.facing(index),
+                    "up": "(" + ", ".join(f"{value:+.2f}" for value in up) + ")",
+                    "roll": f"{roll:.1f}",
+                    "pitch": f"{pitch:.1f}",
+                }
+            )
+        return pictures

@@ -15,12 +15,14 @@ from imulab.procedures.loading import load
 from imulab.procedures.tumble import plan
 from imulab.procedures.tumble.choices import STARTS
 from imulab.procedures.tumble.fit import fit_tumble
+from imulab.procedures.tumble.mag.headings import plan_headings
+from imulab.procedures.tumble.mag.pointing import world_axes
 from imulab.procedures.tumble.options import check_method
 from imulab.procedures.tumble.plan import Plan, fixture_candidates, head_candidates
 from imulab.procedures.tumble.planned import TumblePlan
-from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
+from imulab.procedures.tumble.sections import attitudes_of, data_of, fit_of, model_of
 from imulab.procedures.tumble.segment import find_attitudes
-from imulab.procedures.tumble.sheet import directions_of
+from imulab.procedures.tumble.sheet import directions_of, norths_of
 from imulab.quantities import in_si, quantity, whole
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -40,6 +42,7 @@ def plan_tumble(
     add: Known | Plan | None = None,
     method: str = "norm",
     distinct_verticals: bool | None = None,
+    with_: str | None = None,
 ) -> TumblePlan:
     """Choose the attitudes to measure, and predict the uncertainty of every parameter.
 
@@ -68,13 +71,16 @@ def plan_tumble(
     distinct_verticals
         Whether x, y and z are each vertical, up or down, in one attitude at most, as the source of method linearised
         has it; as `method` demands if not given.
+    with_
+        ``"mag"``: each attitude gets a heading too, in quarter turns, for the magnetometers beside the accelerometers;
+        of `add` the headings of a plan with headings, or of a record with magnetometers, count.
 
     Raises
     ------
     OptionError
         An option cannot be; too few or too many attitudes, too few candidates or none far enough apart.
     ObservabilityError
-        No choice among the candidates determines the model.
+        No choice among the candidates determines the model, or no headings the magnetometers.
     RecordError, ReadError, DataError
         A record or recording cannot be read, or does not say what it is asked.
 
@@ -86,9 +92,13 @@ def plan_tumble(
     (18, 5.8)
     >>> plan.save("plan.csv")
     >>> plan.report("plan.html")
+    >>> il.plan_tumble(16, noise="20ug", order=1, with_="mag").headings.facing(0)
+    '+y to the east'
     """
     number = whole(order, "order")
     check_method(method, number)
+    if with_ not in (None, "mag"):
+        raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings")
     sigma, source = _noise(noise)
     distinct = method == "linearised" if distinct_verticals is None else distinct_verticals
     found = plan.plan_tumble(
@@ -100,7 +110,13 @@ def plan_tumble(
         source=from_ if isinstance(from_, str) else "from_",
         distinct_verticals=distinct,
     )
-    return TumblePlan(**vars(found), criterion=criterion, noise=sigma, noise_from=source, distinct_verticals=distinct)
+    headings = None
+    if with_ is not None:
+        headings = plan_headings(found.directions, before=None if add is None else _measured_headings(add))
+    return TumblePlan(
+        **vars(found), criterion=criterion, noise=sigma, noise_from=source, distinct_verticals=distinct,
+        headings=headings,
+    )  # fmt: skip
 
 
 def _record(data: object) -> Calibration | None:
@@ -209,3 +225,21 @@ def _measured_directions(given: Any) -> Array:
             force = found.mean
     directions: Array = force / np.linalg.norm(force, axis=1, keepdims=True)
     return directions
+
+
+def _measured_headings(given: Any) -> tuple[Array, Array] | None:
+    """Upward directions and those of north of a plan with headings or a record with magnetometers; None of others."""
+    if isinstance(given, TumblePlan):
+        return None if given.headings is None else (given.directions, given.headings.north)
+    if isinstance(given, Plan | np.ndarray | list | tuple):
+        return None
+    record = _record(given)
+    if record is None:
+        recording = as_recording(given, {}, plan_tumble, name="add")
+        up, north = directions_of(recording), norths_of(recording)
+        return None if up is None or north is None else (up, north)
+    held = data_of(record).mag
+    if held is None:
+        return None
+    axes = world_axes(np.array(held.field)[held.used], np.array(held.force)[held.used])
+    return axes[:, 2], axes[:, 1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import DataError, UnitError
 from imulab.procedures.tumble.plan import Plan, roll_pitch
 from imulab.recording import Array, Recording, check_finite
@@ -20,13 +21,15 @@ _SHADES = ("#c8553d", "#1f6f8b", "#d9c27a")
 _LETTERS = ("#ffffff", "#ffffff", "#22303a")
 
 
-def plan_recording(plan: Plan) -> Recording:
-    """Return a plan as a table: number, upward direction in the body frame, roll and pitch."""
+def plan_recording(plan: Plan, north: Array | None = None) -> Recording:
+    """Return a plan as a table: number, upward direction in the body frame (and that of north), roll and pitch."""
     angles = roll_pitch(plan.directions)
     columns = {"number": np.arange(1.0, len(plan.directions) + 1)}
     columns |= {f"up_{axis}": np.round(plan.directions[:, i], 6) + 0.0 for i, axis in enumerate("xyz")}
+    if north is not None:
+        columns |= {f"north_{axis}": np.round(north[:, i], 6) + 0.0 for i, axis in enumerate("xyz")}
     columns |= {name: np.round(np.degrees(angles[:, i]), 3) + 0.0 for i, name in enumerate(("roll", "pitch"))}
-    units = {"number": "1", "up_x": "1", "up_y": "1", "up_z": "1", "roll": "deg", "pitch": "deg"}
+    units = {name: "deg" if name in ("roll", "pitch") else "1" for name in columns}
     return Recording(columns=columns, units=units, metadata={"order": str(plan.order)}, name="plan")
 
 
@@ -40,9 +43,9 @@ def directions_of(recording: Recording) -> Array | None:
     UnitError
         Roll or pitch is no angle.
     """
-    if all(f"up_{axis}" in recording for axis in "xyz"):
-        up = np.column_stack([recording.column(f"up_{axis}") for axis in "xyz"])
-        check_finite(recording, [f"up_{axis}" for axis in "xyz"])
+    if all(name in recording for name in triad("up")):
+        check_finite(recording, triad("up"))
+        up = recording.triad("up")
     elif "roll" in recording and "pitch" in recording:
         for name in ("roll", "pitch"):
             if parse_unit(recording.units[name]).quantity != "angle":
@@ -55,23 +58,46 @@ def directions_of(recording: Recording) -> Array | None:
         up = np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
     else:
         return None
-    length = np.linalg.norm(up, axis=1)
+    return _units(up, recording)
+
+
+def norths_of(recording: Recording) -> Array | None:
+    """Return the directions of north of a plan with headings, shape (n, 3), level; None where it has none.
+
+    Raises
+    ------
+    DataError
+        A direction has no level part or is not finite.
+    """
+    if not all(name in recording for name in (*triad("up"), *triad("north"))):
+        return None
+    check_finite(recording, triad("north"))
+    up, north = _units(recording.triad("up"), recording), recording.triad("north")
+    return _units(north - np.einsum("ni,ni->n", up, north)[:, None] * up, recording)
+
+
+def _units(vectors: Array, recording: Recording) -> Array:
+    length = np.linalg.norm(vectors, axis=1)
     bad = ~(length > 0.1)
     if bad.any():
         index = int(np.argmax(bad))
         raise DataError(f"{recording.name}: {recording.place(index)}: expected a direction, found one without length")
-    directions: Array = up / length[:, None]
+    directions: Array = vectors / length[:, None]
     return directions
 
 
-def attitude_picture(up: Array) -> str:
-    """Return an SVG of the unit as a box in one attitude, seen slightly from above, axes lettered."""
-    turned = _CORNERS @ _to_level(up).T
+def attitude_picture(up: Array, north: Array | None = None) -> str:
+    """Return an SVG of the unit as a box in one attitude, seen slightly from above, axes lettered.
+
+    With the direction of north in the body frame the box faces as it is to lie, beside an arrow to the north.
+    """
+    level = _to_level(up) if north is None else np.array([np.cross(north, up), north, up])
+    turned = _CORNERS @ level.T
     view = turned @ _camera().T
     points = view[:, :2] * [_SIZE * 0.5, -_SIZE * 0.5] + _SIZE
     normals = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
-    facing = (normals @ _to_level(up).T @ _camera().T)[:, 2]
-    shapes = []
+    facing = (normals @ level.T @ _camera().T)[:, 2]
+    shapes = [] if north is None else [_arrow()]
     for (axis, corners, text), toward in zip(_FACES, facing, strict=True):
         if toward <= 0.02:
             continue
@@ -89,6 +115,23 @@ def attitude_picture(up: Array) -> str:
             )
     side = 2 * _SIZE
     return f'<svg viewBox="0 0 {side:.0f} {side:.0f}" width="150" height="150" role="img">{"".join(shapes)}</svg>'
+
+
+def _arrow() -> str:
+    """An arrow on the floor, from the lower left to where north is, which is away from the viewer and to the right."""
+    tip = _camera()[:2, 1] * [_SIZE * 0.35, -_SIZE * 0.35]
+    start = np.array([8.0, 2 * _SIZE - 6.0])
+    end = start + tip
+    along = tip / np.hypot(*tip)
+    across = np.array([-along[1], along[0]])
+    head = " ".join(f"{x:.1f},{y:.1f}" for x, y in (end, end - 6 * along + 3 * across, end - 6 * along - 3 * across))
+    x, y = end + 7 * along
+    return (
+        f'<path d="M{start[0]:.1f} {start[1]:.1f}L{end[0]:.1f} {end[1]:.1f}" stroke="#22303a"/>'
+        f'<polygon points="{head}" fill="#22303a"/>'
+        f'<text x="{x:.1f}" y="{y:.1f}" font-size="10" text-anchor="middle" dominant-baseline="central" '
+        'fill="#22303a">N</text>'
+    )
 
 
 def _narrowest(outline: Array) -> float:

@@ -12,6 +12,8 @@ from imulab.procedures.tumble.mag.solve import Joint, Pair, weighted_jacobian
 from imulab.recording import Array
 
 FALSE_ALARM = 0.05
+WORST_CONDITION = 30.0
+"""Attitudes that all face one way have 45 and more; within 20 deg of one way 7, at any heading 3."""
 _BLIND = 1 / 2000
 """Singular value, relative to the largest, below which a combination is not determined."""
 _HELPS = 0.05

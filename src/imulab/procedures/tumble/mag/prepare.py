@@ -16,7 +16,7 @@ from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_f
 from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
 from imulab.procedures.tumble.findings import Estimate
 from imulab.procedures.tumble.mag.field import FEWEST, FieldMeans, check_magnitude, field_means
-from imulab.procedures.tumble.mag.judge import Seen, seen
+from imulab.procedures.tumble.mag.judge import WORST_CONDITION, Seen, seen
 from imulab.procedures.tumble.mag.model import ACCELEROMETERS, MAGNETOMETERS, triad
 from imulab.procedures.tumble.mag.pointing import find_held
 from imulab.procedures.tumble.mag.scaling import MagScaling, Ready, nominal_mag
@@ -29,8 +29,6 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
 _DISAGREES = 1e-3
-_WORST_CONDITION = 30.0
-"""Attitudes that all face one way have 45 and more; within 20 deg of one way 7, at any heading 3."""
 
 
 def prepare(
@@ -195,7 +193,7 @@ def _pair(
 
 def check_seen(what: Seen, kept: NDArray[np.intp], name: str) -> None:
     """Refuse attitudes that leave something blind, and say what would help."""
-    if what.rank == what.size and what.condition < _WORST_CONDITION:
+    if what.rank == what.size and what.condition < WORST_CONDITION:
         return
     blind = " and ".join(f"({', '.join(f'{part:+.2f}' for part in axis)})" for axis in what.blind)
     cannot = (
