@@ -1,9 +1,13 @@
 """The correction formulas of other programs, read from their files; nothing of imulab.
 
 PX4: sensor_calibration. ArduPilot: AP_InertialSensor_Backend. Kalibr: IccScaledMisalignedImu. OpenVINS: propagation
-derivations. imu_calib: accel_calib.cpp.
+derivations. imu_calib: accel_calib.cpp. magnetometer_pipeline: bias_remover.cpp. Fusion: FusionCalibration.h. Adafruit
+and MotionCal: Adafruit_Sensor_Calibration and its EEPROM.
 """
 
+import re
+import struct
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -107,3 +111,95 @@ def imu_calib(path: Path):
     assert sm.shape == (9,)
     assert bias.shape == (3,)
     return lambda raw: raw @ sm.reshape(3, 3).T - bias
+
+
+def magnetometer_pipeline(path: Path):
+    """lastScale * (field - lastBias), tesla."""
+    content = yaml.safe_load(path.read_text())
+    bias = np.array([content[f"initial_mag_bias_{a}"] for a in "xyz"])
+    scale = _numbers(content["initial_mag_scaling_matrix"]).reshape(3, 3)
+    return lambda raw: (raw - bias) @ scale.T
+
+
+FUSION = r"""
+#include <stdio.h>
+typedef union { float array[3]; struct { float x; float y; float z; } axis; } FusionVector;
+typedef union { float array[3][3]; struct { float xx, xy, xz, yx, yy, yz, zx, zy, zz; } element; } FusionMatrix;
+static FusionVector multiply(const FusionMatrix m, const FusionVector v) {
+    FusionVector r;
+    r.axis.x = m.element.xx * v.axis.x + m.element.xy * v.axis.y + m.element.xz * v.axis.z;
+    r.axis.y = m.element.yx * v.axis.x + m.element.yy * v.axis.y + m.element.yz * v.axis.z;
+    r.axis.z = m.element.zx * v.axis.x + m.element.zy * v.axis.y + m.element.zz * v.axis.z;
+    return r;
+}
+static FusionVector subtract(FusionVector a, const FusionVector b) {
+    for (int i = 0; i < 3; i++) a.array[i] -= b.array[i];
+    return a;
+}
+static FusionVector hadamard(FusionVector a, const FusionVector b) {
+    for (int i = 0; i < 3; i++) a.array[i] *= b.array[i];
+    return a;
+}
+static FusionVector FusionModelInertial(const FusionVector uncalibrated, const FusionMatrix misalignment,
+                                        const FusionVector sensitivity, const FusionVector offset) {
+    return multiply(misalignment, hadamard(subtract(uncalibrated, offset), sensitivity));
+}
+static FusionVector FusionModelMagnetic(const FusionVector uncalibrated, const FusionMatrix softIronMatrix,
+                                        const FusionVector hardIronOffset) {
+    return multiply(softIronMatrix, subtract(uncalibrated, hardIronOffset));
+}
+#include "imulab_fusion.h"
+int main(void) {
+    FusionVector a, w, m;
+    while (scanf("%f %f %f %f %f %f %f %f %f", &a.axis.x, &a.axis.y, &a.axis.z, &w.axis.x, &w.axis.y, &w.axis.z,
+                 &m.axis.x, &m.axis.y, &m.axis.z) == 9) {
+        a = FusionModelInertial(a, accelerometerMisalignment, accelerometerSensitivity, accelerometerOffset);
+        w = FusionModelInertial(w, gyroscopeMisalignment, gyroscopeSensitivity, gyroscopeOffset);
+        m = FusionModelMagnetic(m, softIronMatrix, hardIronOffset);
+        printf("%.9g %.9g %.9g %.9g %.9g %.9g %.9g %.9g %.9g\n", a.axis.x, a.axis.y, a.axis.z, w.axis.x, w.axis.y,
+               w.axis.z, m.axis.x, m.axis.y, m.axis.z);
+    }
+    return 0;
+}
+"""
+
+
+def fusion(path: Path, accel, gyro, mag):
+    """The header compiled with Fusion's types and formulas: calibrated accelerometer, gyroscope and magnetometer."""
+    source = path.parent / "main.c"
+    source.write_text(FUSION)
+    program = path.parent / "main"
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wno-missing-braces", f"-I{path.parent}"]
+    subprocess.run(["cc", *strict, str(source), "-o", str(program)], check=True, timeout=60)
+    rows = "\n".join(" ".join(map(repr, row)) for row in np.hstack([accel, gyro, mag]).tolist())
+    done = subprocess.run([str(program)], input=rows, capture_output=True, text=True, check=True, timeout=60)
+    found = np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
+    return found[:, :3], found[:, 3:6], found[:, 6:]
+
+
+def adafruit(path: Path):
+    """The bytes as Adafruit's EEPROM calibration loads them, and the lines for its sketches: raw -> corrected, uT."""
+    text = path.read_text()
+    data = bytes.fromhex(text.splitlines()[-1])
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ 0xA001 if crc & 1 else crc >> 1
+    assert (crc, len(data), data[0], data[1]) == (0, 68, 0x75, 0x54)
+    offsets = struct.unpack("<16f", data[2:66])
+    assert offsets[:6] == (0.0,) * 6
+    hard, field = np.array(offsets[6:9]), offsets[9]
+    soft = np.array(offsets)[[10, 13, 14, 13, 11, 15, 14, 15, 12]]
+    cal = {"mag_hardiron": np.zeros(3), "mag_softiron": np.zeros(9)}
+    for name, index, value in re.findall(r"^cal\.(mag_\w+)\[(\d)\] = (\S+)f;$", text, re.M):
+        cal[name][int(index)] = np.float32(value)
+    np.testing.assert_array_equal(cal["mag_hardiron"], hard)
+    np.testing.assert_array_equal(cal["mag_softiron"], soft)
+    assert np.float32(re.search(r"cal\.mag_field = (\S+)f;", text)[1]) == field
+    shown = {key: re.findall(rf"^{key} +(.*)$", text, re.M) for key in ("V", "B", "invW")}
+    rows = {key: np.array(" ".join(lines).split(), dtype=np.float32) for key, lines in shown.items()}
+    np.testing.assert_array_equal(rows["V"], hard)
+    np.testing.assert_array_equal(rows["invW"], soft)
+    assert rows["B"] == field
+    return lambda raw: (raw - hard) @ soft.reshape(3, 3).T, field

@@ -18,7 +18,7 @@ def export(
         typer.Option(
             "--to",
             metavar="TARGET",
-            help="c blob px4 ardupilot kalibr openvins ros.",
+            help="c blob px4 ardupilot kalibr openvins ros fusion motioncal.",
             autocompletion=lists("imulab.exporters:EXPORTERS"),
         ),
     ],

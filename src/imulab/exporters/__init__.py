@@ -12,7 +12,7 @@ from imulab.device.array_settings import Fusion
 from imulab.errors import OptionError, listed
 from imulab.records.calibration import Calibration
 
-EXPORTERS = ("c", "blob", "px4", "ardupilot", "kalibr", "openvins", "ros")
+EXPORTERS = ("c", "blob", "px4", "ardupilot", "kalibr", "openvins", "ros", "fusion", "motioncal")
 """Targets, a module each, which has ``export(records, folder, options) -> list of the files written``."""
 
 
@@ -20,7 +20,6 @@ def _nothing(message: str) -> None:
     """Tell nobody."""
 
 
-_WITH_MAGNETOMETERS = ("c", "blob", "px4", "ardupilot")
 MAG_MOUNTS = ("external", "internal")
 
 
@@ -66,6 +65,4 @@ def export(
         raise OptionError(f"unknown target {target!r}; known targets: {listed(EXPORTERS, target)}")
     chosen = options or ExportOptions()
     files: list[Path] = import_module(f"imulab.exporters.{target}").export(records, Path(folder), chosen)
-    if target not in _WITH_MAGNETOMETERS and any("mag_bias_x" in record.parameters for record in records):
-        chosen.tell(f"{target}: its file has no place for magnetometers: theirs are left out")
     return files

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from imulab.exporters import ExportOptions
-from imulab.exporters.magnetometer import Magnetometers, magnetometers, settle
+from imulab.exporters.magnetometer import FieldCorrection, symmetric
 from imulab.exporters.model import (
     UnitModel,
     accel_terms,
@@ -31,7 +31,7 @@ class Corrections:
     offset: Array
     scale: Array
     rest: Array | None
-    mag: Magnetometers | None
+    mag: FieldCorrection | None
     lost: list[str]
 
 
@@ -60,7 +60,8 @@ def corrections(
         how=how,
         options=options,
     )
-    mag = magnetometers(unit.record, target)
-    if mag is not None:
-        lost += settle(mag, target, options, turned=options.mag_mount == "external")
+    mag = None
+    if unit.mag is not None:
+        mag, left_out = symmetric(unit.mag, target, options, turned=options.mag_mount == "external")
+        lost += left_out
     return Corrections(unit, offset, scale, None if gyro is None else gyro.scale * gyro.bias, mag, lost)

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.device.tables import DeviceTable, field_of
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
-from imulab.procedures.unit_tables import tables_of
 from imulab.recording import Array
-from imulab.records.calibration import Calibration
+from imulab.records.triads import Magnetometers
 from imulab.units import parse_unit
 
 _NEGLIGIBLE = np.radians(0.01)
@@ -24,15 +22,17 @@ _NEGLIGIBLE_QUADRATIC = 1e-4
 
 
 @dataclass(frozen=True)
-class Magnetometers:
+class FieldCorrection:
     """``m = W (M - h)`` in the unit of the outputs: W, shape (3, 3), keeps the field's magnitude; h, shape (3,).
 
-    `unit` is that of the outputs; `quadratic` is the largest quadratic term, as a part of the field.
+    `unit` is that of the outputs; `magnitude` the field's in it; `quadratic` is the largest quadratic term, as a part
+    of the field.
     """
 
     matrix: Array
     hard_iron: Array
     unit: str
+    magnitude: float
     quadratic: float
 
     @property
@@ -52,52 +52,52 @@ class Magnetometers:
         return self.hard_iron * parse_unit(self.unit).factor / parse_unit(symbol).factor
 
 
-def magnetometers(record: Calibration, target: str) -> Magnetometers | None:
-    """Return the magnetometers of a record, None where it has none.
+def largest_quadratic(mag: Magnetometers) -> float:
+    """Return the largest quadratic term, as a part of the field."""
+    return float(np.abs(mag.quadratic).max()) * (1.0 if mag.field is None else mag.field)
+
+
+def in_field(mag: Magnetometers) -> bool:
+    """Return whether the outputs are in a unit of field."""
+    return parse_unit(mag.unit).quantity == "magnetic field"
+
+
+def field_correction(mag: Magnetometers, target: str) -> FieldCorrection:
+    """Return the correction of a unit's magnetometers in the unit of their outputs.
+
+    Where the field's magnitude was not stated, the mean sensitivity of the outputs is taken as right.
 
     Raises
     ------
     OptionError
-        Their outputs are no field, or are mirrored: no rotation turns them into the body frame.
+        Their outputs are no field.
     """
-    table = next((table for table in tables_of(record, None) if table.kind == "mag"), None)
-    if table is None:
-        return None
-    unit = str(table.columns["output_unit"])
-    if parse_unit(unit).quantity != "magnetic field":
-        raise OptionError(f"{target}: corrects magnetometers in units of field, but the record has outputs in {unit}")
-    matrix, hard_iron = _linear(table)
-    # Where the field's magnitude was not stated, the mean sensitivity of the outputs is taken as right.
-    known = table.columns["field_unit"] == "T"
-    scale = 1 / parse_unit(unit).factor if known else 1 / float(np.cbrt(abs(np.linalg.det(matrix))))
-    if np.linalg.det(matrix) < 0:
+    if not in_field(mag):
         raise OptionError(
-            f"{target}: the magnetometers' axes are left-handed: no rotation turns them into the body frame"
+            f"{target}: corrects magnetometers in units of field, but the record has outputs in {mag.unit}"
         )
-    quadratic = field_of(table, "quadratic") if int(field_of(table, "order")) == 2 else np.zeros(3)
-    largest = float(np.abs(quadratic).max()) * (5e-5 if known else 1.0)
-    return Magnetometers(scale * matrix, hard_iron, unit, largest)
+    matrix = mag.soft_iron
+    if mag.field is not None:
+        scale = 1 / parse_unit(mag.unit).factor
+        magnitude = mag.field * scale
+    else:
+        magnitude = scale = 1 / float(np.cbrt(abs(np.linalg.det(matrix))))
+    return FieldCorrection(scale * matrix, mag.hard_iron, mag.unit, magnitude, largest_quadratic(mag))
 
 
-def _linear(table: DeviceTable) -> tuple[Array, Array]:
-    """W and h of raw outputs, without quadratic terms."""
-    gain = field_of(table, "gain")
-    return field_of(table, "turn") * gain, field_of(table, "bias") / gain
+def quadratic_loss(part: float) -> list[str]:
+    """Name quadratic terms that a target leaves out, where they matter; `part` is the largest, of the field."""
+    return [f"mag_k2, {100 * part:.2g} % of the field"] if part > _NEGLIGIBLE_QUADRATIC else []
 
 
-def settle(mag: Magnetometers, target: str, options: ExportOptions, *, turned: bool) -> list[str]:
-    """Refuse what the target would lose, or return comments that say so; `turned`: it holds the rotation.
+def settle_magnetometers(lost: list[str], target: str, options: ExportOptions) -> list[str]:
+    """Refuse what a target would lose of the magnetometers, or return comments that say so, and tell them.
 
     Raises
     ------
     OptionError
         Something that matters would be lost, and that was not asked for.
     """
-    lost = []
-    if not turned and mag.angle > _NEGLIGIBLE:
-        lost.append(f"how the magnetometers are turned against the accelerometers, {np.degrees(mag.angle):.3g} deg")
-    if mag.quadratic > _NEGLIGIBLE_QUADRATIC:
-        lost.append(f"mag_k2, {100 * mag.quadratic:.2g} % of the field")
     if not lost:
         return []
     if not options.lossy:
@@ -105,6 +105,27 @@ def settle(mag: Magnetometers, target: str, options: ExportOptions, *, turned: b
     comment = f"left out (lossy): {' and '.join(lost)}"
     options.tell(f"{target}: {comment}")
     return [comment]
+
+
+def symmetric(
+    magnetometers: Magnetometers, target: str, options: ExportOptions, *, turned: bool
+) -> tuple[FieldCorrection, list[str]]:
+    """Return the correction for a target that holds a symmetric matrix, with a rotation if `turned`, and what is lost.
+
+    Raises
+    ------
+    OptionError
+        The axes are mirrored, which no rotation is, or something would be lost and that was not asked for.
+    """
+    mag = field_correction(magnetometers, target)
+    if np.linalg.det(mag.matrix) < 0:
+        raise OptionError(
+            f"{target}: the magnetometers' axes are left-handed: no rotation turns them into the body frame"
+        )
+    lost = []
+    if not turned and mag.angle > _NEGLIGIBLE:
+        lost.append(f"how the magnetometers are turned against the accelerometers, {np.degrees(mag.angle):.3g} deg")
+    return mag, settle_magnetometers([*lost, *quadratic_loss(mag.quadratic)], target, options)
 
 
 def euler(rotation: Array) -> tuple[float, float, float]:
@@ -115,7 +136,7 @@ def euler(rotation: Array) -> tuple[float, float, float]:
     return float(np.degrees(roll)), float(np.degrees(pitch)), float(np.degrees(yaw))
 
 
-def px4_rows(mag: Magnetometers, options: ExportOptions) -> list[tuple[str, float | str]]:
+def px4_rows(mag: FieldCorrection, options: ExportOptions) -> list[tuple[str, float | str]]:
     """Return PX4's parameters: ``Rot (K (M - OFF))``, gauss, K symmetric.
 
     Raises
@@ -140,7 +161,7 @@ def px4_rows(mag: Magnetometers, options: ExportOptions) -> list[tuple[str, floa
     return [*rows, ("CAL_MAG0_ROT", "100"), *((f"CAL_MAG0_{name}", angle) for name, angle in angles)]
 
 
-def ardupilot_rows(mag: Magnetometers, options: ExportOptions) -> list[tuple[str, float]]:
+def ardupilot_rows(mag: FieldCorrection, options: ExportOptions) -> list[tuple[str, float]]:
     """Return ArduPilot's parameters: ``K (M + OFS)`` after COMPASS_ORIENT, mgauss, K symmetric.
 
     Raises

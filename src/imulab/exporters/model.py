@@ -17,7 +17,7 @@ from imulab.printable import printable
 from imulab.procedures.registry import PROCEDURES, procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.records.triads import CROSS_TERMS, NOT_FITTED, Accelerometers, Gyroscopes, text_in_g
+from imulab.records.triads import CROSS_TERMS, NOT_FITTED, Accelerometers, Gyroscopes, Magnetometers, text_in_g
 from imulab.units import STANDARD_GRAVITY
 
 AXES = "xyz"
@@ -32,6 +32,7 @@ class UnitModel:
     record: Calibration
     accel: Accelerometers
     gyro: Gyroscopes | None
+    mag: Magnetometers | None
 
     @property
     def origin(self) -> list[str]:
@@ -70,7 +71,7 @@ def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
         triads = triads_of(record)
     except RecordError as error:
         raise RecordError(f"{target}: {error}") from None
-    return UnitModel(record, triads.accel, triads.gyro)
+    return UnitModel(record, triads.accel, triads.gyro, triads.mag)
 
 
 def refuse_raw(unit: UnitModel, target: str) -> None:

@@ -109,4 +109,8 @@ def without_nonlinearity(unit: UnitModel, target: str, options: ExportOptions) -
     """Return the unit as a target with a full matrix and a bias holds it, and the comment on what is left out."""
     accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
     lost = settle_losses(target, (accel_terms(unit.accel, misalignment=False), error), how=how, options=options)
+    if unit.mag is not None:
+        comment = "its file has no place for magnetometers: theirs are left out"
+        options.tell(f"{target}: {comment}")
+        lost.append(comment)
     return replace(unit, accel=accel), lost

@@ -48,7 +48,7 @@ def export(
     Parameters
     ----------
     to
-        One of ``c blob px4 ardupilot kalibr openvins ros``.
+        One of ``c blob px4 ardupilot kalibr openvins ros fusion motioncal``.
     records
         The unit's records, or their files; one or several.
     folder

@@ -1,7 +1,7 @@
 """The triads of a unit as matrices, as other programs hold them: what a procedure makes of its record for exporters.
 
 Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyroscopes: ``M = S (T w + G f + b)``.
-Outputs M are in SI, or in counts or volts.
+Outputs M are in SI, or in counts or volts. Magnetometers: ``s = T m``, ``A = s + k2 s^2``, ``P M = S (A + b)``.
 """
 
 from __future__ import annotations
@@ -62,11 +62,41 @@ class Accelerometers:
 
 
 @dataclass(frozen=True)
+class Magnetometers:
+    """``P M = S (A + b)``, ``A = s + k2 s^2``, ``s = T m``: what a unit's magnetometers put out in a field m.
+
+    Scale factor S (3,), matrix T (3, 3), bias (3,), k2 (3,), signed permutation P (3, 3), the unit of outputs M, and
+    the magnitude of the field, T; None where that is not known, and m is in units of it.
+    """
+
+    scale: Array
+    matrix: Array
+    bias: Array
+    quadratic: Array
+    axes: Array
+    unit: str
+    field: float | None
+
+    @property
+    def soft_iron(self) -> Array:
+        """W of ``m = W (M - h)``, without quadratic terms, shape (3, 3)."""
+        w: Array = np.asarray(np.linalg.solve(self.matrix, self.axes / self.scale[:, None]), dtype=np.float64)
+        return w
+
+    @property
+    def hard_iron(self) -> Array:
+        """The h of ``m = W (M - h)``, in the unit of the outputs, shape (3,)."""
+        h: Array = self.axes.T @ (self.scale * self.bias)
+        return h
+
+
+@dataclass(frozen=True)
 class Triads:
-    """The accelerometers of a unit, and its gyroscopes, None where the record has none."""
+    """The accelerometers of a unit, and its gyroscopes and magnetometers, None where the record has none."""
 
     accel: Accelerometers
     gyro: Gyroscopes | None
+    mag: Magnetometers | None = None
 
 
 @dataclass(frozen=True)

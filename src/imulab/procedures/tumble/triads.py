@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.procedures.tumble.device import mag_axes
 from imulab.procedures.tumble.refit import refit_linear
 from imulab.procedures.tumble.sections import data_of, fit_of, model_of
 from imulab.records.calibration import Calibration
-from imulab.records.triads import CROSS_TERMS, Accelerometers, Gyroscopes, LinearFit, Triads, output_to_si, text_in_g
+from imulab.records.triads import (
+    CROSS_TERMS,
+    Accelerometers,
+    Gyroscopes,
+    LinearFit,
+    Magnetometers,
+    Triads,
+    output_to_si,
+    text_in_g,
+)
 from imulab.report.elements import plain_number
 
 _AXES = "xyz"
@@ -21,7 +31,7 @@ def triads_of(record: Calibration) -> Triads:
     RecordError
         It lacks a parameter.
     """
-    return Triads(_accelerometers(record), _gyroscopes(record))
+    return Triads(_accelerometers(record), _gyroscopes(record), _magnetometers(record))
 
 
 def linear_fit(record: Calibration, *, misalignment: bool) -> LinearFit:
@@ -81,4 +91,22 @@ def _gyroscopes(record: Calibration) -> Gyroscopes | None:
         sensitivity=sensitivity,
         bias=np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES]),
         unit=kept,
+    )
+
+
+def _magnetometers(record: Calibration) -> Magnetometers | None:
+    if "mag_output_unit" not in record.model:
+        return None
+    model = model_of(record)
+    matrix = np.eye(3)
+    for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
+        matrix[i, j] = record.value(f"mag_misalignment_{_AXES[i]}{_AXES[j]}")
+    return Magnetometers(
+        scale=np.array([record.value(f"mag_scale_factor_{axis}") for axis in _AXES]),
+        matrix=matrix,
+        bias=np.array([record.value(f"mag_bias_{axis}") for axis in _AXES]),
+        quadratic=np.array([record.value(f"mag_k2_{axis}") if model.mag_order == 2 else 0.0 for axis in _AXES]),
+        axes=mag_axes(model.mag_axes),
+        unit=model.mag_output_unit,
+        field=model.field.value if model.field is not None and model.field.unit == "T" else None,
     )
