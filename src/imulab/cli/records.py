@@ -54,11 +54,14 @@ def apply(
             help="Take a missing power-on temperature from the first row's column temperature (warm-up).",
         ),
     ] = False,
+    heading: Annotated[
+        bool, typer.Option("--heading", help="Add columns of magnetic heading and dip, deg, with uncertainties.")
+    ] = False,
     output: OutputFile = None,
 ) -> None:
     """Correct a recording by one or more records, in the order given; CSV or Parquet to OUT, CSV to standard output."""
     from imulab.power_on import with_power_on_temperature
-    from imulab.procedures.apply import apply_blocks, loaded
+    from imulab.procedures.apply import apply_blocks, loaded, with_heading
     from imulab.procedures.loading import load_any
     from imulab.readers import read_blocks
 
@@ -86,6 +89,8 @@ def apply(
                     latest_start=start,
                 )
             )
+    if heading:
+        chain = with_heading(chain, records)
     blocks = with_notes(read_blocks(file, **how), notes=False)
     if temperature_column and any(part.since_power_on for ready in chain for part, _ in ready.sections):
         blocks = with_power_on_temperature(blocks)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from os import PathLike, fspath
@@ -13,7 +13,7 @@ from typing import Any, Unpack
 from imulab.columns import KINDS, triad
 from imulab.device.blob import Blob
 from imulab.device.unit import DeviceUnit
-from imulab.errors import DataError, RecordError
+from imulab.errors import DataError, OptionError, RecordError
 from imulab.power_on import with_power_on_temperature
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.loading import load_any
@@ -44,6 +44,8 @@ class Loaded:
         SHA-256 of the record; for a blob its own, then those of the records it was made from.
     again
         Whether it is applied to a recording that it corrected before.
+    further
+        What adds columns to the corrected recording; None where nothing does.
     """
 
     unit: DeviceUnit
@@ -51,6 +53,7 @@ class Loaded:
     name: str
     holds: tuple[str, ...]
     again: bool = False
+    further: Callable[[Recording], Recording] | None = None
 
 
 def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool = False, **columns: Any) -> Loaded:
@@ -94,6 +97,31 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
     return Loaded(DeviceUnit.of(*tables), chain, called, (record.sealed()[0],), again)
 
 
+def with_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob]) -> list[Loaded]:
+    """Return the same, of which the last that can adds magnetic heading and dip.
+
+    Raises
+    ------
+    RecordError
+        None of the records holds accelerometers and magnetometers.
+    """
+    found, why = list(chain), ""
+    for index in reversed(range(len(records))):
+        record = records[index]
+        law = None if isinstance(record, Blob) else procedure_of(record).heading
+        if law is None or isinstance(record, Blob):
+            kind = "a blob" if isinstance(record, Blob) else f"a {record.procedure} record"
+            why = why or f"{found[index].name}: heading needs a record with magnetometers, found {kind}"
+            continue
+        try:
+            found[index] = replace(found[index], further=law(record))
+        except RecordError as error:
+            why = f"{found[index].name}: {error}"
+            continue
+        return found
+    raise RecordError(why)
+
+
 def apply(
     record: Record | Blob | Loaded,
     data: Data,
@@ -101,6 +129,7 @@ def apply(
     again: bool = False,
     latest_start: float | str = "5 s",
     temperature_column: bool = False,
+    heading: bool = False,
     **reading: Unpack[Reading],
 ) -> Recording:
     """Return data corrected by a record; columns that it does not touch pass unchanged.
@@ -120,6 +149,10 @@ def apply(
         A recording that starts later after power-on, s, is refused by a warm-up table.
     temperature_column
         Whether a warm-up table takes a power-on temperature that is missing from the first row's column temperature.
+    heading
+        Whether to add columns ``heading`` (of the body's x axis, clockwise from magnetic north), ``std_heading``,
+        ``dip`` and ``std_dip``, deg, of a unit at rest, with standard uncertainties by the record's covariance, the
+        scatter of its attitudes, and the acceleration that shows where |f| is off g by more than 1 %.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.
@@ -127,7 +160,7 @@ def apply(
     Raises
     ------
     RecordError
-        The record's procedure has nothing to apply here.
+        The record's procedure has nothing to apply here, or `heading` is asked of one without magnetometers.
     UnitError
         The recording's unit cannot be converted to the record's.
     DataError
@@ -153,6 +186,10 @@ def apply(
         ready = record
     else:
         ready = loaded(record, name, again=again, latest_start=in_si(latest_start, "latest_start", "time", "s"))
+    if heading:
+        if isinstance(record, Loaded):
+            raise OptionError("heading: expected a record, found one that was loaded without")
+        (ready,) = with_heading([ready], [record])
     before = {entry.rpartition("sha256:")[2] for entry in recording.corrected_by}
     if not ready.again and before.intersection(ready.holds):
         raise DataError(
@@ -165,6 +202,8 @@ def apply(
     for part, columns in sections_for(ready.sections, recording):
         assert part.apply is not None
         corrected = part.apply(ready.unit, columns, corrected)
+    if ready.further is not None:
+        corrected = ready.further(corrected)
     if corrected is recording:
         return recording
     return replace(corrected, corrected_by=(*recording.corrected_by, f"{ready.name} sha256:{ready.holds[0]}"))

@@ -71,9 +71,11 @@ def plots(record: Calibration, name: str | int | None) -> Plots | Plot:
     return found if name is None else found[name]
 
 
-def apply_to(record: Calibration, data: Any, again: bool, reading: Mapping[str, Any] | Reading) -> Recording:
+def apply_to(
+    record: Calibration, data: Any, reading: Mapping[str, Any] | Reading, *, again: bool, heading: bool
+) -> Recording:
     """Return data corrected by a record."""
-    return apply(record, as_recording(data, reading, Calibration.apply), again=again)
+    return apply(record, as_recording(data, reading, Calibration.apply), again=again, heading=heading)
 
 
 def export_to(record: Calibration, target: str, folder: str | Path, **options: Any) -> list[Path]:

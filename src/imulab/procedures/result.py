@@ -58,9 +58,9 @@ class Result:
         return self.calibration.cov(*names)
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, **reading: Unpack[Reading]) -> Recording:
+    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Recording:
         """Return data corrected by the record; see `Calibration.apply`."""
-        return self.calibration.apply(data, again=again, **reading)
+        return self.calibration.apply(data, again=again, heading=heading, **reading)
 
     @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:

@@ -291,11 +291,11 @@ class Calibration:
         return self.covariance.block(names) if names else self.covariance.array()
 
     @checked
-    def apply(self, data: Data, *, again: bool = False, **reading: Unpack[Reading]) -> Recording:
+    def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Recording:
         """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`."""
         from imulab.procedures import front
 
-        return front.apply_to(self, data, again, reading)
+        return front.apply_to(self, data, reading, again=again, heading=heading)
 
     @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:

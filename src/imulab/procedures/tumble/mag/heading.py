@@ -1,0 +1,178 @@
+"""Magnetic heading and dip of each sample, with their uncertainties.
+
+With the corrected f and m, ``a = m x f`` points to magnetic east and ``n = f x a`` to magnetic north; the heading of
+the body's x axis, clockwise from north, and the dip are
+
+    heading = atan2(|f| a_x, n_x),    dip = atan2(-m.f, |a|)
+
+A sample's uncertainty is that of the record's parameters, through ``dv = T^-1 (ds - dT v)``,
+``ds = (-(A + b) dS/S - db - sum dk_j s^j) / A'(s)`` of both triads with their common covariance, and of the noise that
+the record's attitudes show. A unit that moves has ``|f|^2 = g^2 + a^2`` with a level acceleration a: where |f| is off
+g by more than 1 %, which gravity and calibration are not, a counts as noise of each axis of f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.columns import triad
+from imulab.errors import DataError, RecordError
+from imulab.procedures.tumble.mag.model import ACCELEROMETERS, MAGNETOMETERS, Pairs, mag_names
+from imulab.procedures.tumble.model import parameter_names
+from imulab.procedures.tumble.sections import fit_of, model_of
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration
+from imulab.units import from_si
+
+_AT_REST = 1e-2
+"""Parts of g by which |f| may be off at rest: gravity differs by 0.5 % from pole to equator."""
+_UNKNOWN = np.pi / np.sqrt(3)
+"""Standard deviation of an angle that may be any."""
+
+
+@dataclass(frozen=True)
+class Triad:
+    """A calibrated triad: bias, scale factor, shape (3,), T, (3, 3), its free places, and k2, k3 ..., (orders, 3)."""
+
+    bias: Array
+    scale: Array
+    turn: Array
+    pairs: Pairs
+    powers: Array
+
+    @classmethod
+    def of(cls, values: Array, pairs: Pairs) -> Triad:
+        """Return that of parameters in SI, in the order of a record."""
+        fixed, turn = 6 + len(pairs), np.eye(3)
+        turn[tuple(np.transpose(pairs))] = values[6:fixed]
+        return cls(values[:3], values[3:6], turn, pairs, values[fixed:].reshape(-1, 3))
+
+    def slopes(self, vectors: Array, gradient: Array) -> Array:
+        """Return how something with a gradient by the vectors changes with the parameters; (n, 3), (n, 3) to (n, p)."""
+        s = vectors @ self.turn.T
+        along = gradient @ np.linalg.inv(self.turn)
+        orders = range(2, len(self.powers) + 2)
+        bent = sum((k * s**j for j, k in zip(orders, self.powers, strict=True)), s)
+        steep = sum((j * k * s ** (j - 1) for j, k in zip(orders, self.powers, strict=True)), np.ones_like(s))
+        by_bias = -along / steep
+        columns = [by_bias, by_bias * (bent + self.bias) / self.scale]
+        columns += [-along[:, i : i + 1] * vectors[:, j : j + 1] for i, j in self.pairs]
+        columns += [by_bias * s**j for j in orders]
+        return np.hstack(columns)
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Heading and dip, rad, with their standard uncertainties, each of shape (n,)."""
+
+    heading: Array
+    heading_uncertainty: Array
+    dip: Array
+    dip_uncertainty: Array
+
+
+@dataclass(frozen=True)
+class Law:
+    """What heading and dip follow from: both triads, the covariance of their parameters, noise of f and m, gravity.
+
+    `force_noise` is in m/s^2, `field_noise` a part of the field, each of one axis.
+    """
+
+    accel: Triad
+    mag: Triad
+    covariance: Array
+    force_noise: float
+    field_noise: float
+    gravity: float
+
+    @np.errstate(all="ignore")
+    def angles(self, force: Array, field: Array) -> Angles:
+        """Return heading and dip of f, m/s^2, and m, both calibrated, shape (n, 3)."""
+        f_length, m_length = np.linalg.norm(force, axis=1), np.linalg.norm(field, axis=1)
+        inner = np.einsum("ni,ni->n", field, force)
+        (fx, fy, fz), (mx, my, mz) = force.T, field.T
+        zero, one = np.zeros_like(fx), np.eye(3)[0]
+        a_x, n_x = my * fz - mz * fy, mx * f_length**2 - fx * inner
+        by_field = (
+            (f_length * np.stack([zero, fz, -fy]) * n_x).T
+            - (f_length * a_x)[:, None] * (np.outer(f_length**2, one) - fx[:, None] * force)
+        )  # fmt: skip
+        by_force = (
+            ((f_length * np.stack([zero, -mz, my]) + a_x * force.T / f_length) * n_x).T
+            - (f_length * a_x)[:, None] * (2 * mx[:, None] * force - np.outer(inner, one) - fx[:, None] * field)
+        )  # fmt: skip
+        squared = (n_x**2 + (f_length * a_x) ** 2)[:, None]
+        heading = np.arctan2(f_length * a_x, n_x) % (2 * np.pi)
+        u_heading = self._uncertainty(force, field, by_force / squared, by_field / squared)
+        u, e = field / m_length[:, None], force / f_length[:, None]
+        dip = np.arctan2(-inner, np.linalg.norm(np.cross(field, force), axis=1))
+        sine, cosine = np.sin(dip)[:, None], np.cos(dip)[:, None]
+        t, v = -(e + u * sine) / cosine / m_length[:, None], -(u + e * sine) / cosine / f_length[:, None]
+        return Angles(heading, np.minimum(u_heading, _UNKNOWN), dip, self._uncertainty(force, field, v, t))
+
+    def _uncertainty(self, force: Array, field: Array, by_force: Array, by_field: Array) -> Array:
+        slopes = np.hstack([self.mag.slopes(field, by_field), self.accel.slopes(force, by_force)])
+        known = np.einsum("np,pq,nq->n", slopes, self.covariance, slopes, optimize=True)
+        off = np.abs((force**2).sum(axis=1) - self.gravity**2)
+        moving = np.maximum(off - 2 * _AT_REST * self.gravity**2, 0.0)
+        noise = (by_force**2).sum(axis=1) * (self.force_noise**2 + moving)
+        noise += (by_field**2).sum(axis=1) * self.field_noise**2 * (field**2).sum(axis=1)
+        total: Array = np.sqrt(known + noise)
+        return total
+
+
+def law_of(record: Calibration) -> Law:
+    """Return the law of heading and dip of a record with magnetometers.
+
+    Raises
+    ------
+    RecordError
+        It holds none, or lacks a parameter or its covariance.
+    """
+    model, fit = model_of(record), fit_of(record)
+    if fit.mag is None:
+        raise RecordError(
+            "heading needs magnetometers, which the record does not hold; 'imulab tumble mag FILE --accel RECORD' adds "
+            "them"
+        )
+    of_mag, of_accel = mag_names(model.mag_order)[:-1], parameter_names(model.order)
+    values = np.array([record.value(name) for name in (*of_mag, *of_accel)])
+    return Law(
+        accel=Triad.of(values[len(of_mag) :], ACCELEROMETERS),
+        mag=Triad.of(values[: len(of_mag)], MAGNETOMETERS),
+        covariance=record.covariance.block([*of_mag, *of_accel]),
+        force_noise=fit.rms.value,
+        field_noise=fit.mag.heading.of_one_reading.value * float(np.cos(record.value("dip"))),
+        gravity=model.gravity.value,
+    )
+
+
+def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
+    """Return what adds columns heading, std_heading, dip and std_dip, deg, to a recording that the record corrected.
+
+    Raises
+    ------
+    RecordError
+        As for `law_of`.
+    """
+    law = law_of(record)
+
+    def with_heading(recording: Recording) -> Recording:
+        for name in (*triad("accel"), *triad("mag")):
+            if name not in recording:
+                raise DataError(f"{recording.name}: no column {name}; heading needs accelerometers and magnetometers")
+        force = np.column_stack([recording.si(name) for name in triad("accel")])
+        field = np.column_stack([recording.si(name) for name in triad("mag")])
+        found = law.angles(force, field)
+        columns = {
+            "heading": found.heading, "std_heading": found.heading_uncertainty,
+            "dip": found.dip, "std_dip": found.dip_uncertainty,
+        }  # fmt: skip
+        return recording.with_columns(
+            {name: from_si(values, "deg") for name, values in columns.items()}, dict.fromkeys(columns, "deg")
+        )
+
+    return with_heading
