@@ -22,6 +22,8 @@ ROWS = 5
 TIME = np.arange(ROWS) * 0.01
 ACCEL = np.random.default_rng(1).normal(0, 5, (ROWS, 3))
 GYRO = np.random.default_rng(2).normal(0, 2, (ROWS, 3))
+MAG = np.random.default_rng(3).normal(0, 30e-6, (ROWS, 3))  # T
+RAW = np.column_stack([np.rint(ACCEL / G * 8192), np.rint(np.degrees(GYRO) * 16), np.rint(MAG * 1e7)]).astype(int)
 CELSIUS = 20 + np.arange(ROWS) / 4
 
 
@@ -49,24 +51,28 @@ def blackbox(accel, gyro, units):
     return head + lines(*counts, *gyro.T, *accel.T, ["ANGLE_MODE|HORIZON_MODE"] * ROWS, ["0"] * ROWS, delimiter=", ")
 
 
-def microstrain():
+def microstrain(*, mag=False):
     head = "FILE_INFO\nListSeparator=comma\nDecimalSeparator=period\n\nSESSION_INFO\nStartTime,02/10/2017 16:13:52\n\n"
     head += "DEVICE_INFO\nModelName,3DM-GX3-35\nSerialNumber,6225-01353\n\nDATA_START\n"
     head += "GPS TFlags,GPS Week,GPS TOW,Roll [x800C],X Accel [x8004],Y Accel [x8004],Z Accel [x8004],"
-    head += "X Gyro [x8005],Y Gyro [x8005],Z Gyro [x8005],Lat [x8103],Flags [x8103],Flags [x8108]\n"
+    head += "X Gyro [x8005],Y Gyro [x8005],Z Gyro [x8005],"
+    head += "X Mag [x8006],Y Mag [x8006],Z Mag [x8006]," if mag else ""
+    head += "Lat [x8103],Flags [x8103],Flags [x8108]\n"
     empty = [""] * ROWS
     week = [[5] * ROWS, [1969] * ROWS, 137649.863104 + TIME, [0.01] * ROWS]
-    return head + lines(*week, *(ACCEL / G).T, *GYRO.T, empty, empty, empty)
+    return head + lines(*week, *(ACCEL / G).T, *GYRO.T, *((MAG * 1e4).T if mag else ()), empty, empty, empty)
 
 
-def movella():
+def movella(*, mag=False):
     head = (
         "sep=,\nDeviceTag:,bei\nFirmwareVersion:,1.6.0\nAppVersion:,2021.0\nStartTime: ,2021-08-30_17:05:05_000 GMT+8\n"
     )
     head += "© Xsens Technologies B. V. 2005-2021\n\n"
-    head += "PacketCounter,SampleTimeFine,Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n"
+    head += "PacketCounter,SampleTimeFine,Euler_X,Euler_Y,Euler_Z,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z"
+    head += ",Mag_X,Mag_Y,Mag_Z\n" if mag else "\n"
     euler = [[-179.9] * ROWS, [0.25] * ROWS, [-136.1] * ROWS]
-    return head + lines(range(ROWS), stamps(1e6, 2974023062), *euler, *ACCEL.T, *np.degrees(GYRO).T)
+    more = MAG.T if mag else ()
+    return head + lines(range(ROWS), stamps(1e6, 2974023062), *euler, *ACCEL.T, *np.degrees(GYRO).T, *more)
 
 
 def gnsslogger():
@@ -75,20 +81,25 @@ def gnsslogger():
     head += "# UncalAccel,utcTimeMillis,elapsedRealtimeNanos,UncalAccelXMps2,UncalAccelYMps2,UncalAccelZMps2,"
     head += "BiasXMps2,BiasYMps2,BiasZMps2\n# \n# UncalGyro,utcTimeMillis,elapsedRealtimeNanos,UncalGyroXRadPerSec,"
     head += "UncalGyroYRadPerSec,UncalGyroZRadPerSec,DriftXRadPerSec,DriftYRadPerSec,DriftZRadPerSec\n# \n"
+    head += "# UncalMag,utcTimeMillis,elapsedRealtimeNanos,UncalMagXMicroT,UncalMagYMicroT,UncalMagZMicroT,"
+    head += "BiasXMicroT,BiasYMicroT,BiasZMicroT\n# \n"
     head += "Fix,GPS,28.14,-82.29,-14.2,0.09,5.8,108.3,1663712656000,,,445420306913617,11.1,0\n"
     zero = [[0.0] * ROWS] * 3
     clocks = stamps(1e3, 1663164669190), stamps(1e9, 65972054923181)
     accel = lines(*clocks, *ACCEL.T, *zero, before="UncalAccel,").splitlines()
     gyro = lines(*clocks, *GYRO.T, *zero, before="UncalGyro,").splitlines()
-    mixed = [line for pair in zip(accel, gyro, strict=True) for line in pair]
+    mag = lines(*clocks, *(MAG * 1e6).T, *zero, before="UncalMag,").splitlines()
+    mixed = [line for together in zip(accel, gyro, mag, strict=True) for line in together]
     return head + "\n".join(mixed) + "\nRaw,1663707711608,32083712000000,18,,\n"
 
 
 def flysight():
     head = "$FLYS,1\n$VAR,FIRMWARE_VER,v2023.09.22\n$COL,BARO,time,pressure,temperature\n$UNIT,BARO,s,Pa,deg C\n"
+    head += "$COL,MAG,time,x,y,z,temperature\n$UNIT,MAG,s,gauss,gauss,gauss,deg C\n"
     head += "$COL,IMU,time,wx,wy,wz,ax,ay,az,temperature\n$UNIT,IMU,s,deg/s,deg/s,deg/s,g,g,g,deg C\n$DATA\n"
     imu = lines(TIME + 59970.376, *np.degrees(GYRO).T, *(ACCEL / G).T, CELSIUS, before="$IMU,").splitlines()
-    return head + "".join(f"{line}\n$BARO,59970.4,98123.1,25.1\n" for line in imu)
+    mag = lines(TIME + 59970.376, *(MAG * 1e4).T, CELSIUS, before="$MAG,").splitlines()
+    return head + "".join(f"{a}\n$BARO,59970.4,98123.1,25.1\n{b}\n" for a, b in zip(imu, mag, strict=True))
 
 
 def kitti():
@@ -106,21 +117,39 @@ def quoted(*titles):
 
 
 PHONE = "time,seconds_elapsed,z,y,x\n"
+
+
+def androsensor(*, mag=False):
+    titles = [*xyz("ACCELEROMETER {1} (m/s²)"), *xyz("GYROSCOPE {1} (rad/s)"), "Time since start in ms ", "DATE"]
+    columns = [*ACCEL.T, *GYRO.T, stamps(1e3, 7), ["2014-05-07 10:12:15:123"] * ROWS]
+    if mag:
+        titles[6:6], columns[6:6] = xyz("MAGNETIC FIELD {1} (\u03bcT)"), list((MAG * 1e6).T)
+    return ";".join(titles) + "\n" + lines(*columns, delimiter=";")
+
+
+def motioncal():
+    raw = lines(*RAW.T, before="Raw:").splitlines()
+    more = "Uni:0.1,-0.2,9.8,0.01,0.0,-0.02,20.1,-3.0,41.2\n"
+    return "Adafruit AHRS - IMU Calibration!\n" + "".join(f"{line}\r\n{more}" for line in raw)
+
+
 FILES = {
-    "androsensor": lambda: (
-        ";".join([*xyz("ACCELEROMETER {1} (m/s²)"), *xyz("GYROSCOPE {1} (rad/s)"), "Time since start in ms ", "DATE"])
-        + "\n"
-        + lines(*ACCEL.T, *GYRO.T, stamps(1e3, 7), ["2014-05-07 10:12:15:123"] * ROWS, delimiter=";")
-    ),
+    "androsensor": androsensor,
+    "androsensor-mag": lambda: androsensor(mag=True),
     "betaflight": lambda: blackbox(ACCEL / G, np.degrees(GYRO), (" (g)", " (deg/s)")),
     "betaflight-raw": lambda: blackbox(ACCEL, GYRO, ("", "")),
     "euroc": euroc,
     "flysight": flysight,
+    "flysight-mag": flysight,
     "gnsslogger-accel": gnsslogger,
     "gnsslogger-gyro": gnsslogger,
+    "gnsslogger-mag": gnsslogger,
     "kitti-oxts": kitti,
     "microstrain": microstrain,
+    "microstrain-mag": lambda: microstrain(mag=True),
+    "motioncal": motioncal,
     "movella-dot": movella,
+    "movella-dot-mag": lambda: movella(mag=True),
     "phyphox": lambda: (
         quoted("Time (s)", *xyz("Acceleration {0} (m/s^2)"), "Absolute acceleration (m/s^2)")
         + lines(TIME, *ACCEL.T, np.linalg.norm(ACCEL, axis=1))
@@ -129,9 +158,18 @@ FILES = {
         quoted("Time (s)", *xyz("Gyroscope {0} (rad/s)"), "Absolute (rad/s)")
         + lines([f"{t:.9E}" for t in TIME], *GYRO.T, np.linalg.norm(GYRO, axis=1))
     ),
+    "phyphox-mag": lambda: (
+        quoted("Time (s)", *xyz("Magnetic field {0} (µT)"), "Absolute field (µT)")
+        + lines(TIME, *(MAG * 1e6).T, np.linalg.norm(MAG, axis=1))
+    ),
+    "physics-toolbox-mag": lambda: (
+        "time,gFx,gFy,gFz,wx,wy,wz,p,Bx,By,Bz,Azimuth\n"
+        + lines(TIME, *(ACCEL / G).T, *GYRO.T, [1013.2] * ROWS, *(MAG * 1e6).T, [12.0] * ROWS)
+    ),
     "physics-toolbox": lambda: "time,gFx,gFy,gFz,wx,wy,wz,p\n" + lines(TIME, *(ACCEL / G).T, *GYRO.T, [1013.2] * ROWS),
     "sensorlogger-accel": lambda: PHONE + lines(stamps(1e9, 1718030736872695300), TIME, *ACCEL.T[::-1]),
     "sensorlogger-gyro": lambda: PHONE + lines(stamps(1e9, 1718030736872695300), TIME, *GYRO.T[::-1]),
+    "sensorlogger-mag": lambda: PHONE + lines(stamps(1e9, 1718030736872695300), TIME, *(MAG * 1e6).T[::-1]),
     "tum-vi": lambda: (
         "# timestamp[ns] w.x w.y w.z a.x a.y a.z\n"
         + lines(stamps(1e9, 1520530308181901469), *GYRO.T, *ACCEL.T, delimiter=" ")
@@ -141,15 +179,27 @@ FILES = {
         + "\n"
         + lines(stamps(1e6, 12_000_000), *np.degrees(GYRO).T, *(ACCEL / G).T)
     ),
+    "x-imu3-mag": lambda: "Timestamp (us),X (a.u.),Y (a.u.),Z (a.u.)\n" + lines(stamps(1e6, 12_000_000), *MAG.T),
 }
+OF_ALL = ("accel", "gyro", "mag")
 ALIKE = {
-    "sensorlogger-accel": ["sensorlogger-accel", "sensorlogger-gyro"],
-    "sensorlogger-gyro": ["sensorlogger-accel", "sensorlogger-gyro"],
-    "gnsslogger-accel": ["gnsslogger-accel", "gnsslogger-gyro"],
-    "gnsslogger-gyro": ["gnsslogger-accel", "gnsslogger-gyro"],
+    **{
+        f"{app}-{sensor}": [f"{app}-{s}" for s in OF_ALL] for app in ("sensorlogger", "gnsslogger") for sensor in OF_ALL
+    },
+    "flysight": ["flysight", "flysight-mag"],
+    "flysight-mag": ["flysight", "flysight-mag"],
     "kitti-oxts": [],
 }
 """Which layouts fit a file of each, where that is not just its own."""
+SENSORS = {
+    **{f"{app}-{sensor}": [sensor] for app in ("sensorlogger", "gnsslogger") for sensor in OF_ALL},
+    **{f"{app}-mag": ["mag"] for app in ("phyphox", "x-imu3", "flysight")},
+    **{f"{app}-mag": list(OF_ALL) for app in ("androsensor", "microstrain", "movella-dot", "physics-toolbox")},
+    "motioncal": list(OF_ALL),
+    "phyphox": ["accel"],
+    "phyphox-gyro": ["gyro"],
+}
+"""What a layout reads, where that is not accelerometer and gyroscope."""
 
 
 def test_every_layout_has_a_file_here_and_a_line_in_the_docs():
@@ -170,12 +220,11 @@ def test_a_file_is_read_by_the_name_of_its_layout(tmp_path, name):
     time = found.si("time")
     # Nanoseconds since 1970 are held to 0.24 us.
     np.testing.assert_allclose(time - time[0], TIME, atol=5e-7, rtol=0)
-    of = {"accel": ACCEL, "gyro": GYRO}
-    sensors = [sensor for sensor in of if f"{sensor}_x" in found]
-    assert sensors == [s for s in of if s not in {"phyphox": "gyro", "phyphox-gyro": "accel"}.get(name, "")] or (
-        "logger" in name and sensors == [name.partition("-")[2]]
-    )
-    for sensor in sensors:
+    of = {"accel": ACCEL, "gyro": GYRO, "mag": MAG}
+    if name == "motioncal":
+        of = {"accel": RAW[:, :3] * G / 8192, "gyro": np.radians(RAW[:, 3:6] / 16), "mag": RAW[:, 6:] * 1e-7}
+    assert [sensor for sensor in of if f"{sensor}_x" in found] == SENSORS.get(name, ["accel", "gyro"])
+    for sensor in SENSORS.get(name, ["accel", "gyro"]):
         read = np.column_stack([found.si(f"{sensor}_{axis}") for axis in "xyz"])
         np.testing.assert_allclose(read, of[sensor], rtol=1e-14)
         assert (found.triad_unit(sensor) == "count") == (name == "betaflight-raw")
@@ -255,7 +304,7 @@ def test_kitti_is_put_into_one_file_by_the_command_in_the_docs(tmp_path):
 def test_formats_lists_them_and_prints_one(imulab):
     shown = imulab("show", "--formats").stdout
     for entry in shipped():
-        assert re.search(rf"^{entry.name} +{re.escape(entry.about)} +time ", shown, re.M)
+        assert re.search(rf"^{entry.name} +{re.escape(entry.about)} +{' '.join(entry.sensors)}", shown, re.M)
     printed = imulab("show", "--formats", "euroc").stdout
     assert printed == shipped_file("euroc").read_text()
     said = json.loads(imulab("show", "--formats", "--json").stdout)

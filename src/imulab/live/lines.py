@@ -178,11 +178,10 @@ class LayoutDecoder(LineDecoder):
             document = json.loads(text)
             return [float(_looked_up(document, key)) for key in self._keys]
         delimiter = None if self._layout.delimiter == " " else self._layout.delimiter
-        fields = [field.strip() for field in text.split(delimiter)]
-        if self._layout.prefix:
-            if fields[0] != self._layout.prefix:
-                return None
-            fields = fields[1:]
+        found = self._layout.behind_prefix([field.strip() for field in text.split(delimiter)])
+        if found is None:
+            return None
+        fields = found
         if self._places is None:
             titles = [field.strip('"') for field in fields]
             if all(key in titles for key in self._keys):

@@ -46,8 +46,8 @@ static const char *whole_end(const char *p, const char *end, char delimiter, con
 PyDoc_STRVAR(choose_doc,
              "choose(block, delimiter, out, prefix, slots, skip, most_fields=0, most_rows=-1)\n"
              "-> (size, rows, lines, incomplete)\n\n"
-             "Copy to `out`, a writable buffer larger than `block`, the lines whose first field is `prefix`, without it (all\n"
-             "lines where that is empty). With `skip`, only rows in which every field with a slot >= 0 holds a reading, cut\n"
+             "Copy to `out`, a writable buffer larger than `block`, the lines whose first field is `prefix`, without it, or\n"
+             "begins with a `prefix` that ends with a colon (all lines where it is empty). With `skip`, only rows in which every field with a slot >= 0 holds a reading, cut\n"
              "behind field len(slots) - 1, and of at most `most_fields` fields; others of the prefix count as incomplete.\n"
              "Ends after `most_rows` rows; `lines` is how many lines were looked at, `size` how many bytes were written.");
 
@@ -77,8 +77,14 @@ static PyObject *choose(PyObject *module, PyObject *args) {
                 const char *last = first;
                 while (from < last && *from == ' ') from++;
                 while (last > from && last[-1] == ' ') last--;
-                if (last - from != prefix.len || memcmp(from, prefix.buf, (size_t)prefix.len) != 0) continue;
-                from = first < stop ? first + 1 : stop;
+                if (last - from < prefix.len || memcmp(from, prefix.buf, (size_t)prefix.len) != 0) continue;
+                if (last - from == prefix.len) {
+                    from = first < stop ? first + 1 : stop;
+                } else if (from[prefix.len - 1] == ':') {
+                    from += prefix.len;
+                } else {
+                    continue;
+                }
             }
             if (skip) {
                 stop = whole_end(from, stop, (char)delimiter, slots.buf, slots.len / (Py_ssize_t)sizeof(int32_t), most_fields);

@@ -23,7 +23,7 @@ decimal = "."                                   # or "," where numbers are writt
 header = false                                  # true: the first line names the columns
 skip_lines = 0                                  # lines above the header or the data
 skip_incomplete = false                         # true: rows without a reading in every column are skipped and counted
-# prefix = "IMU"                                # only lines whose first field is IMU, without that field
+# prefix = "IMU"                                # only lines whose first field is IMU, without that field; or "Raw:"
 # encoding = "gbk"                              # of the names in the header, where they are not UTF-8
 # sample_rate = { value = 100, unit = "Hz" }    # instead of time, where no column holds it
 [columns]
@@ -97,9 +97,10 @@ class Layout:
     """Where the columns of a foreign file are.
 
     ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
-    in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field of the lines that count, or
-    nothing; ``text`` says that the file is delimited text whatever it looks like (it names a delimiter); ``if_needed``
-    that it is left out where a file says itself what its columns are.
+    in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field of the lines that count (what
+    that field begins with, where the prefix ends with a colon), or nothing; ``text`` says that the file is delimited
+    text whatever it looks like (it names a delimiter); ``if_needed`` that it is left out where a file says itself what
+    its columns are.
     """
 
     columns: Mapping[str, LayoutColumn]
@@ -123,6 +124,16 @@ class Layout:
         return (
             known if self.sample_rate is None else {**({} if "time" in known else {"time": "s"}), **known, "time": "s"}
         )
+
+    def behind_prefix(self, fields: list[str]) -> list[str] | None:
+        """Return the fields of a line behind the prefix, None where it does not begin with it."""
+        first = fields[0].strip()
+        if not self.prefix:
+            return fields
+        if first == self.prefix:
+            return fields[1:]
+        glued = self.prefix.endswith(":") and first.startswith(self.prefix)
+        return [first.removeprefix(self.prefix), *fields[1:]] if glued else None
 
     def skipped(self, count: int, *, so_far: bool = False) -> str:
         """Say how many rows were skipped by ``skip_incomplete``."""

@@ -55,7 +55,7 @@ def fitting(head: bytes) -> list[str]:
 def _fits(entry: Shipped, line: str) -> bool:
     layout = entry.layout
     if layout.prefix:
-        return line.startswith(layout.prefix + layout.delimiter)
+        return line.startswith(layout.prefix + ("" if layout.prefix.endswith(":") else layout.delimiter))
     return bool(entry.titles) and entry.titles.issubset(titles_of(line, layout.delimiter))
 
 

@@ -248,7 +248,7 @@ class TextFile:
             raise ReadError(
                 f"{self._name}: no line whose first field is {layout.prefix!r}, the prefix in {layout.name}"
             )
-        return len(_fields(line.decode("utf-8", "replace"), layout.delimiter)) - bool(self._prefix)
+        return len(layout.behind_prefix(_fields(line.decode("utf-8", "replace"), layout.delimiter)) or [])
 
     def _has_prefix(self, line: bytes) -> bool:
         return (
@@ -268,7 +268,7 @@ class TextFile:
                 break
             titles = titles_of(line, layout.delimiter)
             if wanted.issubset(titles):
-                return titles[1:] if self._prefix else titles
+                return layout.behind_prefix(titles) or titles[1:]
             if line.startswith("#") and wanted.isdisjoint(titles):
                 self._note(line)
                 continue
