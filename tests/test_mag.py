@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from conftest import sap5_table
 from imulab.cli import main
 from imulab.columns import triad
 from imulab.errors import ObservabilityError
+from imulab.procedures.tumble.mag.heading import law_of
 from imulab.recording import Recording
 from reference import magnetometer as reference
 
@@ -562,3 +564,35 @@ def test_a_record_of_these_attitudes_says_how_they_were_fitted_and_counts_once(n
     assert both.covariance == alone.covariance
     assert "accel: a record of order 0" in refuse(nine_axes, order="auto", accel=il.fit_tumble(nine_axes, order=0))
     assert "cross terms" in refuse(nine_axes, order="auto", accel=il.fit_tumble(nine_axes, order=1, cross=True))
+
+
+def test_two_records_of_one_unit_are_compared_by_what_belongs_to_the_unit(tmp_path, capsys):
+    truth, _, first = simulated(51, mounting=np.eye(3))
+    moved = replace(truth, hard_iron=truth.hard_iron + truth.matrix @ [0.05, 0.0, 0.0], dip=np.radians(60))
+    rng = np.random.default_rng(52)
+    second = reference.simulate(moved, attitudes(rng), rng, accel=5e-4, field=3e-3, dip=SWAY)
+    one, other = (il.fit_mag(table(*data), gravity=G, order=1) for data in (first, second))
+    found = il.compare_records(one, other)
+    assert [change.name for change in found.changes if change.significant] == ["mag_bias_x"]
+    assert found.left_out == ("dip",)
+    third = il.fit_mag(table(first[0], first[1] @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]).T), gravity=G, order=1)
+    left_out = il.compare_records(one, third).left_out
+    assert {*left_out} == {name for name in one.calibration.parameters if name.startswith("mag_") or name == "dip"}
+    for name, fit in (("a.json", one), ("b.json", other)):
+        fit.save(tmp_path / name)
+    assert main(["show", str(tmp_path / "a.json"), str(tmp_path / "b.json")]) == 0
+    assert "not compared (in one record alone, or of another meaning there): dip" in capsys.readouterr().out
+
+
+def test_the_report_shows_heading_over_the_attitudes_and_names_the_disturbed():
+    record = il.fit_mag(disturbed(1, 0.1)[1], gravity=G, order=2).calibration
+    known, reading = law_of(record).horizontal_uncertainty(
+        G * np.array(record.data["mag"]["force"])[record.data["mag"]["used"]],
+        np.array(record.data["mag"]["field"])[record.data["mag"]["used"]],
+    )
+    stated = record.fit["mag"]["heading"]["standard_uncertainty"]["value"]
+    assert np.sqrt(np.mean(known**2)) == pytest.approx(stated, rel=1e-6)
+    assert (reading > known).all()
+    shown = record.plot("heading").figure
+    assert len(shown.traces[1]["x"]) == 24
+    assert "set aside as disturbed: row 8" in record.plot("magnitude and dip").figure.caption

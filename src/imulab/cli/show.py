@@ -79,7 +79,10 @@ def describe_changes(first: str, second: str, comparison: Comparison, record: Ca
     if comparison.models:
         lines += ["", f"the records differ in {', '.join(comparison.models)}: a change may come from that"]
     if comparison.left_out:
-        lines += ["", f"not in both, or of other levels: {' '.join(comparison.left_out)}"]
+        lines += [
+            "",
+            f"not compared (in one record alone, or of another meaning there): {' '.join(comparison.left_out)}",
+        ]
     if "table" in record.sections:
         lines += ["", "the tables themselves are not compared"]
     return "\n".join(lines)

@@ -40,6 +40,13 @@ def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     return factor, "ppm" if unit == _OFF_NOMINAL else unit
 
 
+def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
+    """Return whether a parameter means the same in both records: magnetometers' outputs may be renamed otherwise."""
+    if name == "dip":
+        return False  # of the place, not of the unit
+    return not name.startswith("mag_") or first.model.get("mag_axes") == second.model.get("mag_axes")
+
+
 def propagated_rows(record: Calibration, trials: Trials) -> list[list[str]]:
     """Return the Monte Carlo intervals beside the linear ones: name, both, ratio of their widths, unit."""
     fit, output = fit_of(record), model_of(record).output_unit

@@ -38,6 +38,7 @@ ENTRY = Procedure(
     ),
     rows=deferred(f"{_HERE}.engineering:engineering_rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
+    same_meaning=deferred(f"{_HERE}.engineering:same_meaning"),
     heading=deferred(f"{_HERE}.mag.heading:heading_of"),
     beyond=deferred(f"{_HERE}.apply:beyond_test"),
     beyond_message=deferred(f"{_HERE}.apply:beyond_message"),

@@ -54,6 +54,11 @@ def parameters_table(record: Calibration) -> ReportTable:
         turned = (
             f" Gyroscopes: M = S (T ω + b + G f), Student's t with {fit.gyro.degrees_of_freedom} degrees of freedom."
         )
+    if fit.mag is not None:
+        turned += (
+            f" Magnetometers: the law of the accelerometers with the field m for f, T with six misalignments, outputs "
+            f"renamed {model.mag_axes}; Student's t."
+        )
     return ReportTable(
         title="Parameters",
         caption=f"M = S (A + b), A = s + k2 s² + …, s = T f. {basis} Gauge: {model.gauge}.{turned}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from imulab.estimation.ranked import rms
+from imulab.procedures.tumble.mag.heading import law_of
 from imulab.procedures.tumble.sections import Fields, MagFit, data_of, fit_of, model_of
 from imulab.records.calibration import Calibration
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Figure, plain_number
@@ -35,10 +36,10 @@ def mag_facts(record: Calibration) -> list[tuple[str, str]]:
 
 
 def mag_figures(record: Calibration) -> list[Figure]:
-    """Return residuals of |m| and dip, and the sphere before and after."""
+    """Return residuals of |m| and dip, the sphere before and after, and what heading is known to in each attitude."""
     data = data_of(record).mag
     assert data is not None
-    return [_residuals(record, data), _sphere(record, data)]
+    return [_residuals(record, data), _sphere(record, data), _headings(record, data)]
 
 
 def _fit(record: Calibration) -> MagFit:
@@ -53,8 +54,8 @@ def _residuals(record: Calibration, data: Fields) -> Figure:
     colours = [GOOD if one else BAD for one in data.used]
     shapes = ["circle" if one else "diamond" for one in data.used]
     worst = int(np.argmax(np.where(used, np.abs(dip), -1.0)))
-    fit = _fit(record)
-    aside = f" Red diamonds were set aside: {', '.join(map(str, fit.set_aside))}." if fit.set_aside else ""
+    disturbed = [label for label, kept in zip(data.label, data.used, strict=True) if not kept]
+    aside = f" Red diamonds were set aside as disturbed: {', '.join(disturbed)}." if disturbed else ""
     marker = {"color": colours, "symbol": shapes, "size": 8}
     texts = [f"{label}" for label in data.label]
     return Figure(
@@ -119,3 +120,34 @@ def _sphere(record: Calibration, data: Fields) -> Figure:
         layout={**layout, "legend": LEGEND},
         height=430,
     )
+
+
+def _headings(record: Calibration, data: Fields) -> Figure:
+    """Return the uncertainty of heading in each attitude, by the parameters, and that of one reading."""
+    length, gravity = float(record.model["field"]["value"]), model_of(record).gravity.value
+    known, reading = law_of(record).horizontal_uncertainty(
+        gravity * np.array(data.force), length * np.array(data.field)
+    )
+    known, reading = np.degrees(known), np.degrees(reading)
+    worst = int(np.argmax(known))
+    shared = {"text": data.label, "hovertemplate": "%{text}<br>%{y:.2g} deg<extra></extra>"}
+    return Figure(
+        title="What heading is known to in each attitude",
+        message=f"By the parameters within {rms(known):.2g} deg rms, {known[worst]:.2g} deg in attitude "
+        f"{data.number[worst]} at worst; one reading within {rms(reading):.2g} deg.",
+        caption="Standard uncertainty of magnetic heading with the unit in that attitude: what the parameters leave "
+        "open, common to all readings there, and with the scatter of |m| and f, that of one reading. Where the two are "
+        "alike, more readings do not help.",
+        traces=[
+            scatter(data.number, rounded(reading), "markers", name="one reading",
+                    marker={"color": QUIET, "symbol": "circle-open", "size": 8}, **shared),
+            scatter(data.number, rounded(known), "markers", name="by the parameters",
+                    marker={"color": GOOD, "size": 8}, **shared),
+        ],
+        layout={
+            "xaxis": axis("attitude", dtick=max(1, round(len(data.number) / 20)), range=[0.4, max(data.number) + 0.6]),
+            "yaxis": axis("u(heading), deg", rangemode="tozero"),
+            "legend": LEGEND,
+        },
+        height=330,
+    )  # fmt: skip

@@ -14,13 +14,14 @@ g by more than 1 %, which gravity and calibration are not, a counts as noise of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imulab.columns import triad
 from imulab.errors import DataError, RecordError
 from imulab.procedures.tumble.mag.model import ACCELEROMETERS, MAGNETOMETERS, Pairs, mag_names
+from imulab.procedures.tumble.mag.pointing import world_axes
 from imulab.procedures.tumble.model import parameter_names
 from imulab.procedures.tumble.sections import fit_of, model_of
 from imulab.recording import Array, Recording
@@ -112,6 +113,20 @@ class Law:
         sine, cosine = np.sin(dip)[:, None], np.cos(dip)[:, None]
         t, v = -(e + u * sine) / cosine / m_length[:, None], -(u + e * sine) / cosine / f_length[:, None]
         return Angles(heading, np.minimum(u_heading, _UNKNOWN), dip, self._uncertainty(force, field, v, t))
+
+    def horizontal_uncertainty(self, force: Array, field: Array) -> tuple[Array, Array]:
+        """Return the standard uncertainty of magnetic heading whatever axis points, rad, shape (n,): by the parameters.
+
+        The second also holds the noise of one reading. An error dm turns the horizontal part of the field by
+        ``east . dm / |m| cos(dip)``, one df the vertical.
+        """
+        east, north, up = world_axes(field, force).transpose(1, 0, 2)
+        by_field = east / np.einsum("ni,ni->n", north, field)[:, None]
+        by_force = -by_field * (np.einsum("ni,ni->n", up, field) / np.linalg.norm(force, axis=1))[:, None]
+        silent = replace(self, force_noise=0.0, field_noise=0.0)
+        return silent._uncertainty(force, field, by_force, by_field), self._uncertainty(
+            force, field, by_force, by_field
+        )
 
     def _uncertainty(self, force: Array, field: Array, by_force: Array, by_field: Array) -> Array:
         slopes = np.hstack([self.mag.slopes(field, by_field), self.accel.slopes(force, by_force)])

@@ -124,8 +124,10 @@ def seen(pair: Pair, theta: Array) -> Seen:
     return Seen(rank, layout.mag + 1, float(values[0] / max(values[-1], 1e-300)), blind, heading)
 
 
-def heading_uncertainty(joint: Joint) -> tuple[float, float]:
+def heading_uncertainty(joint: Joint, covariance: Array) -> tuple[float, float]:
     """Return the standard uncertainty of magnetic heading, rad: by the parameters, rms of the attitudes; of a reading.
+
+    `covariance` is that of the parameters, shape (p, p).
 
     An error dm of the field turns its horizontal part by ``east . dm / |m| cos(dip)``, one df of the specific force the
     vertical.
@@ -139,7 +141,7 @@ def heading_uncertainty(joint: Joint) -> tuple[float, float]:
     slope[:, : layout.mag] = np.einsum("ni,nip->np", east, found.field.by_parameters) / horizontal[:, None]
     vertical = np.einsum("ni,ni->n", axes[:, 2], m) / np.linalg.norm(f, axis=1) / horizontal
     slope[:, layout.of_accel] = -np.einsum("ni,nip->np", east, found.force.by_parameters) * vertical[:, None]
-    known = np.einsum("np,pq,nq->n", slope, joint.covariance, slope)
+    known = np.einsum("np,pq,nq->n", slope, covariance, slope)
     # V of |m| is that of one component of the field, whatever the direction.
     own = np.linalg.inv(joint.information[:, :3, :3])[:, 1, 1]
     reading = float(np.median(own)) / np.cos(joint.theta[layout.dip_at]) ** 2

@@ -40,7 +40,9 @@ def with_mag(
         ready.estimate, ready.gravity, ready.scaling,
         {"order": ready.order, "method": "norm", "loss": ready.loss, "gravity": ready.gravity.value},
     )  # fmt: skip
-    names, values, matrix, units = _values(ready, joint)
+    known = _covariance(ready, joint)
+    heading = heading_uncertainty(joint, known)
+    names, values, matrix, units = _values(ready, joint, known)
     parameters = _parameters(names, values, matrix, units, joint.freedom[: len(names)])
     own = accel.parameters
     moved = {
@@ -57,7 +59,7 @@ def with_mag(
         parameters=kept | {name: parameters[name] for name in mag_names(joint.pair.mag_order)},
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
         model={**accel.model, **_model(ready, joint)},
-        fit={**accel.fit, "mag": _fit(ready, joint, seen, aside, moved)},
+        fit={**accel.fit, "mag": _fit(ready, joint, seen, aside, moved, heading)},
         options={
             **accel.options,
             **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
@@ -67,13 +69,20 @@ def with_mag(
             *accel.warnings,
             *ready.means.notes,
             *ready.notes,
-            *_warnings(ready, joint, seen, aside, moved, options),
+            *_warnings(ready, joint, seen, aside, moved, options, heading[0]),
         ),
         verdict=UNJUDGED,
     )
 
 
-def _values(ready: Ready, joint: Joint) -> tuple[list[str], Array, Array, list[str]]:
+def _covariance(ready: Ready, joint: Joint) -> Array:
+    """Covariance of the scaled parameters, the accelerometers' whatever their order is, shape (p, p)."""
+    covariance = joint.covariance.copy()
+    covariance[joint.pair.layout.of_accel, joint.pair.layout.of_accel] += _whatever_the_order(ready)
+    return covariance
+
+
+def _values(ready: Ready, joint: Joint, known: Array) -> tuple[list[str], Array, Array, list[str]]:
     """Names, values, covariance and units of all parameters, the magnetometers' first."""
     layout, order = joint.pair.layout, ready.estimate.problem.order
     g = ready.gravity.value
@@ -83,16 +92,14 @@ def _values(ready: Ready, joint: Joint) -> tuple[list[str], Array, Array, list[s
     slope = np.eye(size)
     slope[: layout.mag, : layout.mag] = mag_slope
     slope[layout.of_accel, layout.of_accel] = accel_slope
-    covariance = joint.covariance[:size, :size].copy()
-    covariance[layout.of_accel, layout.of_accel] += _whatever_the_order(ready)
-    matrix = slope @ covariance @ slope.T
+    matrix = slope @ known[:size, :size] @ slope.T
     shared = np.zeros(size)
     shared[layout.of_accel] = ready.gravity.standard_uncertainty / g * gravity_slope(of_accel, order)
-    known = "1" if ready.mag.field is None else "T"
+    unit = "1" if ready.mag.field is None else "T"
     output = ready.means.unit
-    per = output if known == "1" else f"{output}/T"
+    per = output if unit == "1" else f"{output}/T"
     names = [*mag_names(joint.pair.mag_order), *parameter_names(order)]
-    units = [known] * 3 + [per] * 3 + ["rad"] * 6 + ["1" if known == "1" else "1/T"] * (layout.mag - 12) + ["rad"]
+    units = [unit] * 3 + [per] * 3 + ["rad"] * 6 + ["1" if unit == "1" else "1/T"] * (layout.mag - 12) + ["rad"]
     units += parameter_units(order, ready.estimate.attitudes.unit)
     values = np.concatenate([of_mag, [joint.theta[layout.dip_at]], of_accel])
     return names, values, matrix + np.outer(shared, shared), units
@@ -138,10 +145,14 @@ def _model(ready: Ready, joint: Joint) -> dict[str, Any]:
 
 
 def _fit(
-    ready: Ready, joint: Joint, seen: Seen, aside: Sequence[Disturbed], moved: Mapping[str, float]
+    ready: Ready,
+    joint: Joint,
+    seen: Seen,
+    aside: Sequence[Disturbed],
+    moved: Mapping[str, float],
+    heading: tuple[float, float],
 ) -> dict[str, Any]:
     predicted, residuals = leave_one_out(joint), joint.found.residuals
-    heading, reading = heading_uncertainty(joint)
     return {
         "attitudes": len(residuals),
         "magnitude": {"rms": rms(residuals[:, 1]), "leave_one_out": predicted.rms(1)},
@@ -153,8 +164,8 @@ def _fit(
         "condition_number": seen.condition,
         "set_aside": [int(ready.kept[one.index]) + 1 for one in aside],
         "heading": {
-            "standard_uncertainty": {"value": heading, "unit": "rad"},
-            "of_one_reading": {"value": reading, "unit": "rad"},
+            "standard_uncertainty": {"value": heading[0], "unit": "rad"},
+            "of_one_reading": {"value": heading[1], "unit": "rad"},
         },
         "moved": dict(moved),
     }
@@ -208,6 +219,7 @@ def _warnings(
     aside: Sequence[Disturbed],
     moved: Mapping[str, float],
     options: Mapping[str, Any],
+    heading: float,
 ) -> list[str]:
     attitudes = ready.estimate.attitudes
     found = [_set_aside(attitudes.label(one.index), one) for one in aside]
@@ -219,12 +231,12 @@ def _warnings(
             "mag: the fit of both triads did not come to rest: more attitudes, at several headings, would help"
         )
     if seen.condition > _ONE_WAY:
-        heading = np.degrees(heading_uncertainty(joint)[0])
         left = np.delete(ready.kept, [one.index for one in aside])
         which = " ".join(str(int(left[i]) + 1) for i in sorted(seen.heading))
         found.append(
             f"mag: the attitudes face nearly one way (condition {seen.condition:.0f}): heading is known to "
-            f"{heading:.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help most"
+            f"{np.degrees(heading):.2g} deg only; attitudes {which} once more, facing a quarter turn away, would help "
+            "most"
         )
     far = {name: value for name, value in moved.items() if abs(value) > _MOVED}
     if far:
