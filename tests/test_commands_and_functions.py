@@ -55,6 +55,7 @@ WITHOUT = {"demo", "live", "open"}
 READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
 APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
 OTHERWISE = {
+    "convert": {"with_"},  # join_recordings
     "show": {"formats"},  # a list for people
     "tumble gyro": {"accel", "accel_file"},  # the first argument; accel_data, which may be no file
     "array calibrate": {"interval"},  # window

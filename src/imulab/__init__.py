@@ -80,6 +80,7 @@ if TYPE_CHECKING:
     from imulab.procedures.warmup.spreadsheet import warmup_table as warmup_table
     from imulab.readers import read as read
     from imulab.readers import read_blocks as read_blocks
+    from imulab.readers.join import join_recordings as join_recordings
     from imulab.recording import Recording as Recording
     from imulab.records.calibration import Calibration as Calibration
     from imulab.writers import write as write
@@ -120,6 +121,7 @@ _HOME = {
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
     "fleet_status": "fleet.run",
+    "join_recordings": "readers.join",
     "load": "procedures.loading",
     "load_manifest": "procedures.centrifuge.manifest",
     "merge_array": "procedures.gyro_array.public",

@@ -71,7 +71,7 @@ class Units:
             return self._known(column, stated)
         quantities = expected_quantities(column)
         sensor = next((part for part in TRIADS if part in _stems(column)), column)
-        fits = quantities or (["output"] if sensor in TRIADS else [])
+        fits = quantities or (["magnetic field", "output"] if sensor in TRIADS else [])
         if self.common is not None and column not in DEFAULT_UNITS and parse_unit(self.common).quantity in fits:
             self.used.add("unit")
             return parse_unit(self.common).symbol

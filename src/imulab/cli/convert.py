@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from imulab.cli.fit_options import READ, reading, with_options
 from imulab.cli.options import (
@@ -23,13 +25,28 @@ if TYPE_CHECKING:
 def convert(
     file: RecordingFile,
     options: dict[str, str | None],
+    with_files: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--with",
+            metavar="FILE[@LAYOUT]",
+            help="Another sensor of the same unit, on the same clock, whose columns are added; repeatable.",
+        ),
+    ] = None,
     output: OutputFile = None,
 ) -> None:
     """Write a recording of any kind as native CSV or Parquet to OUT, or as CSV to standard output."""
-    from imulab.readers import read_blocks
+    from imulab.readers import read, read_blocks
+    from imulab.readers.join import file_and_layout, join_recordings
 
-    check_outputs([output], [name for name in (file, options["layout"]) if name])
-    write_out(with_notes(read_blocks(file, **reading(options))), output)
+    others = [file_and_layout(text) for text in with_files or []]
+    inputs = [name for pair in ((file, options["layout"]), *others) for name in pair if name]
+    check_outputs([output], inputs)
+    blocks: Iterable[Recording] = read_blocks(file, **reading(options))
+    if others:
+        first = read(file, **reading(options))
+        blocks = [join_recordings(first, [read(other, layout) for other, layout in others])]
+    write_out(with_notes(blocks), output)
 
 
 def write_out(blocks: Iterable[Recording], output: str | None) -> None:
