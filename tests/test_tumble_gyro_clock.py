@@ -160,6 +160,17 @@ def test_turns_with_a_knock_or_with_lost_samples_are_named_and_do_not_count(chan
         assert ("Hatched and red: set aside." in figure.caption) == (len(fit.aside) > 0)
 
 
+def test_one_attitude_cut_out_of_the_recording_leaves_the_verdict_good():
+    """As a session cuts one that its person dropped: one turn of many is lost, and nothing is wrong with the others."""
+    recording = il.simulate_tumble(attitudes=20, order=1, gravity=9.81, hold="4 s", move="1 s", gyro=True, seed=3)
+    attitudes, time = il.find_attitudes(recording), recording.column("time")
+    keep = (time < attitudes.start[8] - 1.0) | (time > attitudes.stop[8] + 0.6)
+    cut = il.Recording({n: recording.column(n)[keep] for n in recording.columns}, recording.units)
+    fit = il.fit_gyro(il.fit_tumble(cut, order=1, gravity=9.81).calibration, cut)
+    assert any("1 turn left out, samples are missing" in warning for warning in fit.calibration.warnings)
+    assert fit.calibration.verdict.state == "good"
+
+
 def test_nothing_is_set_aside_without_reason():
     aside = sum(len(fit_gyro(*campaign(seed)[1:]).aside) for seed in range(20, 36))
     assert aside <= 2  # of 16 times 23 turns

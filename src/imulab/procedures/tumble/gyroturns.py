@@ -14,11 +14,13 @@ from imulab.errors import SegmentError
 from imulab.procedures.tumble.gyrorest import Holds, Rest, beyond_range
 from imulab.procedures.tumble.rotation import Turns, composed_turns, weighted_turns
 from imulab.recording import Array
+from imulab.verdict import Note
 
 ROWS, COLUMNS = (0, 0, 1, 1, 2, 2), (1, 2, 0, 2, 0, 1)
 _FEWEST_TURNS = 8
 _LONGEST_TURN = 60.0  # s
 _GAP_SECONDS, _GAP_STEPS, _GAP_BURSTS = 0.05, 4.5, 2.0
+_FEW_BROKEN = 0.1  # of the turns: the others are as good without them
 _COARSE = 4  # steps taken as one where a scale factor is only to be found roughly
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
@@ -73,7 +75,7 @@ def find_turns(
     wide = step > max(_GAP_SECONDS, _GAP_STEPS * usual[0], _GAP_BURSTS * usual[1])
     broken = _any_during(np.append(wide, False)[:, None], begin, end - 1)[:, 0] & turns
     chosen = np.flatnonzero(turns & ~clipped.any(axis=1) & ~broken)
-    notes = []
+    notes: list[str] = []
 
     def times(which: NDArray[np.bool_]) -> str:
         where = np.flatnonzero(which)
@@ -91,10 +93,11 @@ def find_turns(
         )
     if broken.any():
         longest = float(step[wide].max())
-        notes.append(
+        said = (
             f"gyro: {count(broken)} left out, samples are missing during them: gaps of up to {longest:.3g} s "
             f"(turns from {times(broken)} s)"
         )
+        notes.append(Note(said) if broken.sum() <= _FEW_BROKEN * turns.sum() else said)
     if len(chosen) < _FEWEST_TURNS:
         aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
         aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
