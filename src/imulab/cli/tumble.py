@@ -319,7 +319,7 @@ def check(
         from imulab.procedures.tumble.checkfigures import check_page
 
         write_text(report, check_page(result, attitudes, held, record=record, file=file, warnings=notes))
-    print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, record, file))
+    print(as_json(result, attitudes, notes) if json else as_text(result, attitudes, held, record, file))
     for message in notes:
         warn(message)
     if report and not json:

@@ -122,6 +122,19 @@ def specific_force(record: Calibration, output: Array) -> Array:
     return np.column_stack(force)
 
 
+def field_in_body(record: Calibration, output: Array) -> Array:
+    """Return the field in the body frame, T or parts of the local one, for outputs in the record's unit, (n, 3) each.
+
+    Raises
+    ------
+    RecordError
+        The record lacks a parameter, or has one that cannot be.
+    """
+    (table,) = (table for table in tables_of(record) if table.kind == "mag")
+    field, _ = DeviceUnit.of(table).mag(list(output.T))
+    return np.column_stack(field)
+
+
 def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
     """Return how many samples lie far beyond the 1 g that the record was made at, and the largest, m/s^2.
 

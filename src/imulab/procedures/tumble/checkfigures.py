@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.engineering import micro_g, small_g
-from imulab.procedures.tumble.prior import FALSE_ALARM
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report import render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
-from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, ReportTable
+from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, ReportTable, format_uncertain
+from imulab.report.traces import axis, rounded, scatter
 from imulab.verdict import Bad, Note, verdict_of
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _BEYOND = 2.0
 """Standard uncertainties beyond which a residual is marked."""
+_BEYOND_BOTH = float(np.sqrt(2 * np.log(20.0)))
+"""The same of two at once, which one in twenty exceeds by chance."""
 
 
 def meaning(check: Check) -> str:
@@ -32,6 +34,8 @@ def meaning(check: Check) -> str:
         return "the attitudes agree with the record"
     if _limit_alone(check):
         return "no change of the unit is shown, but an attitude is beyond the limit"
+    if check.accelerometers_agree:
+        return "hard or soft iron has changed since the record was made, or iron was near"
     return "the unit has changed since the record was made, or gravity, unit or attitudes are not as assumed"
 
 
@@ -41,6 +45,11 @@ def next_step(check: Check, record: str, file: str) -> list[str]:
         return []
     if _limit_alone(check):
         return ["the limit is smaller than the uncertainty of the attitudes can tell"]
+    if check.accelerometers_agree:
+        return [
+            "measure again away from iron, or 'imulab tumble mag FILE -o NEW.json' with 16 or more attitudes for a "
+            "record that follows the change"
+        ]
     return [
         f"measure again, or 'imulab tumble fit {file} --prior {record} -o NEW.json' for a record that follows the "
         "change"
@@ -61,8 +70,35 @@ def measured(check: Check, attitudes: Attitudes) -> str:
     )
 
 
+def of_magnetometers(check: Check, attitudes: Attitudes, unit: str) -> list[str]:
+    """Return what the test of the magnetometers says; `unit` is that of the record's biases."""
+    mag = check.mag
+    if mag is None:
+        return []
+    p = f"p = {mag.probability:.2g}" if mag.probability else "p below 1e-300"
+    worst = mag.worst
+    lines = [
+        f"magnetometers: |m| and dip {'stay the same' if check.magnetometers_agree else 'do not stay the same'}, {p}, "
+        f"farthest off |m| {100 * mag.magnitude[worst]:+.2g} %, dip {np.degrees(mag.dip[worst]):+.2g} deg "
+        f"({attitudes.label(worst)})",
+        f"field against that of the record: |m| {format_both(100 * mag.common[0], 100 * mag.common_uncertainty[0])} %, "
+        f"dip {format_both(*np.degrees([mag.common[1], mag.common_uncertainty[1]]).tolist())} deg (not tested: of the "
+        "place)",
+    ]
+    if not check.magnetometers_agree and mag.explained >= check.false_alarm:
+        of = "uT" if unit == "T" else "of the field"
+        shown = ", ".join(f"{1e6 * v:+.2f}" if unit == "T" else f"{v:+.4f}" for v in mag.hard_iron.tolist())
+        lines.append(f"a hard iron that changed by ({shown}) {of} explains it (p = {mag.explained:.2g})")
+    return lines
+
+
+def format_both(value: float, uncertainty: float) -> str:
+    """Return ``+0.12 ± 0.05``."""
+    return " ± ".join(format_uncertain(value, uncertainty))
+
+
 def _limit_alone(check: Check) -> bool:
-    return check.probability is not None and check.probability >= FALSE_ALARM
+    return check.probability is not None and check.accelerometers_agree and check.magnetometers_agree
 
 
 def check_page(
@@ -95,7 +131,7 @@ def exhibits_of_check(check: Check, attitudes: Attitudes) -> Exhibits:
     return Exhibits(
         f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}; {measured(check, attitudes)}.",
         facts,
-        [_figure(check, attitudes), _table(check, attitudes)],
+        [_figure(check, attitudes), *_mag_figures(check, attitudes), _table(check, attitudes)],
     )
 
 
@@ -183,6 +219,46 @@ def _points(attitudes: Attitudes, residual: Array, beyond: NDArray[np.bool_]) ->
     }
 
 
+def _mag_figures(check: Check, attitudes: Attitudes) -> list[Figure]:
+    """Return |m| and dip of each fresh attitude, less what all have in common."""
+    mag = check.mag
+    if mag is None:
+        return []
+    number = list(range(1, len(attitudes) + 1))
+    far = np.hypot(mag.magnitude / mag.magnitude_uncertainty, mag.dip / mag.dip_uncertainty) > _BEYOND_BOTH
+    marker = {
+        "size": 8, "color": [BAD if mark else GOOD for mark in far.tolist()],
+        "symbol": ["diamond" if mark else "circle" for mark in far.tolist()],
+    }  # fmt: skip
+    texts, traces = [attitudes.label(i) for i in range(len(attitudes))], []
+    for values, sigma, unit, place in (
+        (100 * mag.magnitude, 100 * mag.magnitude_uncertainty, "%", "y2"),
+        (np.degrees(mag.dip), np.degrees(mag.dip_uncertainty), "deg", "y"),
+    ):
+        bars = {"type": "data", "array": rounded(2 * sigma), "color": QUIET, "thickness": 1, "width": 3}
+        traces.append(
+            scatter(number, rounded(values), "markers", marker=marker, error_y=bars, text=texts, yaxis=place,
+                    hovertemplate=f"%{{text}}<br>%{{y:+.2f}} {unit}<extra></extra>")
+        )  # fmt: skip
+    return [
+        Figure(
+            title="Magnitude and dip of the field in each fresh attitude under the record",
+            message=f"{int(far.sum())} of {len(number)} attitudes {'lies' if far.sum() == 1 else 'lie'} beyond what "
+            "one in twenty does by chance.",
+            caption="|m| and dip less what all attitudes have in common, which is of the place. Bars: twice the "
+            "standard uncertainty, from the record and the scatter of its attitudes.",
+            traces=traces,
+            layout={
+                "xaxis": axis("attitude", dtick=max(1, round(len(number) / 20)), range=[0.4, len(number) + 0.6]),
+                "yaxis": axis("dip, deg", domain=[0, 0.46], zeroline=True),
+                "yaxis2": axis("|m|, %", domain=[0.54, 1], zeroline=True),
+                "showlegend": False,
+            },
+            height=460,
+        )
+    ]
+
+
 def _table(check: Check, attitudes: Attitudes) -> ReportTable:
     rows = []
     beyond = _beyond(check)
@@ -195,7 +271,7 @@ def _table(check: Check, attitudes: Attitudes) -> ReportTable:
     return ReportTable(
         "Attitudes",
         "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all attitudes "
-        f"together, with what their errors share; it fails where p is below {100 * FALSE_ALARM:g} %.",
+        f"together, with what their errors share; it fails where p is below {100 * check.false_alarm:g} %.",
         ["attitude", "|f| − g", "u", "(|f| − g) / u", "remark"],
         rows,
     )

@@ -7,6 +7,7 @@ from typing import ClassVar, Unpack
 
 import numpy as np
 
+from imulab.columns import triad
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.ranked import median
@@ -17,6 +18,7 @@ from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
+from imulab.procedures.tumble.mag.check import FEWEST, MagCheck, check_mag
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
 from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of, scatter
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
@@ -51,6 +53,8 @@ class Check(Drawn):
         What a user must know of the test, a sentence each.
     attitudes
         That were tested.
+    mag
+        The same of the magnetometers; None where the record or the recording has none.
     """
 
     residuals: Array
@@ -61,6 +65,7 @@ class Check(Drawn):
     limit: float | None
     notes: tuple[str, ...]
     attitudes: Attitudes
+    mag: MagCheck | None = None
 
     subject: ClassVar[str] = "Tumble check"
 
@@ -80,9 +85,24 @@ class Check(Drawn):
 
     @property
     def passed(self) -> bool:
-        """Whether the test finds no contradiction at 5 %, and every attitude is within the limit, if there is one."""
+        """Whether the tests find no contradiction at 5 %, and every attitude is within the limit, if there is one."""
         within = self.limit is None or bool((np.abs(self.residuals) <= self.limit).all())
-        return within and (self.probability is None or self.probability >= FALSE_ALARM)
+        return within and self.accelerometers_agree and self.magnetometers_agree
+
+    @property
+    def false_alarm(self) -> float:
+        """Probability below which a test fails: 5 % shared by those that are made."""
+        return FALSE_ALARM if self.mag is None or self.probability is None else FALSE_ALARM / 2
+
+    @property
+    def accelerometers_agree(self) -> bool:
+        """Whether |f| = g holds under the record."""
+        return self.probability is None or self.probability >= self.false_alarm
+
+    @property
+    def magnetometers_agree(self) -> bool:
+        """Whether |m| and dip stay the same under the record; so where there are none."""
+        return self.mag is None or self.mag.probability >= self.false_alarm
 
     @property
     def worst(self) -> int:
@@ -103,7 +123,9 @@ def check_tumble(
     """Test whether fresh attitudes contradict an existing record, without refitting.
 
     ``r' (J V J' + C)^-1 r`` against chi-square, with r the residuals ``|f| - g`` under the record, J their derivatives
-    by its parameters, V its covariance and C the attitudes' noise. A record that holds fails once in twenty tests.
+    by its parameters, V its covariance and C the attitudes' noise. Of magnetometers, where record and attitudes have
+    them, |m| and dip are tested likewise, but for what all have in common: the attitudes may be of another place. A
+    record that holds fails once in twenty tests.
 
     Parameters
     ----------
@@ -169,6 +191,7 @@ def check_tumble(
         notes.append("the record was made from this recording, which therefore says nothing of whether it still holds")
     if not record.covariance.names:
         return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
+    mag = _mag(record, attitudes, notes)
     own_variance = own[0] + _excess(record, g)
     more = scatter(rows, seen, own_variance)
     if more > 0:
@@ -186,7 +209,21 @@ def check_tumble(
 
         probability = float(fdtrc(len(seen), freedom, value / len(seen)))
     total = g * np.sqrt(np.diag(rows @ known.covariance @ rows.T + noise))
-    return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes)
+    return Check(residuals, total, value, probability, local, limit, tuple(notes), attitudes, mag)
+
+
+def _mag(record: Calibration, attitudes: Attitudes, notes: list[str]) -> MagCheck | None:
+    """Test the magnetometers where there are any; a note says why not where only the record has them."""
+    if fit_of(record).mag is None:
+        return None
+    name = attitudes.recording.name
+    if not all(column in attitudes.recording for column in triad("mag")):
+        notes.append(Note(f"{name}: no magnetometers in it: the record's accelerometers alone are tested"))
+    elif len(attitudes) < FEWEST:
+        notes.append(Note(f"{name}: {len(attitudes)} attitudes; magnetometers are tested by {FEWEST} or more"))
+    else:
+        return check_mag(record, attitudes)
+    return None
 
 
 def _gravity(record: Calibration, given: float | str | Gravity | None, attitudes: Attitudes) -> Gravity:

@@ -40,6 +40,21 @@ class FieldMeans:
 
 
 def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
+    """Return the magnetometers' outputs in the attitudes `kept`, from 0, that a fit can be made of.
+
+    Raises
+    ------
+    DataError
+        A constant or saturated axis, outputs in one plane, too few attitudes, and as for `outputs_of`.
+    OptionError, UnitError
+        As for `outputs_of`.
+    """
+    found = outputs_of(attitudes, kept)
+    _check(replace(found, mean=found.mean[kept]), attitudes.recording.name, triad("mag"))
+    return found
+
+
+def outputs_of(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
     """Return the magnetometers' outputs in the attitudes `kept`, from 0, of a recording that has them.
 
     A magnetometer that is slower than its log has samples in some of the rows, and no numbers in the others.
@@ -47,12 +62,11 @@ def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
     Raises
     ------
     DataError
-        No such columns, no samples in an attitude, a constant or saturated axis, outputs in one plane, too few
-        attitudes.
+        No such columns, or no samples in an attitude.
     OptionError
         Some of the attitudes were taken out by hand.
     UnitError
-        The columns have different units.
+        The columns have different units, or one of something else.
     """
     recording = attitudes.recording
     names = triad("mag")
@@ -69,13 +83,10 @@ def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
             f"count, found {unit!r}"
         )
     if attitudes.pieces is not None:
-        found = _of_stretches(attitudes, kept, recording, names, unit)
-    elif attitudes.trace is None:
-        found = _of_table(attitudes, recording, names, unit)
-    else:
-        raise OptionError(f"{recording.name}: expected all attitudes that were found; drop says which to leave out")
-    _check(replace(found, mean=found.mean[kept]), recording.name, names)
-    return found
+        return _of_stretches(attitudes, kept, recording, names, unit)
+    if attitudes.trace is None:
+        return _of_table(attitudes, recording, names, unit)
+    raise OptionError(f"{recording.name}: expected all attitudes that were found; drop says which to leave out")
 
 
 def _of_table(attitudes: Attitudes, recording: Recording, names: list[str], unit: str) -> FieldMeans:

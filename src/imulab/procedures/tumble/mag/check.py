@@ -1,0 +1,158 @@
+"""Fresh attitudes against the magnetometers of a record, to test whether |m| and the dip still stay the same.
+
+Of a place that may be another one only their constancy is tested: |m| over the record's field and the dip less the
+record's, r, with J their derivatives by the record's parameters of both triads, V its covariance, N the scatter of its
+own attitudes, and one unknown each that all |m| and all dips have in common,
+
+    min (r - X c)' (J V J' + N)^-1 (r - X c) / (2n - 2)   against F(2n - 2, nu)
+
+with nu the redundancy of the record's |m| and dips. With three more columns, J of the hard iron, the same says whether
+a change of hard iron alone would explain what is left, and which.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.estimation.special import fdtrc
+from imulab.procedures.tumble.apply import field_in_body, output_factor, specific_force
+from imulab.procedures.tumble.attitudes import Attitudes
+from imulab.procedures.tumble.mag.field import outputs_of
+from imulab.procedures.tumble.mag.heading import Law, law_of
+from imulab.procedures.tumble.mag.model import dips
+from imulab.procedures.tumble.sections import fit_of, model_of
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+
+FEWEST = 4
+_PASSES = 5
+_LEAST_FREE = 3.0
+
+
+@dataclass(frozen=True)
+class MagCheck:
+    """How well the magnetometers of a record still hold.
+
+    Attributes
+    ----------
+    magnitude, dip
+        Of each attitude, less what all have in common: parts of the field, and rad, shape (n,).
+    magnitude_uncertainty, dip_uncertainty
+        Of each, from the record's covariance and scatter, shape (n,).
+    common
+        By what |m| and the dip are off the record's in all attitudes, as a part of the field and rad: another place.
+    common_uncertainty
+        Of both.
+    probability
+        Of so large a scatter, did the record hold.
+    hard_iron
+        Change of hard iron that would explain the attitudes best, in the unit of the record's biases, shape (3,).
+    explained
+        Probability of what such a change leaves.
+    """
+
+    magnitude: Array
+    dip: Array
+    magnitude_uncertainty: Array
+    dip_uncertainty: Array
+    common: Array
+    common_uncertainty: Array
+    probability: float
+    hard_iron: Array
+    explained: float
+
+    @property
+    def worst(self) -> int:
+        """Index of the attitude that is farthest off, in units of its uncertainties."""
+        off = (self.magnitude / self.magnitude_uncertainty) ** 2 + (self.dip / self.dip_uncertainty) ** 2
+        return int(np.argmax(off))
+
+
+def check_mag(record: Calibration, attitudes: Attitudes) -> MagCheck:
+    """Test whether the magnitude and the dip of fresh attitudes stay the same under a record.
+
+    Parameters
+    ----------
+    record
+        With magnetometers.
+    attitudes
+        Four or more, in the record's unit, of a recording with magnetometers.
+
+    Raises
+    ------
+    DataError
+        An attitude has no samples of the magnetometers, or numbers that are none.
+    UnitError
+        Their unit cannot be converted to the record's.
+    RecordError
+        The record lacks a parameter or its covariance.
+    """
+    law, fit, n = law_of(record), fit_of(record).mag, len(attitudes)
+    assert fit is not None
+    means = outputs_of(attitudes, np.arange(n))
+    factor = output_factor(attitudes.recording.name, "mag", means.unit, model_of(record).mag_output_unit)
+    field = field_in_body(record, means.mean * factor)
+    force = specific_force(record, attitudes.mean)
+    length, dip = float(record.model["field"]["value"]), record.value("dip")
+    slopes, _ = _slopes(law, force, field, length)
+    noise, freedom = _noise(record, n)
+    total = slopes @ law.covariance @ slopes.T + np.diag(noise)
+    common: Array = np.kron(np.eye(2), np.ones((n, 1))).astype(np.float64)
+    found, left, value, of_common = _fitted(_off(force, field, length, dip), common, total)
+    moved, after = np.zeros(3), value
+    for _ in range(_PASSES):  # |m| is not linear in a hard iron that moved far
+        there = field - moved @ np.linalg.inv(law.mag.turn).T
+        design = np.hstack([common, _slopes(law, force, there, length)[1]])
+        step, _, after, _ = _fitted(_off(force, there, length, dip), design, total)
+        moved = moved - step[2:]
+    sigma = np.sqrt(np.diag(total))
+    return MagCheck(
+        left[:n], left[n:], sigma[:n], sigma[n:], found, np.sqrt(np.diag(of_common)),
+        float(fdtrc(2.0 * n - 2, freedom, value / (2 * n - 2))),
+        moved,
+        float(fdtrc(2.0 * n - 5, freedom, after / (2 * n - 5))),
+    )  # fmt: skip
+
+
+def _off(force: Array, field: Array, length: float, dip: float) -> Array:
+    """Return |m| over the record's less 1, and then the dips less the record's, shape (2n,)."""
+    return np.concatenate([np.linalg.norm(field, axis=1) / length - 1, dips(field, force) - dip])
+
+
+def _slopes(law: Law, force: Array, field: Array, length: float) -> tuple[Array, Array]:
+    """Return how |m| and then the dips change with all parameters, (2n, p), and with the hard iron, (2n, 3)."""
+    f_length, m_length = np.linalg.norm(force, axis=1)[:, None], np.linalg.norm(field, axis=1)[:, None]
+    u, e = field / m_length, force / f_length
+    dip = dips(field, force)[:, None]
+    t, v = -(e + u * np.sin(dip)) / np.cos(dip) / m_length, -(u + e * np.sin(dip)) / np.cos(dip) / f_length
+    of_mag = np.vstack([law.mag.slopes(field, u / length), law.mag.slopes(field, t)])
+    of_accel = np.vstack([law.accel.slopes(force, np.zeros_like(force)), law.accel.slopes(force, v)])
+    return np.hstack([of_mag, of_accel]), of_mag[:, :3]
+
+
+def _noise(record: Calibration, count: int) -> tuple[Array, float]:
+    """Variance of each |m| and dip as the record's own attitudes scatter, and its degrees of freedom.
+
+    With a share h of an attitude in its own fit its residual has the variance (1 - h) of the noise, its leave-one-out
+    error 1 / (1 - h): the product of both root mean squares is the noise's variance, their ratio what is left of an
+    attitude. The degrees of freedom are those of one F with the mean of the two.
+    """
+    fit = fit_of(record).mag
+    assert fit is not None
+    scatter = [of.rms * of.leave_one_out for of in (fit.magnitude, fit.dip)]
+    free = [max(fit.attitudes * of.rms / of.leave_one_out, _LEAST_FREE) for of in (fit.magnitude, fit.dip)]
+    mean = sum(each / (each - 2) for each in free) / 2
+    return np.repeat(scatter, count), 2 * mean / (mean - 1)
+
+
+def _fitted(values: Array, design: Array, covariance: Array) -> tuple[Array, Array, float, Array]:
+    """Generalised least squares: parameters, what is left, its weighted square, and the parameters' covariance."""
+    root = np.linalg.cholesky(covariance)
+    rows, whitened = np.linalg.solve(root, design), np.linalg.solve(root, values)
+    size = np.linalg.norm(rows, axis=0)
+    found = np.linalg.lstsq(rows / size, whitened, rcond=None)[0] / size
+    spread = np.linalg.inv((rows / size).T @ (rows / size)) / np.outer(size, size)
+    left = whitened - rows @ found
+    return found, values - design[:, :2] @ found[:2], float(left @ left), spread
