@@ -16,6 +16,8 @@ from imulab.estimation.allan import AllanCurve, allan_deviation
 from imulab.estimation.noise.analysis import Analysis, analyses
 from imulab.estimation.noise.choice import CANDIDATES, average
 from imulab.estimation.noise.cosine import transformed
+from imulab.estimation.noise.plausible import doubtful_units
+from imulab.estimation.noise.readings import own_readings
 from imulab.estimation.noise.terms import allan_variance
 from imulab.estimation.noise_coefficients import (
     NoiseCoefficients,
@@ -116,11 +118,12 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
         more += [type(note)(f"{recording.name}: {note}") for note in left_out.notes()]
         recording = left_out.recording
     _check_squares(recording, names)
+    recording, mended = own_readings(recording, names)
     recording, trimmed = steady_part(recording)
     rate, timing = sampling_rate(recording)
     if not 1 / _LARGEST < rate < _LARGEST:
         raise DataError(f"{recording.name}: column time: {rate:.3g} samples in a second; expected a rate of sensors")
-    notes += [*more, *trimmed, *timing]
+    notes += [*more, *mended, *trimmed, *timing, *doubtful_units(recording, names, rate)]
     moved = moved_columns(recording, names, rate)
     columns: dict[str, Any] = {}
     values = (recording.si(name) for name in names)  # one at a time: a long log is large

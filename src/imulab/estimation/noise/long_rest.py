@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from imulab.estimation.column_noise import most_reach
 from imulab.estimation.noise.cosine import Accumulator, Stretch
-from imulab.estimation.noise.rest import FEWEST, LEVELS, MOST, SHARE, Rest, is_clipped, notes_of_gaps, notes_of_steps
+from imulab.estimation.noise.plausible import doubtful_units
+from imulab.estimation.noise.readings import LEVELS, dropouts, own_readings
+from imulab.estimation.noise.rest import FEWEST, MOST, SHARE, Rest, is_clipped, notes_of_gaps, notes_of_steps
 from imulab.estimation.ranked import distinct
 from imulab.estimation.sampling import BRIDGED, SAME_RATE, WIDEST_GAP, bridged, bridged_line, mislabelled, usual_step
 from imulab.recording import Array, Recording
@@ -196,6 +198,8 @@ class _Log:
         if time is None or not np.isfinite(time).all():
             raise _AsWholeError
         columns = {name: np.asarray(block.si(name), dtype=np.float64) for name in self._names}
+        if any(dropouts(values) is not None for values in columns.values()):
+            raise _AsWholeError
         if not fine.all():
             self._first_bad = self._first_bad or block.place(int(np.argmin(fine)))
             self._bad += int(np.count_nonzero(~fine))
@@ -229,8 +233,11 @@ class _Log:
     def _begin(self, block: Recording, steps: Array, columns: dict[str, Array]) -> None:
         if len(steps) < FEWEST:
             raise _AsWholeError
-        self._head = _rows(block, 0, 0)
-        self._coarse = notes_of_steps(bridged(block, self._names)[0], self._names)
+        self._head, filled = _rows(block, 0, 0), bridged(block, self._names)[0]
+        if own_readings(filled, self._names)[1]:
+            raise _AsWholeError
+        rate = 1 / usual_step(steps)[0]
+        self._coarse = [*notes_of_steps(filled, self._names), *doubtful_units(filled, self._names, rate)]
         self._warm = "temperature" in block
         self._usual, self._longest = usual_step(steps)
         self._levels = {name: _Level(columns[name], max(1, round(1 / self._usual))) for name in self._names}

@@ -12,6 +12,8 @@ import numpy as np
 from imulab.errors import DataError
 from imulab.estimation.column_noise import moved_columns
 from imulab.estimation.noise.cosine import Stretch, slow_coefficients, transformed
+from imulab.estimation.noise.plausible import doubtful_units
+from imulab.estimation.noise.readings import LEVELS, own_readings
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.ranked import distinct
 from imulab.estimation.sampling import WIDEST_GAP, bridged, sampling_rate, steady_part, usual_step
@@ -23,7 +25,7 @@ FEWEST, SHORT = 500, 100.0
 """Samples of a stretch at least; s below which only white noise and limits of the rest can be told."""
 MOST, SHARE = 16, 0.05
 """Stretches between gaps at most, and how long each must be in terms of the longest."""
-LEVELS, _PILED, _A_FEW = 6, 2, 10
+_PILED, _A_FEW = 2, 10
 _SEEN = 100_000
 
 
@@ -102,9 +104,10 @@ class Rest:
             limit = _clipped(part)
             if limit is not None:
                 count = int(np.count_nonzero(part == limit))
+                lost = " (or are zeros in place of lost readings)" if limit == 0 else ""
                 raise DataError(
-                    f"{where}: {count} samples are at its limit, {limit:.6g} {unit}; expected a range that holds the "
-                    "noise of a sensor at rest"
+                    f"{where}: {count} samples are at its limit, {limit:.6g} {unit}{lost}; expected a range that holds "
+                    "the noise of a sensor at rest"
                 )
 
 
@@ -121,8 +124,9 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         holds 500 samples.
     """
     recording, notes = bridged(recording, list(names))
+    recording, more = own_readings(recording, names)
     recording, trimmed = steady_part(recording)
-    notes = [*(f"{recording.name}: {note}" for note in recording.notes), *notes, *trimmed]
+    notes = [*(f"{recording.name}: {note}" for note in recording.notes), *notes, *more, *trimmed]
     if len(recording) < FEWEST:
         raise _too_few(recording, len(recording))
     rate, timing = sampling_rate(recording)
@@ -135,7 +139,7 @@ def at_rest(recording: Recording, names: Sequence[str]) -> Rest:
         raise _too_few(recording, left_out)
     # Lines about gaps are said here, for other figures than those of an Allan curve follow from them.
     notes += [line for line in timing if " in time, the longest " not in line]
-    notes += notes_of_steps(recording, names)
+    notes += [*notes_of_steps(recording, names), *doubtful_units(recording, names, rate)]
     notes += notes_of_gaps(recording.name, usual, list(map(_length, parts)), filled, left_out, len(time))
     return Rest(recording, usual, tuple(parts), filled, tuple(notes))
 
