@@ -121,6 +121,19 @@ def test_whole_fits_err_by_what_the_record_predicts():
     assert 0.85 < np.sqrt(np.mean(ratios)) < 1.15
 
 
+def test_samples_scatter_by_what_is_stated():
+    """Within each attitude of a recording the parameters' part is common, and here far below the noise."""
+    recording = il.simulate_tumble(attitudes=16, order=1, hold="3 s", gravity=G, field="48 uT", seed=5)
+    found = il.apply(il.fit_mag(recording, order=1, gravity=G), recording, heading=True)
+    attitudes, ratios = il.find_attitudes(recording), []
+    for start, stop in zip(attitudes.start, attitudes.stop, strict=True):
+        rows = (found.column("time") > start + 0.3) & (found.column("time") < stop - 0.3)
+        for angle in ("heading", "dip"):
+            error, u = np.radians(found.column(angle)[rows]), np.radians(found.column(f"std_{angle}")[rows])
+            ratios.append(wrapped(error - error[0]).std() / np.median(u))
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.06)
+
+
 def test_motion_and_a_vertical_axis_are_uncertain():
     truth, record = fitted(5)
     north_up = np.array([[[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]] * 3)  # x east, y north, z up

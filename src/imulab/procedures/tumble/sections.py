@@ -116,6 +116,13 @@ class Heading(Part):
     of_one_reading: Length
 
 
+class OneSample(Part):
+    """``fit.mag.of_one_sample``: noise of one axis, m/s^2 and parts of the field."""
+
+    accel: Length
+    mag: Length
+
+
 class MagFit(Part):
     """``fit.mag``."""
 
@@ -128,6 +135,7 @@ class MagFit(Part):
     condition_number: float
     set_aside: list[int] = field(default_factory=list)
     heading: Heading
+    of_one_sample: OneSample | None = None
     moved: dict[str, float]
 
 

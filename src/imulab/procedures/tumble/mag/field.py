@@ -30,13 +30,16 @@ class FieldMeans:
     """Outputs of the magnetometers in each attitude.
 
     `mean` has shape (n, 3), `covariance` (n, 3, 3), or None for a table that does not state it, not a number where an
-    attitude was not asked for; `unit` is that of the columns, `notes` what was left out.
+    attitude was not asked for; `unit` is that of the columns, `notes` what was left out. `of_one_sample` is the
+    standard deviation of one axis of accelerometers and magnetometers at rest, each in the unit of its columns, None
+    for a table.
     """
 
     mean: Array
     covariance: Array | None
     unit: str
     notes: tuple[str, ...] = ()
+    of_one_sample: tuple[float, float] | None = None
 
 
 def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
@@ -107,8 +110,10 @@ def _of_stretches(
     mean, own = np.full((len(attitudes), 3), np.nan), np.full((len(attitudes), 3, 3), np.nan)
     freedom = np.ones(len(attitudes))
     rest = np.zeros(len(samples), dtype=np.bool_)
-    for number in kept.tolist():
+    force, scatter = recording.triad("accel"), np.empty((len(kept), 2))
+    for place, number in enumerate(kept.tolist()):
         index = np.concatenate([np.arange(a, b) for a, b, at in pieces.tolist() if at == number])
+        scatter[place, 0] = force[index].var(axis=0, ddof=1).mean()
         index = index[there[index]]
         if len(index) < 2:
             raise DataError(
@@ -117,6 +122,7 @@ def _of_stretches(
             )
         rest[index] = True
         mean[number] = samples[index].mean(axis=0)
+        scatter[place, 1] = samples[index].var(axis=0, ddof=1).mean()
         parts = np.array_split(index, min(_BATCHES, len(index)))
         batches = np.array([samples[part].mean(axis=0) for part in parts])
         own[number], freedom[number] = np.cov(batches.T) / len(batches), len(batches) - 1.0
@@ -128,7 +134,8 @@ def _of_stretches(
     covariance[:, range(3), range(3)] += np.where(
         covariance[kept][:, range(3), range(3)].mean(axis=0) < 1e-3 * step**2, step**2 / 12, 0.0
     )
-    return FieldMeans(mean, covariance, unit, tuple(left_out.notes(rest)))
+    of_accel, of_mag = np.sqrt(np.median(scatter, axis=0)).tolist()
+    return FieldMeans(mean, covariance, unit, tuple(left_out.notes(rest)), (of_accel, of_mag))
 
 
 def _readings(recording: Recording, names: list[str]) -> tuple[LeftOut, NDArray[np.bool_]]:

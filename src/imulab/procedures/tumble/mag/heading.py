@@ -6,9 +6,10 @@ the body's x axis, clockwise from north, and the dip are
     heading = atan2(|f| a_x, n_x),    dip = atan2(-m.f, |a|)
 
 A sample's uncertainty is that of the record's parameters, through ``dv = T^-1 (ds - dT v)``,
-``ds = (-(A + b) dS/S - db - sum dk_j s^j) / A'(s)`` of both triads with their common covariance, and of the noise that
-the record's attitudes show. A unit that moves has ``|f|^2 = g^2 + a^2`` with a level acceleration a: where |f| is off
-g by more than 1 %, which gravity and calibration are not, a counts as noise of each axis of f.
+``ds = (-(A + b) dS/S - db - sum dk_j s^j) / A'(s)`` of both triads with their common covariance, of the scatter that
+the record's attitudes show, and of the noise of one sample in the recording that the record was made from. A unit that
+moves has ``|f|^2 = g^2 + a^2`` with a level acceleration a: where |f| is off g by more than 1 %, which gravity and
+calibration are not, a counts as noise of each axis of f.
 """
 
 from __future__ import annotations
@@ -165,6 +166,19 @@ def law_of(record: Calibration) -> Law:
     )
 
 
+def of_samples(law: Law, record: Calibration) -> Law:
+    """Return the law for samples of a recording, which are noisier than the means of attitudes."""
+    mag = fit_of(record).mag
+    if mag is None or mag.of_one_sample is None:
+        return law
+    sample = mag.of_one_sample
+    return replace(
+        law,
+        force_noise=float(np.hypot(law.force_noise, sample.accel.value)),
+        field_noise=float(np.hypot(law.field_noise, sample.mag.value)),
+    )
+
+
 def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
     """Return what adds columns heading, std_heading, dip and std_dip, deg, to a recording that the record corrected.
 
@@ -173,7 +187,8 @@ def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
     RecordError
         As for `law_of`.
     """
-    law = law_of(record)
+    of_means = law_of(record)
+    of_each = of_samples(of_means, record)
 
     def with_heading(recording: Recording) -> Recording:
         for name in (*triad("accel"), *triad("mag")):
@@ -181,7 +196,8 @@ def heading_of(record: Calibration) -> Callable[[Recording], Recording]:
                 raise DataError(f"{recording.name}: no column {name}; heading needs accelerometers and magnetometers")
         force = np.column_stack([recording.si(name) for name in triad("accel")])
         field = np.column_stack([recording.si(name) for name in triad("mag")])
-        found = law.angles(force, field)
+        # A table of attitudes has no time: its rows are means.
+        found = (of_each if "time" in recording else of_means).angles(force, field)
         columns = {
             "heading": found.heading, "std_heading": found.heading_uncertainty,
             "dip": found.dip, "std_dip": found.dip_uncertainty,

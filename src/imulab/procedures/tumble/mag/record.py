@@ -59,7 +59,10 @@ def with_mag(
         parameters=kept | {name: parameters[name] for name in mag_names(joint.pair.mag_order)},
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
         model={**accel.model, **_model(ready, joint)},
-        fit={**accel.fit, "mag": _fit(ready, joint, seen, aside, moved, heading)},
+        fit={
+            **accel.fit,
+            "mag": _fit(ready, joint, seen, aside, moved, heading) | _of_one_sample(ready, parameters),
+        },
         options={
             **accel.options,
             **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
@@ -169,6 +172,19 @@ def _fit(
         },
         "moved": dict(moved),
     }
+
+
+def _of_one_sample(ready: Ready, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
+    """Noise of one axis of one sample of the recording, m/s^2 and parts of the field; nothing of a table of means."""
+    if ready.means.of_one_sample is None:
+        return {}
+    of_accel, of_mag = ready.means.of_one_sample
+    scale = float(np.median([abs(parameters[f"scale_factor_{axis}"].value) for axis in "xyz"]))
+    sizes = {
+        "accel": {"value": of_accel / scale, "unit": "m/s^2"},
+        "mag": {"value": of_mag / ready.mag.size, "unit": "1"},
+    }
+    return {"of_one_sample": sizes}
 
 
 def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, Any]:
