@@ -52,19 +52,23 @@ def test_an_unknown_target_lists_the_known_ones(folder, capsys):
     assert not (folder / "out").exists()
 
 
+def contents(folder):
+    """The files of a folder and of those in it, by their names from it on."""
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def test_it_says_what_it_wrote(folder, capsys):
     assert main(["export", "--to", "c", "accel.json", "warmup.json", "-o", "new/out"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    written = sorted(path.relative_to(folder).as_posix() for path in (folder / "new/out").iterdir())
-    assert sorted(line.removeprefix("c: ") for line in lines) == written
+    assert sorted(line.removeprefix("c: new/out/") for line in lines) == sorted(contents(folder / "new/out"))
 
 
 def test_a_second_export_replaces_the_first(folder):
     for record in ("accel.json", "again.json", "accel.json"):
         assert main(["export", "--to", "c", record, "-o", "out"]) == 0
-    first = {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+    first = contents(folder / "out")
     assert main(["export", "--to", "c", "accel.json", "-o", "other"]) == 0
-    assert {path.name: path.read_bytes() for path in (folder / "other").iterdir()} == first
+    assert contents(folder / "other") == first
 
 
 def test_a_serial_cannot_end_a_comment(folder, capsys):

@@ -428,9 +428,12 @@ def test_nothing_but_the_self_test_has_a_main_and_the_core_is_the_same_for_every
     assert (tmp_path / "imulab.h").read_bytes() == (exported / "imulab.h").read_bytes()
     core, own = {"imulab.c", "imulab.h"}, {"unit.c", "unit.h", "unit.blob"}
     others = {"Makefile", "README.md", "golden.h", "selftest.c"}
-    assert {path.name for path in tmp_path.iterdir()} == core | own | others
+    libraries = {"library.properties", "library.json", "src", "zephyr", "examples"}
+    assert {path.name for path in tmp_path.iterdir()} == core | own | others | libraries
     assert [path.name for path in tmp_path.glob("*.c") if " main(" in path.read_text()] == ["selftest.c"]
-    assert [path.name for path in tmp_path.iterdir() if '"golden.h"' in path.read_text("latin-1")] == ["selftest.c"]
+    every = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert [path.name for path in every if '"golden.h"' in path.read_text("latin-1")] == ["selftest.c"]
+    assert [path.name for path in every if " main(" in path.read_text("latin-1")] == ["selftest.c"]
 
 
 def test_double_never_occurs_in_the_float_build(exported, tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from imulab.device.blob import make_blob
 from imulab.device.tables import KINDS, DeviceTable, Field
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
+from imulab.exporters.libraries import firmware_file, libraries
 from imulab.printable import printable
 from imulab.procedures.registry import section
 from imulab.procedures.unit_tables import tables_of_all
@@ -39,18 +40,22 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     """
     tables = tables_of_all(records, options.fusion)
     blob = make_blob(records, tables)
+    words = _words(records, tables, len(blob))
     contents = {
         "imulab.h": _header(tables),
         "imulab.c": _amalgamation(),
         "unit.h": _unit_h(records, tables),
         "unit.c": _unit_c(records, tables),
         "golden.h": _golden_h(tables, blob),
-        "selftest.c": _firmware("selftest.c"),
-        "Makefile": _firmware("Makefile"),
-        "README.md": _readme(records, tables, len(blob)),
+        "selftest.c": firmware_file("selftest.c"),
+        "Makefile": firmware_file("Makefile"),
+        "README.md": _rendered("README.md.j2", words),
+        **libraries(words["serial"]),
+        "examples/Corrected/Corrected.ino": _rendered("Corrected.ino.j2", words),
     }
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for name in contents:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OptionError(f"{folder}: the folder cannot be made: {error.strerror}") from None
     for name, text in contents.items():
@@ -82,10 +87,6 @@ def _source(name: str) -> str:
     if compiled is None or (_CHECKOUT.is_dir() and source != compiled):
         raise OptionError(f"{name}: the compiled part is older than the source: build again (pip install -e .)")
     return compiled
-
-
-def _firmware(name: str) -> str:
-    return (files("imulab.exporters") / "firmware" / name).read_text(encoding="utf-8")
 
 
 def _most_elements(tables: Sequence[DeviceTable]) -> int:
@@ -236,17 +237,22 @@ def _nested(value: NDArray[Any]) -> str:
     return "{\n" + ",\n".join("    " + _nested(row) for row in value) + "}"
 
 
-def _readme(records: Sequence[Calibration], tables: Sequence[DeviceTable], blob_size: int) -> str:
+def _words(records: Sequence[Calibration], tables: Sequence[DeviceTable], blob_size: int) -> dict[str, Any]:
+    """Return what the README and the sketch are made with; `use` is the code that calls the core for this unit."""
+    words = {
+        "serial": _unit_name(records),
+        "software": _comment_text(records[0].software),
+        "blob_size": blob_size,
+        "kinds": {table.kind: table.columns for table in tables},
+        "first": tables[0].kind,
+        "most_elements": _most_elements(tables),
+    }
+    return {**words, "use": _rendered("use.c.j2", words)}
+
+
+def _rendered(name: str, words: Mapping[str, Any]) -> str:
     from jinja2 import Environment, StrictUndefined
 
     # The output is Markdown and C, not HTML: nothing is escaped.
     environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
-    text: str = environment.from_string(_firmware("README.md.j2")).render(
-        serial=_unit_name(records),
-        software=_comment_text(records[0].software),
-        blob_size=blob_size,
-        kinds={table.kind: table.columns for table in tables},
-        first=tables[0].kind,
-        most_elements=_most_elements(tables),
-    )
-    return text + "\n"
+    return environment.from_string(firmware_file(name)).render(words).rstrip("\n") + "\n"

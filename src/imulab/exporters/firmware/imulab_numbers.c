@@ -1,0 +1,8 @@
+/* unit.c as Arduino, PlatformIO and Zephyr compile it; nothing where the sources themselves are in a project. */
+#if defined(ARDUINO) || defined(IMULAB_UNIT_LIBRARY)
+#include "imulab_unit.h"
+
+#include "../unit.c"
+#else
+typedef int imulab_numbers;
+#endif
