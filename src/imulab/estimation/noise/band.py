@@ -15,7 +15,7 @@ from imulab.recording import Array
 
 _AGREE, _SIGMAS, _SHARP = 0.03, 3.0, 0.2
 """How far two octaves may be apart, beyond so many sigma; up to where these sigma tell of an agreement at all."""
-_FULL = 0.999
+_FULL, _NEARLY_FULL = 0.999, 0.24
 _MANY, _FEWEST = 200, 16
 """Coefficients of a bin that tells the ripple; such bins that are needed to tell it."""
 _OFF_SIGMAS, _OFF = 5.0, 0.10
@@ -44,6 +44,10 @@ class Band:
     flat: bool = True
     roll_off: float = field(default=0.0, compare=False)
 
+    def filtered(self, interval: float) -> bool:
+        """Return whether it ends below a sensor's filter; at a quarter of the sampling rate it does where none is."""
+        return self.flat and self.highest * interval < _NEARLY_FULL
+
 
 def usable_band(spectra: Sequence[Spectrum]) -> Band:
     """Return the band whose two highest octaves agree: f_max is halved from half the rate until they do, and once more.
@@ -63,7 +67,9 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
             far, u = _apart(f, p, d, highest, 2)
             full = highest > _FULL * nyquist
             if _SIGMAS * u[0] > _SHARP or (full and far[0] < -_SIGMAS * u[0]):
-                return Band(highest, full)
+                # One of first order takes 0.76 of what these octaves are apart from the band, and N half of that.
+                left = 0.0 if full else 0.38 * float(max(far[0], 0.0) + u[0]) / math.sqrt(3)
+                return Band(highest, full, roll_off=left)
             # One of first order leaves a quarter of it an octave lower, and N has half of that at most.
             return Band(highest / 2, False, roll_off=float(_AGREE + _SIGMAS * u[0]) / 8 / math.sqrt(3))
         highest /= 2

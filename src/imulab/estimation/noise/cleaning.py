@@ -20,6 +20,10 @@ _STRONG, _NEAR, _WANDERS, _MOST_STRONG, _ROUNDS = 1e5, 50, 0.01, 8, 14
 """Lines so far above the median are fitted, by so many coefficients on both sides, if so little of them is left."""
 _STEP = 5.0
 _MOST_STEPS = 5
+_AROUND, _FEWEST_BLOCKS, _MOST_KNOCKED = 21, 64, 0.05
+_LEVEL, _FIFTH, _LOUD = 6.0, 10, 3.0
+"""How many sigma the median of a knocked block is off those around it; or how many times as far as in nineteen of
+twenty blocks its ten outermost samples are from its median."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,39 @@ def spikes_removed(samples: Array) -> tuple[Array, int]:
             cleaned[edge] = np.where(off > limit, near, samples[edge])
             count += int(np.count_nonzero(off > limit))
     return cleaned, count
+
+
+def knocks_removed(samples: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return samples, shape (n,), with knocks replaced by straight lines, and first sample and end of each, (k, 2).
+
+    A knock is a block of 50 samples whose median is 6 sigma off the median of 21 blocks around, or ten of whose samples
+    are farther from it than three times what nineteen of twenty blocks have, and half a block on both sides. Where that
+    is more than 5 % of all blocks, these are no knocks.
+    """
+    count = len(samples) // _BLOCK
+    none = np.empty((0, 2), dtype=np.int64)
+    if count < _FEWEST_BLOCKS:
+        return samples, none
+    blocks = samples[: count * _BLOCK].reshape(count, _BLOCK)
+    level = medians(blocks)
+    far = np.partition(np.abs(blocks - level[:, None]), _BLOCK - _FIFTH, axis=1)[:, _BLOCK - _FIFTH]
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND // 2, mode="reflect"), _AROUND)
+    off = np.abs(level - medians(around))
+    knocked = np.zeros(count, dtype=np.bool_)
+    for size, limit in ((off, _LEVEL / _TO_SIGMA), (far, _LOUD)):
+        usual = limit * quantile(size, 0.95)
+        knocked |= (size > usual) & (quantile(size, 0.9) > 0)  # whole counts hardly ever differ
+    if not 0 < np.count_nonzero(knocked) <= _MOST_KNOCKED * count:
+        return samples, none
+    # What reaches into the next block is part of it.
+    half = _BLOCK // 2
+    edge = np.flatnonzero(np.diff(np.concatenate([[0], knocked.astype(np.int8), [0]]))).reshape(-1, 2) * _BLOCK
+    edge = np.clip(edge + half * np.array([-1, 1]), 0, len(samples))
+    cleaned = samples.copy()
+    centre = half + _BLOCK * np.flatnonzero(~knocked)
+    for start, stop in edge.tolist():
+        cleaned[start:stop] = np.interp(np.arange(start, stop), centre, level[~knocked])
+    return cleaned, edge
 
 
 def line_groups(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.noise.cleaning import Line, line_groups, spikes_removed, strong_lines_removed
+from imulab.estimation.noise.cleaning import Line, knocks_removed, line_groups, spikes_removed, strong_lines_removed
 from imulab.estimation.noise.spectrum import Spectrum, bins
 from imulab.recording import Array
 
@@ -43,6 +43,8 @@ class Stretch:
         The lines that were left out, the largest first.
     spikes
         Samples that were replaced.
+    knocks
+        Start and length, s, of each part that was replaced because it is not of the noise around it.
     """
 
     spectra: tuple[Spectrum, ...]
@@ -50,6 +52,7 @@ class Stretch:
     used: NDArray[np.bool_]
     lines: tuple[Line, ...]
     spikes: int
+    knocks: tuple[tuple[float, float], ...] = ()
 
     @property
     def count(self) -> int:
@@ -122,6 +125,7 @@ class Accumulator:
         self._waiting: list[Array] = []
         self._held = self._spikes = self._stretches = 0
         self._squares = np.empty(0)
+        self._knocks: list[NDArray[np.int64]] = []
         self._means, self._filled, self._averaged = np.empty(0), 0, 1
 
     def add(self, samples: Array) -> None:
@@ -167,9 +171,15 @@ class Accumulator:
     def _cleaned(self, samples: Array) -> Array:
         if not self._despike:
             return samples
+        samples, knocks = knocks_removed(samples)
+        self._knocks.append(knocks + self._stretches * STRETCH)
         samples, count = spikes_removed(samples)
         self._spikes += count
         return samples
+
+    def _knocked(self) -> tuple[tuple[float, float], ...]:
+        edges = np.concatenate([np.empty((0, 2), dtype=np.int64), *self._knocks])
+        return tuple((start * self._interval, (stop - start) * self._interval) for start, stop in edges.tolist())
 
     def _whole(self, samples: Array) -> Stretch:
         count = smooth_count(len(samples))
@@ -182,7 +192,7 @@ class Accumulator:
             fine, weak = line_groups(squares, first, last, 1, count, self._interval)
             lines = tuple(sorted([*strong, *weak], key=lambda line: -line.amplitude))
         spectrum = binned(squares, fine, (first, last), self._interval, count)
-        return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes)
+        return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes, self._knocked())
 
     def _transform(self, samples: Array) -> None:
         samples = self._cleaned(samples)
@@ -225,7 +235,8 @@ class Accumulator:
         )
         edge = above.first[0] / (2 * STRETCH * self._interval)
         named = [*lines, *(each for each in more if each.frequency >= edge)]
-        return Stretch(tuple(parts), slow, fine, tuple(sorted(named, key=lambda line: -line.amplitude)), self._spikes)
+        lines = tuple(sorted(named, key=lambda line: -line.amplitude))
+        return Stretch(tuple(parts), slow, fine, lines, self._spikes, self._knocked())
 
 
 def binned(

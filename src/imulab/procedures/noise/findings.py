@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 _MANY_SPIKES = 0.01
 _MOST_NAMED = 3
-_SLOW = 10.0
-_NEARLY_FULL = 0.24
-"""Of the sampling rate: the band ends at a quarter of it where the spectrum is level up to the half."""
+_SLOW, _LEANS = 10.0, 0.005
 
 
 def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon: float) -> tuple[str, ...]:
@@ -56,16 +54,22 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
     found: list[tuple[type[str], str]] = []
     if not analysis.band.flat:
         found.append((str, "the spectrum is level nowhere, so that white noise is not told apart from other noise"))
-    elif (highest := analysis.band.highest) < _NEARLY_FULL / analysis.interval:
-        found.append(
-            (Note, f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level")
-        )
+    elif analysis.band.filtered(analysis.interval):
+        highest, low = analysis.band.highest, 2 * analysis.band.roll_off
+        lean = f", which may leave the white noise up to {100 * low:.1g} % too small" if low > _LEANS else ""
+        text = f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level"
+        found.append((Note, text + lean))
     if at_band_edge(analysis.values, analysis.limits[0]).any():
         found.append((Note, _edge(column)))
     samples = sum(each.count for each in analysis.stretches)
     if column.spikes:
         kind: type[str] = str if column.spikes > _MANY_SPIKES * samples else Note
         found.append((kind, f"{column.spikes} spikes replaced, of {samples} samples"))
+    if column.knocks:
+        start, lost = column.knocks[0][0], sum(length for _, length in column.knocks)
+        many = f"{len(column.knocks)} knocks or other parts" if len(column.knocks) > 1 else "a knock or other part"
+        text = f"{many} unlike the noise around, {lost:.2g} s from {start:.5g} s on, bridged by straight lines"
+        found.append((str if lost > _MANY_SPIKES * samples * analysis.interval else Note, text))
     if column.lines:
         found.append((Note, _lines(column)))
     for low, high, factor in analysis.allowance.off[:_MOST_NAMED]:

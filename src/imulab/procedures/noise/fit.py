@@ -65,8 +65,8 @@ class ColumnModel:
         Of the column; the unit in SI.
     analysis
         Spectrum, candidates, chosen model.
-    spikes, lines, steps
-        What was found that is no noise.
+    spikes, knocks, lines, steps
+        What was found that is no noise; of knocks start and length, s.
     drifts
         How it follows time and temperature.
     """
@@ -75,6 +75,7 @@ class ColumnModel:
     unit: str
     analysis: Analysis
     spikes: int
+    knocks: tuple[tuple[float, float], ...]
     lines: tuple[Line, ...]
     steps: tuple[Step, ...]
     drifts: tuple[Drift, ...]
@@ -315,6 +316,7 @@ def _column(
         si_unit(rests[0].recording.units[name]),
         analysis,
         spikes,
+        tuple(knock for each in stretches for knock in each.knocks),
         lines,
         tuple(step for each in found for step in each),
         tuple(drifts),

@@ -106,6 +106,11 @@ def _parameters(
         analysis, unit = column.analysis, column.unit
         values, covariance = edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])
         low, high = _intervals(analysis, more, values, covariance)
+        if analysis.band.filtered(analysis.interval):  # what its roll-off leaves in the band is not in the model
+            covariance, more_of_white = covariance.copy(), analysis.band.roll_off * values[0]
+            covariance[0, 0] += analysis.band.roll_off**2
+            low[0] = values[0] - np.hypot(values[0] - low[0], NORMAL_95 * more_of_white)
+            high[0] = values[0] + np.hypot(high[0] - values[0], NORMAL_95 * more_of_white)
         has, known = np.where(analysis.values > 0, values > 0, analysis.model), []
         for k, term in enumerate(NAMES):
             slow = term in _SLOW
@@ -184,6 +189,7 @@ def _column(column: ColumnModel) -> dict[str, Any]:
         "samples": sum(each.count for each in analysis.stretches),
         "stretches": len(analysis.stretches),
         "spikes": column.spikes,
+        "knocks": [{"time": _value(start, "s"), "length": _value(length, "s")} for start, length in column.knocks],
         "lines": [
             {"frequency": _value(line.frequency, "Hz"), "amplitude": _value(line.amplitude, column.unit)}
             for line in column.lines
