@@ -354,4 +354,4 @@ class Guide:
         now, then = (np.sqrt(np.diag(search.covariance(each))[:3].max()) for each in (np.empty((0, 3)), more))
         worst = max(u for axis in "xyz" if (u := self.fit.calibration.parameters[f"bias_{axis}"].standard_uncertainty))
         micro = 1e6 * worst / self.local_gravity
-        return f"five more would bring the worst bias from {micro:.3g} to about {micro * then / now:.3g} ug"
+        return f"five more would bring the worst bias from {micro:.3g} to about {micro * then / now:.3g} µg"
