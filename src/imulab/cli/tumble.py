@@ -265,15 +265,15 @@ def mag(
     """Calibrate a magnetometer triad in the accelerometers' frame from the same attitudes, into one record of both."""
     from imulab.gravity import gravity_option
     from imulab.procedures.loading import load
-    from imulab.procedures.tumble.mag.fit import fit_mag
+    from imulab.procedures.tumble.mag.fit import fit_mag, hemisphere_at
 
     check_outputs([output, report], [name for name in (file, accel, options["layout"]) if name])
     known = None if accel is None else load(accel)
     local = gravity_option(options["gravity"], options["latitude"], options["height"], FLAG)
     found = call(
         fit_mag, read_recording(file, **reading(options)), accel=known, same_direction=tuple(same_direction or ()),
-        field=field, loss=loss, mag_order=mag_order, drop=tuple(drop or ()), hemisphere=hemisphere, gravity=local,
-        order=order,
+        field=field, loss=loss, mag_order=mag_order, drop=tuple(drop or ()),
+        hemisphere=hemisphere or hemisphere_at(options["latitude"]), gravity=local, order=order,
     )  # fmt: skip
     finish(found.calibration, output, report, json=json)
 

@@ -8,7 +8,7 @@ from typing import overload
 
 from imulab.errors import UnitError
 from imulab.recording import Array
-from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si
+from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit
 
 _RATIO = re.compile(r"(.+)/\(\1\)")
 _NONLINEARITY = re.compile(r"1/\(m/s\^2\)(?:\^(\d))?")
@@ -32,14 +32,17 @@ class Display:
 
 
 def display_of(unit: str) -> Display:
-    """Return how parameters of a unit are shown: m/s^2 in mg, rad in mrad, rad/s in deg/h, ratios in ppm from 1."""
-    plain = {"m/s^2": "mg", "rad": "mrad", "rad/s": "deg/h"}.get(unit)
+    """Return how parameters of a unit are shown: m/s^2 in mg, rad in mrad, rad/s in deg/h, T in uT, ratios in ppm."""
+    plain = {"m/s^2": "mg", "rad": "mrad", "rad/s": "deg/h", "T": "uT"}.get(unit)
     if plain is not None:
         return Display(plain, from_si(1.0, plain))
     if unit == "rad/s/(m/s^2)":
         return Display("deg/h/g", from_si(STANDARD_GRAVITY, "deg/h"))
     if _RATIO.fullmatch(unit):
         return Display("ppm", 1e6, -1e6)
+    sensed, slash, field = unit.rpartition("/")
+    if slash and field == "T" and parse_unit(sensed).quantity == "magnetic field":
+        return Display("ppm", 1e6 / from_si(1.0, sensed), -1e6)
     match = _NONLINEARITY.fullmatch(unit)
     if match is not None:
         power = int(match[1] or 1)

@@ -27,6 +27,8 @@ from imulab.quantities import in_si
 from imulab.records.calibration import Calibration
 
 _STEEPEST = np.radians(87.0)
+_EQUATOR = np.radians(20.0)
+"""The magnetic equator lies within 16 deg of the geographic one."""
 _GAIN = 0.9
 _SIGNIFICANT = 0.01
 _MOST_ASIDE = 5
@@ -105,7 +107,7 @@ def fit_mag(
     drop
         Attitudes to leave out, numbers from 1.
     hemisphere
-        ``north`` or ``south``, to check the sign of the dip.
+        ``north`` or ``south``, to check the sign of the dip; by the latitude, where that is given, beyond 20 deg.
     gravity, latitude, height, order
         As for `fit_tumble`.
     reading
@@ -135,6 +137,7 @@ def fit_mag(
     """
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     _check_options(loss, mag_order, order, hemisphere, magnitude)
+    hemisphere = hemisphere or hemisphere_at(latitude)
     attitudes = as_attitudes(data, reading, fit_mag)
     known = None if accel is None else as_record(accel, "fit_mag: accel")
     ready = prepare(
@@ -169,6 +172,12 @@ def fit_mag(
     if known is not None and not ready.notes:
         record = with_gyro_of(record, known)
     return MagFit(record, joint, what, aside)
+
+
+def hemisphere_at(latitude: float | str | None) -> str | None:
+    """Return the magnetic hemisphere at a latitude, rad or a text; None near the equator, and where none is given."""
+    angle = 0.0 if latitude is None else in_si(latitude, "latitude", "angle", "deg")
+    return None if abs(angle) < _EQUATOR else "north" if angle > 0 else "south"
 
 
 def _check_options(

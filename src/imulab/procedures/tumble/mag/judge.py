@@ -17,6 +17,8 @@ WORST_CONDITION = 30.0
 _BLIND = 1 / 2000
 """Singular value, relative to the largest, below which a combination is not determined."""
 _HELPS = 0.05
+_LEAST_PART = 3
+"""Attitudes before and after a step: of fewer each is held against all others."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,46 @@ def most_disturbed(joint: Joint) -> Disturbed:
     index = int(np.argmin(p))
     error = predicted.errors[index]
     return Disturbed(index, float(min(p[index], 1.0)), float(error[1]), float(error[2]))
+
+
+@dataclass(frozen=True)
+class Step:
+    """From which attitude on |m| and dip are others than before, by how much, and how improbable that is by chance."""
+
+    first: int
+    magnitude: float
+    dip: float
+    probability: float
+
+
+def likeliest_step(joint: Joint) -> Step | None:
+    """Return the split of the attitudes, in their order, at which |m| and dip change most; None of too few attitudes.
+
+    Both change by a number of their own, which the fit would have found beside its parameters; the gain, in the sum of
+    squares c of |m| and dips with nu degrees of freedom, is held against F(2, nu - 2), times the number of splits.
+    """
+    n, k = joint.found.residuals.shape
+    splits = np.arange(_LEAST_PART, n - _LEAST_PART + 1)
+    if not splits.size:
+        return None
+    jacobian = weighted_jacobian(joint)
+    q = np.linalg.qr(jacobian / np.linalg.norm(jacobian, axis=0))[0][: n * k]
+    root = np.zeros((n, k, 3))
+    root[:, :3] = np.linalg.cholesky(joint.information[:, :3, :3]).transpose(0, 2, 1)
+    whitened = np.einsum("nij,nj->ni", root, joint.found.residuals[:, :3])
+    after = np.arange(n)[:, None, None, None] >= splits[:, None]
+    steps = (root[:, :, None, 1:] * after).reshape(n * k, -1)
+    columns = (steps - q @ (q.T @ steps)).reshape(n * k, len(splits), 2)
+    normal = np.einsum("rsa,rsb->sab", columns, columns)
+    moment = np.einsum("rsa,r->sa", columns, whitened.ravel())
+    size = np.linalg.solve(normal, moment[:, :, None])[:, :, 0]
+    gain = (size * moment).sum(axis=1)
+    total = float((whitened[:, 1:3] ** 2).sum())
+    redundancy = max(2 * n - joint.pair.layout.mag - 1.0, 3.0)
+    at = int(np.argmax(gain))
+    ratio = gain[at] / 2 / (max(total - float(gain[at]), 1e-300) / (redundancy - 2))
+    p = min(float(fdtrc(2.0, redundancy - 2, ratio)) * len(splits), 1.0)
+    return Step(int(splits[at]), float(size[at, 0]), float(size[at, 1]), p)
 
 
 @dataclass(frozen=True)

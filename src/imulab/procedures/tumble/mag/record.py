@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.estimation.least_squares import coverage_factor
 from imulab.estimation.ranked import rms
-from imulab.procedures.tumble.mag.judge import Disturbed, Seen, heading_uncertainty, leave_one_out
+from imulab.procedures.tumble.mag.judge import Disturbed, Seen, heading_uncertainty, leave_one_out, likeliest_step
 from imulab.procedures.tumble.mag.model import mag_names
 from imulab.procedures.tumble.mag.scaling import Ready
 from imulab.procedures.tumble.mag.solve import Joint
@@ -29,6 +29,7 @@ _ONE_WAY = 6.0
 _LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
 """Scatter of |m| and dip that steady attitudes in one field do not have; the worst of real ones: 0.5 %, 0.3 deg."""
 _HOPELESS = 5.0  # times that
+_STEPS_BY_CHANCE = 0.01
 _POINTING = np.radians(3.0)
 
 
@@ -220,6 +221,19 @@ def _scatter(joint: Joint) -> list[str]:
     ]
 
 
+def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
+    """Say if |m| and dip are others from some attitude on."""
+    step = likeliest_step(joint)
+    if step is None or step.probability > _STEPS_BY_CHANCE:
+        return []
+    return [
+        f"mag: from {labels[step.first]} on |m| is {100 * abs(step.magnitude):.2g} % "
+        f"{'higher' if step.magnitude > 0 else 'lower'} and the dip {np.degrees(abs(step.dip)):.2g} deg "
+        f"{'higher' if step.dip > 0 else 'lower'} than before (p {step.probability:.1g}): was iron, such as a phone, "
+        "near in a part of the attitudes, or did the place change?"
+    ]
+
+
 def _set_aside(label: str, one: Disturbed) -> str:
     return (
         f"mag: {label} set aside: |m| {100 * abs(one.magnitude):.2g} % "
@@ -261,7 +275,8 @@ def _warnings(
             f"mag: the dip moves the accelerometers' {name} by {abs(value):.1f} standard uncertainties: field and "
             "gravity contradict each other; was iron near, or did the unit move?"
         )
-    found += _scatter(joint)
+    left = np.delete(ready.kept, [one.index for one in aside])
+    found += [*_scatter(joint), *_step(joint, [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left])]
     if joint.pair.held is not None and joint.sigma[2] > _POINTING:
         found.append(
             f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
