@@ -4,6 +4,7 @@ import inspect
 import json
 import keyword
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,9 @@ import pytest
 import imulab as il
 from imulab.cli import common, main
 from imulab.cli.app import command
+from imulab.procedures.noise.checkfigures import as_json
 from imulab.quantities import quantity
+from imulab.records.json_text import json_text
 
 FUNCTIONS = {
     "apply": il.apply,
@@ -55,15 +58,15 @@ WITHOUT = {"demo", "live", "open"}
 READING = {"layout", "topic", "instance", "window", "element", "accel_layout", "unpack_limit"}
 APART = READING | {"output", "report", "json", "quiet", "verbose", "no_project"}
 OTHERWISE = {
-    "convert": {"with_"},  # join_recordings
-    "show": {"formats"},  # a list for people
-    "tumble gyro": {"accel", "accel_file"},  # the first argument; accel_data, which may be no file
-    "array calibrate": {"interval"},  # window
-    "array fuse": {"rate"},  # of arrays and files, a keyword of reading
-    "array compare": {"experiment", "seeds"},  # of the command alone: it simulates what the source had
-    "noise fit": {"for_", "rate", "step"},  # NoiseFit.wants
+    "convert": {"with_"},  # join_recordings, which takes both files
+    "show": {"formats"},  # a list of the files that can be read, for people; docs/recordings.md has it too
+    "tumble gyro": {"accel_file"},  # accel_data: as FILE is data in Python, it need not be a file
+    "array calibrate": {"interval"},  # an older name of window, which is there too
+    "array compare": {"experiment", "seeds"},  # in place of a FILE: repeats the simulation of the method's source
+    "noise fit": {"for_", "rate", "step"},  # of NoiseFit.wants, which the command prints in place of the record
 }
-"""Options that functions have by another name, or say in another way."""
+"""Options that functions have by another name, or in another place, and where."""
+ELSEWHERE = {"noise fit": il.NoiseFit.wants}
 COMMANDS = dict(common.commands_of(command()))
 G = 9.80665
 DEGREE = np.pi / 180
@@ -108,6 +111,26 @@ def test_options_are_keywords_of_the_same_name_and_default(path):
         if name not in keywords or plain(default) != plain(keywords[name].default)
     }
     assert {*wrong} == OTHERWISE.get(path, set())
+    if path in ELSEWHERE:
+        assert {*wrong} == {*inspect.signature(ELSEWHERE[path]).parameters} - {"self"}
+
+
+@pytest.mark.parametrize("path", FUNCTIONS)
+def test_an_option_is_read_as_on_the_command_line_where_it_is_a_text(path):
+    """What is neither a switch nor a file: `duration=600`, ``"600 s"`` and ``"10 min"`` are the same."""
+    keywords = inspect.signature(FUNCTIONS[path]).parameters
+    for parameter in COMMANDS[path].params:
+        own = keywords.get(parameter.name)
+        if own is not None and parameter.param_type_name == "option" and not parameter.is_flag:
+            assert re.search(r"\bstr\b|Data|Record|Known|Markov|Window|Sequence\[Fault", str(own.annotation)), own
+
+
+def test_what_a_program_wants_of_a_noise_fit_is_as_on_the_command_line(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    ran("noise", "fit", "log1.csv", "--for", "px4", "--rate", "100", "--step", "8 ms")
+    said = dict(line.split(": ") for line in capsys.readouterr().out.splitlines() if line.startswith("EKF2"))
+    found = il.fit_noise("log1.csv").wants("px4", rate=100.0, step="8 ms")
+    assert said == {key: f"{value:.4g}" for key, value in found.items()}
 
 
 def test_the_unit_of_a_bare_number_is_in_the_help():
@@ -145,6 +168,14 @@ def folder(tmp_path_factory):
         il.write(replace(cycle, metadata=head), place / f"cycle{number}.csv")
     il.fit_warmup(cycles, temperatures=(-40, 0, 60), model="knot-cubic").save(place / "warm.json")
     il.plan_centrifuge("1,10", cycles=1).save(place / "plan.toml")
+    il.write(il.simulate_tumble(attitudes=14, order=1, hold="2 s", field="48 uT"), place / "mag.csv")
+    il.write(still, place / "still.csv")
+    il.write(il.simulate_array(session=1, duration=60.0), place / "board.csv")
+    log = {"white": "0.3 deg/sqrt(h)", "walk": "30 deg/h/sqrt(h)", "duration": "5 min", "columns": ["gyro_z"]}
+    for seed in (1, 2):
+        il.write(il.simulate_noise(**log, seed=seed), place / f"log{seed}.csv")
+    il.fit_noise(place / "log1.csv").save(place / "noise.json")
+    il.simulate_centrifuge(levels="1,10,20", cycles=1, duration=60, static_duration=30).save(place / "rig")
     return place
 
 
@@ -254,6 +285,50 @@ MADE = {
         ["tumble.csv", "--accel", "unit1.json", "--g-sensitivity", "no", "--clock", "20 ppm", "-o", "one.json"],
         lambda out: il.fit_gyro("unit1.json", "tumble.csv", g_sensitivity="no", clock="20 ppm").save(out),
     ),
+    "tumble gyro of two files": (
+        ["tumble.csv", "--accel", "unit1.json", "--accel-file", "tumble.csv", "--fit-bias", "-o", "one.json"],
+        lambda out: il.fit_gyro("unit1.json", "tumble.csv", accel_data="tumble.csv", fit_bias=True).save(out),
+    ),
+    "tumble mag": (
+        ["mag.csv", "--accel", "unit1.json", "--field", "48", "--order", "1", "--drop", "3", "-o", "one.json"],
+        lambda out: il.fit_mag("mag.csv", accel="unit1.json", field="48 uT", order=1, drop=[3]).save(out),
+    ),
+    "array calibrate": (
+        [
+            "still.csv",
+            "--moving",
+            "board.csv",
+            "--averaging",
+            "2",
+            "--method",
+            "mean",
+            "--window",
+            ":25",
+            "-o",
+            "one.json",
+        ],
+        lambda out: il.calibrate_array(
+            "still.csv", "board.csv", averaging=2.0, method="mean", window=(None, 25.0)
+        ).save(out),
+    ),
+    "array fuse": (
+        ["board.csv", "--calibration", "array.json", "--memory", "0.01", "--still", "0:5", "-o", "one.csv"],
+        lambda out: il.write(
+            il.fuse("board.csv", calibration="array.json", memory=0.01, still=(0.0, 5.0)).recording(), out
+        ),
+    ),
+    "array compare": (
+        ["board.csv", "--calibration", "array.json", "--memory", "growing:9", "-o", "one.json"],
+        lambda out: il.compare_methods("board.csv", calibration="array.json", memory="growing:9").record.save(out),
+    ),
+    "centrifuge reduce": (
+        ["rig/manifest.toml", "-o", "one.json"],
+        lambda out: il.fit_centrifuge("rig/manifest.toml").save(out),
+    ),
+    "noise fit": (
+        ["log1.csv", "log2.csv", "--terms", "NK", "--horizon", "5 s", "--steps", "remove", "-o", "one.json"],
+        lambda out: il.fit_noise(["log1.csv", "log2.csv"], terms="NK", horizon=5.0, steps="remove").save(out),
+    ),
     "warmup fit": (
         [
             *CYCLES,
@@ -300,8 +375,7 @@ MADE = {
 
 @pytest.mark.parametrize("row", MADE)
 def test_a_command_and_its_function_give_the_same(row, folder, tmp_path, monkeypatch, capsys):
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     il.write_csv(il.simulate_tumble(attitudes=12, order=1, hold="2 s", seed=2), tmp_path / "tumble2.csv")
     monkeypatch.chdir(tmp_path)
     words, function = MADE[row]
@@ -312,6 +386,26 @@ def test_a_command_and_its_function_give_the_same(row, folder, tmp_path, monkeyp
     assert same(out, other)
 
 
+def test_the_other_options_of_a_tumble_fit_are_read_as_on_the_command_line(folder):
+    data = il.find_attitudes(folder / "tumble.csv")
+    rest = (5e-6, 2e-6 * G, np.radians(3 / 3600))
+    for given, meant in (
+        (
+            {"order": "1", "method": "linearised", "threshold": "5ppm,2ug,3arcsec"},
+            {"order": 1, "method": "linearised", "threshold": rest},
+        ),
+        ({"nonlinearity": "20ug,20ug"}, {"nonlinearity": (20e-6, 20e-6)}),
+        ({"order": "1", "monte_carlo": "1000"}, {"order": 1, "monte_carlo": 1000}),
+        (
+            {"prior": folder / "unit1.json", "ageing": "100ug,50ppm", "loss": "square"},
+            {"prior": il.load(folder / "unit1.json"), "ageing": (1e-4 * G, 5e-5), "loss": "square"},
+        ),
+    ):
+        one, other = (il.fit_tumble(data, gravity=G, **options).calibration for options in (given, meant))
+        for name, parameter in one.parameters.items():
+            assert parameter.value == pytest.approx(other.value(name), rel=1e-12)
+
+
 def test_records_are_compared_as_on_the_command_line(folder, capsys):
     first, second = folder / "unit1.json", folder / "unit2.json"
     ran("show", first, second, "--json")
@@ -319,6 +413,35 @@ def test_records_are_compared_as_on_the_command_line(folder, capsys):
     found = il.compare_records(first, second)
     assert said["probability"] == found.probability
     assert [change["difference"] for change in said["changes"]] == [change.difference for change in found.changes]
+
+
+def test_a_record_is_checked_as_on_the_command_line(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    ran("tumble", "check", "unit1.json", "tumble.csv", "--limit", "5 mg", "--json")
+    said = json.loads(capsys.readouterr().out)
+    found = il.check_tumble("unit1.json", "tumble.csv", limit="5 mg")
+    assert (said["p"], said["chi_square"], said["limit"]["value"]) == (found.probability, found.chi_square, found.limit)
+    assert [each["residual"] for each in said["attitudes"]] == found.residuals.tolist()
+    assert [each["standard_uncertainty"] for each in said["attitudes"]] == found.standard_uncertainty.tolist()
+
+
+def test_noise_is_checked_as_on_the_command_line(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    ran("noise", "check", "noise.json", "log2.csv", "--tolerance", "2 %", "--json")
+    said = json.loads(capsys.readouterr().out)
+    found = il.check_noise("noise.json", "log2.csv", tolerance=0.02)
+    assert said == json.loads(json_text(as_json(found)))
+    assert found.passed
+
+
+def test_the_noise_of_columns_is_told_as_on_the_command_line(folder, capsys, monkeypatch):
+    monkeypatch.chdir(folder)
+    ran("allan", "still.csv", "--taus", "dense", "--window", "3:25", "--json")
+    said = json.loads(capsys.readouterr().out)["columns"]
+    for name, column in said.items():
+        found = il.allan_deviation("still.csv", column=name, taus="dense", window="3:25")
+        for what in ("tau", "deviation", "standard_uncertainty"):
+            assert column[what] == getattr(found, what).tolist()
 
 
 def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):

@@ -194,7 +194,7 @@ def test_the_gyroscopes_are_fitted_in_every_form_as_by_the_command(tmp_path):
         for name, pair in parameters(found.calibration).items():
             assert pair == pytest.approx(expected[name], rel=1e-11), name
         assert len(repr(found).splitlines()) <= 12
-    with pytest.raises(ImulabError, match=r"fit_gyro: record: expected a record .*, found the recording"):
+    with pytest.raises(ImulabError, match=r"fit_gyro: accel: expected a record .*, found the recording"):
         il.fit_gyro(recording, recording)
 
 

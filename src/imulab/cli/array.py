@@ -151,7 +151,7 @@ def fuse(
     output: OutputFile = None,
 ) -> None:
     """Fuse an array into one rate: CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes."""
-    from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fused_recording
+    from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser
     from imulab.procedures.gyro_array.memory import carried, fusion_text
     from imulab.quantities import interval
     from imulab.readers import read_blocks
@@ -176,7 +176,7 @@ def fuse(
         still=None if still is None else interval(still, "--still"),
     )
     fuser = Fuser(settings, tell=warn) if file == "-" else Fuser(settings)  # a stream may never end
-    blocks = (fused_recording(part) for part in fuser.fuse(with_notes(read_blocks(file, **how))))
+    blocks = (part.recording() for part in fuser.fuse(with_notes(read_blocks(file, **how))))
     if output:
         write(blocks, output)
     else:

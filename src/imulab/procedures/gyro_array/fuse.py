@@ -133,10 +133,10 @@ class Fused(Drawn):
         The columns that were fused.
     health
         What happened to each gyro.
-    notes
-        Gaps in time, and whatever else a user should know.
     block
         The samples that were fused.
+    notes
+        Gaps in time, and whatever else a user should know.
 
     Examples
     --------
@@ -152,8 +152,8 @@ class Fused(Drawn):
     flags: np.ndarray | None
     elements: Elements
     health: Health
+    block: Recording
     notes: tuple[str, ...] = ()
-    block: Recording | None = None
 
     subject: ClassVar[str] = "Fused rate"
 
@@ -162,6 +162,13 @@ class Fused(Drawn):
         from imulab.procedures.gyro_array.fused_figures import exhibits_of_fused
 
         return exhibits_of_fused(self)
+
+    def recording(self) -> Recording:
+        """Return the fused rate as a recording, with the time and the head of what was fused: ``write`` takes it."""
+        columns, units = {"time": self.block.columns["time"]}, {"time": self.block.units["time"]}
+        for a, (name, unit) in enumerate(zip(self.elements.rate_names(), self.elements.units, strict=True)):
+            columns[name], units[name] = np.ascontiguousarray(self.rate[:, a]), unit
+        return replace(self.block, columns=columns, units=units, notes=())
 
     def __repr__(self) -> str:
         gyros, axes = self.elements.count, len(self.elements.axes)
@@ -180,20 +187,10 @@ def fuse(
     """
     fuser = Fuser(options or FuseOptions(), weights=weights)
     parts = list(fuser.fuse([recording]))
-    joined = (
-        [np.concatenate(column) for column in zip(*[(p.time, p.rate) for p in parts], strict=True)] if parts else None
-    )
-    if joined is None or fuser.health is None:
+    if not parts:
         raise DataError(f"{recording.name}: no samples to fuse")
-    return Fused(
-        time=joined[0],
-        rate=joined[1],
-        weights=np.concatenate([p.weights for p in parts]) if weights else None,
-        flags=np.concatenate([p.flags for p in parts]) if flags and parts[0].flags is not None else None,
-        elements=parts[0].elements,
-        health=fuser.health,
-        notes=tuple(fuser.notes()),
-    )
+    (whole,) = parts
+    return replace(whole, flags=whole.flags if flags else None, notes=tuple(fuser.notes()))
 
 
 @dataclass
@@ -397,16 +394,3 @@ def _gain(
             rate_walk = _WITHOUT_UNIT * float(white[a].mean()) / np.sqrt(step)
         gains.append(steady_gain(white[a], walk[a], rate_walk, step))
     return np.ascontiguousarray(gains)
-
-
-def fused_recording(fused: Fused) -> Recording:
-    """Return a fused block as a recording: its time as it was, and the fused rate."""
-    block = fused.block
-    if block is None:
-        raise ValueError("only a block of Fuser.fuse has its samples with it")
-    columns = {"time": block.columns["time"]}
-    units = {"time": block.units["time"]}
-    for a, (name, unit) in enumerate(zip(fused.elements.rate_names(), fused.elements.units, strict=True)):
-        columns[name] = np.ascontiguousarray(fused.rate[:, a])
-        units[name] = unit
-    return replace(block, columns=columns, units=units, notes=())

@@ -20,8 +20,8 @@ from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.kalman import RATE_WALK
 from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording, check_keywords
-from imulab.quantities import in_si
+from imulab.procedures.inputs import Data, Part, Reading, Record, Window, as_record, as_recording, check_keywords
+from imulab.quantities import in_si, interval
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 
@@ -106,11 +106,13 @@ def fuse(
     memory: str | float | None = None,
     initial_bias: Record = "first",
     calibration: Record | Blob | None = None,
+    rate: float | str | None = None,
     rate_walk: float | None = None,
-    still: tuple[float, float] | None = None,
+    still: tuple[float, float] | str | None = None,
+    window: Window | None = None,
     weights: bool = False,
     flags: bool = True,
-    **reading: Unpack[Reading],
+    **reading: Unpack[Part],
 ) -> Fused:
     """Fuse the readings of an array into one rate.
 
@@ -120,7 +122,7 @@ def fuse(
         A file, recording, data frame or arrays with the columns gyro_1 .. (or gyro_x_1 ..); or the readings of n gyros,
         shape (m, n) or (m, n, 3).
     options
-        All of the following as one object, instead of them.
+        The keywords as one object, instead of them, for what fuses block by block.
     method
         One of ``mean support least-squares feedback robust covariance kalman``; that of `calibration`, or robust.
     memory
@@ -129,15 +131,18 @@ def fuse(
         ``first``, ``zero``, or the record, or its file, whose biases the recursion starts from.
     calibration
         Record of `calibrate_array` or blob, or its file: its biases are taken off, its noise gives the weights.
+    rate
+        Samples per second, Hz, of arrays without `time`; the nominal rate of what has a time of its own.
     rate_walk
         Process noise of `kalman`, rad/s/sqrt(s).
     still
-        From when to when the unit is known to be at rest, s.
+        From when to when the unit is known to be at rest, s, as ``(10, 60)`` or ``"10:60"``.
+    window
+        First and last time to use, s.
     weights, flags
         Whether to keep the weight and the state of each gyro in each sample.
     reading
-        How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
-        `window`. For what has a time of its own `rate` is the nominal one.
+        How arrays and files are to be understood: `time`, `unit` or `units`; `layout`, `topic`, `instance`, `element`.
 
     Raises
     ------
@@ -157,13 +162,15 @@ def fuse(
     >>> il.fuse(board, method="mean").rate.shape == (len(board), 1)
     True
     """
-    given: dict[str, Any] = dict(reading)
-    check_keywords(given, fuse)
-    nominal = given.pop("rate", None) if _has_time(data) else None
+    hertz = None if rate is None else in_si(rate, "rate", "frequency", "Hz")
+    rest = interval(still, "still") if isinstance(still, str) else still
+    check_keywords(reading, fuse)
+    nominal, own = (hertz, None) if _has_time(data) else (None, hertz)
+    given: dict[str, Any] = {**reading, "window": window, "rate": own}
     recording = _timed(as_recording(data, given, fuse, gyros_of), "fuse")
-    named = (method, memory, calibration, rate_walk, still, None if initial_bias == "first" else initial_bias, nominal)
+    named = (method, memory, calibration, rate_walk, rest, None if initial_bias == "first" else initial_bias, nominal)
     if options is None:
-        options = _options(method, memory, initial_bias, calibration, rate_walk, still)
+        options = _options(method, memory, initial_bias, calibration, rate_walk, rest)
         options = options if nominal is None else replace(options, rate=nominal)
     elif any(value is not None for value in named):
         raise OptionError("fuse: options together with other keywords: expected one or the other")

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from imulab.device.methods import METHODS
 from imulab.errors import OptionError
 from imulab.procedures.options import READING, Option, file_option, measure, part_of, read_options, text_option
 from imulab.procedures.procedure import Files, Task
-from imulab.quantities import interval
+from imulab.quantities import span
 
 if TYPE_CHECKING:
-    from imulab.recording import Recording
     from imulab.records.calibration import Calibration
 
 
@@ -23,28 +21,12 @@ def _fit(
     from imulab.procedures.gyro_array.fit import calibrate_array
 
     part = values["part"]
-    still = _between(access.recording(files[0], values["layout"], **part), values["interval"])
+    still = access.recording(files[0], values["layout"], **{**part, "window": values["interval"] or part["window"]})
     moving = access.recording(files[1], values["layout"], **{**part, "window": None}) if len(files) > 1 else None
     noise = None if values["noise"] is None else access.record(values["noise"])
     return calibrate_array(
         still, moving, averaging_time=values["averaging"], fusion=values["fusion"], noise=noise
     ).calibration
-
-
-def _between(recording: Recording, ends: Sequence[float] | None) -> Recording:
-    """Cut a recording to an interval of its time."""
-    if ends is None:
-        return recording
-    import numpy as np
-
-    shown = f"{ends[0]:g} to {ends[1]:g} s"
-    if "time" not in recording:
-        raise OptionError(f"{recording.name}: interval {shown} needs a column time")
-    inside = np.flatnonzero((recording.si("time") >= ends[0]) & (recording.si("time") < ends[1]))
-    if not inside.size:
-        raise OptionError(f"{recording.name}: interval {shown}: no samples there")
-    columns = {name: values[inside] for name, values in recording.columns.items()}
-    return replace(recording, columns=columns, first_row=recording.first_row + int(inside[0]))
 
 
 METHOD = text_option(
@@ -57,7 +39,7 @@ MEMORY = text_option(
     choices=("growing",),
 )
 OPTIONS = (
-    Option("interval", "Use STILL from START to STOP, s.", interval, shows="FROM:TO"),
+    Option("interval", "The same as window, by its older name.", span, shows="FROM:TO"),
     measure("averaging", "Averaging time of the covariance matrix, s.", "time", "s", "1 s", shows="TIME"),
     METHOD,
     MEMORY,

@@ -11,6 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.arguments import checked
 from imulab.errors import DataError, OptionError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.noise.analysis import Analysis, analysed, without_steps
@@ -23,7 +24,9 @@ from imulab.frames import is_frame
 from imulab.procedures.inputs import Data, Reading, as_recording
 from imulab.procedures.noise.choices import HORIZON, NO_COVARIATE, SAY_STEPS, check_options
 from imulab.procedures.noise.record import make_record
+from imulab.procedures.options import names_of_columns
 from imulab.procedures.result import Result
+from imulab.quantities import in_si
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
 from imulab.units import parse_unit, si_unit
@@ -98,20 +101,49 @@ class NoiseFit(Result):
     >>> fit = il.fit_noise(il.simulate_noise(white="0.3 deg/sqrt(h)", rate=50.0, duration="10 min", columns=["gyro_z"]))
     >>> list(fit.columns)
     ['gyro_z']
+    >>> list(fit.wants("kalibr"))
+    ['gyroscope_noise_density', 'gyroscope_random_walk', 'update_rate']
     """
 
     calibration: Calibration
     columns: Mapping[str, ColumnModel]
+
+    @checked
+    def wants(self, for_: str, *, rate: float | str | None = None, step: float | str | None = None) -> dict[str, float]:
+        """Return what a program's filter wants, by its own keys and in its own units, as ``noise fit --for`` prints it.
+
+        Parameters
+        ----------
+        for_
+            ``kalibr openvins vins px4 ardupilot gtsam ros matlab``.
+        rate
+            Samples per second that the program gets, Hz; those of the logs if not given.
+        step
+            Time between predictions of the filter, s; 10 ms of px4 and 12 ms of ardupilot if not given.
+
+        Raises
+        ------
+        OptionError
+            The program is not known, or `rate` or `step` is not above 0.
+        RecordError
+            No column is of a gyroscope or an accelerometer in SI.
+        """
+        from imulab.procedures.noise.wants import noise_for
+
+        hertz = None if rate is None else in_si(rate, "rate", "frequency", "Hz")
+        return noise_for(
+            self.calibration, for_, rate=hertz, step=None if step is None else in_si(step, "step", "time", "s")
+        )
 
 
 def fit_noise(
     data: Data | Sequence[Data],
     *,
     terms: str = "auto",
-    horizon: float = HORIZON,
-    band: float | None = None,
+    horizon: float | str = HORIZON,
+    band: float | str | None = None,
     regress: str | None = NO_COVARIATE,
-    columns: Sequence[str] | None = None,
+    columns: str | Sequence[str] | None = None,
     steps: str | None = SAY_STEPS,
     **reading: Unpack[Reading],
 ) -> NoiseFit:
@@ -137,7 +169,7 @@ def fit_noise(
     regress
         ``time`` or ``temperature``: take out what follows it; ``no``: nothing.
     columns
-        Which columns; all outputs of sensors if not given.
+        Which columns, as a list or a text such as ``"gyro_x,gyro_y"``; all outputs of sensors if not given.
     steps
         ``remove``: take changes of level out; ``say``: only say them.
     reading
@@ -165,6 +197,9 @@ def fit_noise(
 
     Source: Whittle (1953); IEEE Std 952 and 647 (terms).
     """
+    horizon = in_si(horizon, "horizon", "time", "s")
+    band = None if band is None else in_si(band, "band", "frequency", "Hz")
+    columns = names_of_columns(columns, "columns") if isinstance(columns, str) else columns
     check_options(terms, horizon, band, regress, steps)
     alone = isinstance(data, str | PathLike | Recording | Mapping | np.ndarray) or is_frame(data)
     several_logs = not alone and isinstance(data, list | tuple) and all(_is_log(each) for each in data)
@@ -176,10 +211,17 @@ def fit_noise(
         gyro = parse_unit(reading.get("unit") or "m/s^2").quantity == "rate"
         return {"gyro" if gyro else "accel": samples}
 
-    recordings = (as_recording(each, reading, fit_noise, columns=named) for each in logs)
+    sources: list[Source] = []
+
+    def read() -> Iterator[Recording]:
+        for each in logs:
+            recording = as_recording(each, reading, fit_noise, columns=named)
+            sources.extend([recording.source] if recording.source is not None else [])
+            yield recording
+
     return fit_recordings(
-        recordings, terms=terms, horizon=horizon, band=band, regress=regress, columns=columns, steps=steps
-    )
+        read(), terms=terms, horizon=horizon, band=band, regress=regress, columns=columns, steps=steps, sources=sources
+    )  # fmt: skip
 
 
 def _is_log(data: object) -> bool:

@@ -23,6 +23,7 @@ from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, para
 from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction, known_of, scatter
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
+from imulab.quantities import in_si
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits
@@ -114,7 +115,7 @@ def check_tumble(
     record: Record,
     data: TumbleData,
     *,
-    limit: float | None = None,
+    limit: float | str | None = None,
     gravity: float | str | Gravity | None = None,
     latitude: float | str | None = None,
     height: float | str | None = None,
@@ -135,7 +136,7 @@ def check_tumble(
         A file, recording, data frame, arrays or attitudes, as for `fit_tumble`. Where nothing is known of their noise,
         that of the record's own attitudes counts.
     limit
-        Largest ``| |f| - g |`` that passes, m/s^2, beside the test.
+        Largest ``| |f| - g |`` that passes, m/s^2 or a text such as ``"2 mg"``, beside the test.
     gravity
         Where the attitudes were measured, as for `fit_tumble`; else that of the recording's head, or of the record.
     latitude, height
@@ -164,6 +165,7 @@ def check_tumble(
     True
     """
     record = as_record(record, "check_tumble")
+    limit = None if limit is None else in_si(limit, "limit", "acceleration", "mg")
     attitudes = as_attitudes(data, reading, check_tumble)
     if record.procedure != "tumble":
         raise RecordError(f"a {record.procedure} record cannot be checked by attitudes; expected a tumble record")

@@ -13,6 +13,7 @@ from imulab.estimation.least_squares import Observability
 from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Reading, Record, as_record
 from imulab.procedures.result import Result
+from imulab.procedures.tumble import texts
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_attitudes
 from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
@@ -23,13 +24,13 @@ from imulab.procedures.tumble.gyrorecord import with_gyro
 from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold
 from imulab.procedures.tumble.mag.fit import fit_mag
 from imulab.procedures.tumble.model import parameter_count
-from imulab.procedures.tumble.montecarlo import propagate
+from imulab.procedures.tumble.montecarlo import MonteCarlo, propagate
 from imulab.procedures.tumble.options import check_options, further_triads
 from imulab.procedures.tumble.order_zero import with_assumed_alignment
 from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.record import make_record
 from imulab.procedures.tumble.sections import model_of
-from imulab.quantities import in_si
+from imulab.quantities import in_si, whole
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -77,12 +78,12 @@ def fit_tumble(
     height: float | str | None = None,
     method: str = "norm",
     loss: str = "auto",
-    nonlinearity: tuple[float, float] | None = None,
+    nonlinearity: tuple[float, float] | str | None = None,
     prior: Record | None = None,
-    ageing: Sequence[float] = (),
-    monte_carlo: int | None = None,
+    ageing: Sequence[float] | str = (),
+    monte_carlo: int | str | None = None,
     cross: bool = False,
-    threshold: Sequence[float] | None = None,
+    threshold: Sequence[float] | str | None = None,
     with_: str | Sequence[str] = (),
     field: float | str | None = None,
     covariance: ArrayLike | None = None,
@@ -114,21 +115,22 @@ def fit_tumble(
         ``"auto"``: attitudes that no order explains are set aside and named (``"square"`` with method linearised);
         ``"square"``: all count; ``"huber"``: the pull of single disturbed ones is limited (method norm only).
     nonlinearity
-        Standard deviations of k2 and k3 about zero, in units of 1/g and 1/g^2, if known; order auto or blend.
+        Standard deviations of k2 and k3 about zero, in units of 1/g and 1/g^2, or as ``"20ug,20ug"``, if known; order
+        auto or blend.
     prior
         Earlier tumble record of the same unit, or its file, taken as a normal distribution of the parameters, which is
         widened by what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square
         and stated or measured noise.
     ageing
         Standard deviations of what biases (m/s^2), scale factors (1) and misalignments (rad) changed since the prior
-        was made, as many as are known; the attitudes tell the others.
+        was made, as many as are known, or as ``"100ug,100ppm"``; the attitudes tell the others.
     monte_carlo
         Number of trials of a propagation of distributions (JCGM 101), method norm only; none if not given.
     cross
         Whether the model has cross terms k_xy, k_yz, k_zx, at an order that is given; no attitude is set aside then.
     threshold
         Changes of scale factors (1), biases (m/s^2) and misalignments (rad) from one pass to the next below which
-        method linearised rests; the source's 5 ppm, 2 ug and 3 arcsec if not given.
+        method linearised rests, or as ``"5ppm,2ug,3arcsec"``; those are the source's, and stand if not given.
     with_
         Further triads of the same attitudes, ``"gyro"``, ``"mag"`` or both, ``"gyro,mag"``: the record is that of
         `fit_mag` and then `fit_gyro` on the record of the accelerometers. With ``"mag"`` needs method norm, order auto
@@ -177,6 +179,11 @@ def fit_tumble(
     >>> [nine.parameters[name].unit for name in ("bias_x", "gyro_bias_x", "mag_bias_x")]
     ['m/s^2', 'rad/s', 'T']
     """
+    order = texts.order(order, "order") if isinstance(order, str) else order
+    nonlinearity = texts.nonlinearity(nonlinearity, "nonlinearity") if isinstance(nonlinearity, str) else nonlinearity
+    ageing = texts.ageing(ageing, "ageing") if isinstance(ageing, str) else ageing
+    threshold = texts.threshold(threshold, "threshold") if isinstance(threshold, str) else threshold
+    monte_carlo = None if monte_carlo is None else whole(monte_carlo, "monte_carlo")
     further = further_triads(with_, "with_")
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     check_options(
@@ -195,12 +202,7 @@ def fit_tumble(
         attitudes, local, scaling, order, loss, rest,
         nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross,
     )  # fmt: skip
-    trials = None
-    if monte_carlo is not None:
-        freedom = _freedom_for_trials(estimate)
-        trials = propagate(
-            estimate.problem, estimate.solution, trials=monte_carlo, freedom=freedom, progress=progress
-        )  # fmt: skip
+    trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
     given = {"nonlinearity": nonlinearity and list(nonlinearity), "monte_carlo": monte_carlo, "cross": cross or None}
     if rest is not None:
         given["threshold"] = rest.in_si(local.value)
@@ -240,15 +242,16 @@ def _threshold(given: Sequence[float] | None, gravity: float) -> Threshold:
     return SOURCE_THRESHOLD if given is None else Threshold(given[0], given[1] / gravity, given[2])
 
 
-def _freedom_for_trials(estimate: Estimate) -> float | None:
-    """Return the degrees of freedom of the noise that is drawn; refuse attitudes that tell nothing of theirs."""
+def _propagated(estimate: Estimate, trials: int, progress: Callable[[int], None]) -> MonteCarlo:
+    """Propagate the noise of the attitudes; refuse attitudes that tell nothing of theirs."""
     if estimate.given_order is None:
         attitudes, order = estimate.attitudes, estimate.problem.order
         raise OptionError(
             f"{attitudes.recording.name}: monte-carlo needs more attitudes than parameters, or their noise (std_* "
             f"columns); found {len(attitudes)} attitudes for {parameter_count(order)} parameters"
         )
-    return estimate.given_order.freedom
+    freedom = estimate.given_order.freedom
+    return propagate(estimate.problem, estimate.solution, trials=trials, freedom=freedom, progress=progress)
 
 
 def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:

@@ -25,7 +25,7 @@ class BothTriads(Result):
 
 
 def fit_gyro(
-    record: Record,
+    accel: Record,
     data: Data,
     *,
     accel_data: Data | None = None,
@@ -43,7 +43,7 @@ def fit_gyro(
 
     Parameters
     ----------
-    record
+    accel
         Tumble record of the accelerometers, or its file.
     data
         A file, recording, data frame or arrays by name with time and both triads, or the gyroscopes alone.
@@ -67,7 +67,7 @@ def fit_gyro(
     Raises
     ------
     RecordError
-        The record is no tumble record, or `noise` no noise record of these gyroscopes.
+        `accel` is no tumble record, or `noise` no noise record of these gyroscopes.
     SegmentError
         Fewer than eight turns between attitudes.
     DataError
@@ -87,7 +87,7 @@ def fit_gyro(
     >>> abs(both.parameters["gyro_scale_factor_x"].value / truth - 1) < 1e-3
     True
     """
-    known = as_record(record, "fit_gyro")
+    known = as_record(accel, "fit_gyro: accel")
     recording = as_recording(data, reading, fit_gyro, lambda samples: {"gyro": samples})
     own = recording
     if accel_data is not None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from imulab.errors import DataError, OptionError, RecordError, listed
+from imulab.errors import DataError, RecordError
 from imulab.procedures.options import (
     ELEMENT,
     READING,
@@ -21,9 +20,9 @@ from imulab.procedures.options import (
     whole,
 )
 from imulab.procedures.procedure import Files, Task
+from imulab.procedures.tumble import texts
 from imulab.procedures.tumble.choices import FURTHER, LOSSES, METHODS, ORDERS
-from imulab.quantities import labelled, quantity
-from imulab.units import STANDARD_GRAVITY
+from imulab.quantities import labelled
 
 if TYPE_CHECKING:
     from imulab.recording import Recording
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
 
 _NAMED = ("order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo", "with_", "field")
-_CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
 
 
 def _fit(
@@ -61,38 +59,6 @@ def _fit(
     ).calibration
 
 
-def _ageing(text: str, name: str) -> tuple[float, ...]:
-    """Standard deviations of what biases, scale factors and misalignments changed, in SI, as many as are given."""
-    kinds = (("acceleration", "ug"), ("number", "ppm"), ("angle", "urad"))
-    parts = text.split(",")
-    if len(parts) > len(kinds):
-        raise OptionError(f"{name} {text!r}: expected up to three, as in 100ug,100ppm,50urad")
-    return tuple(quantity(part, name, *kind) for part, kind in zip(parts, kinds, strict=False))
-
-
-def _threshold(text: str, name: str) -> tuple[float, ...]:
-    """Changes of scale factors, biases and misalignments at which method linearised rests, in SI."""
-    parts = text.split(",")
-    if len(parts) != len(_CHANGES):
-        raise OptionError(
-            f"{name} {text!r}: expected three changes, of scale factors, biases and misalignments, such as "
-            "5ppm,2ug,3arcsec"
-        )
-    found = tuple(quantity(part.strip(), name, *kind) for part, kind in zip(parts, _CHANGES, strict=True))
-    if not all(0 < value < math.inf for value in found):
-        raise OptionError(f"{name} {text!r}: expected three finite changes above 0")
-    return found
-
-
-def _spread(text: str, option: str) -> tuple[float, float]:
-    """Return the standard deviations of k2 and k3 in units of 1/g and 1/g^2: ``20ug,20ug`` is 20 ug/g^2, 20 ug/g^3."""
-    parts = text.split(",")
-    if len(parts) != 2:
-        raise OptionError(f"{option} {text!r}: expected two standard deviations, of k2 and k3, such as 20ug,20ug")
-    first, second = (quantity(part.strip(), option, "acceleration", "ug") / STANDARD_GRAVITY for part in parts)
-    return first, second
-
-
 def _prior(file: str, recording: Recording, access: Files) -> Calibration:
     """Read a record that can be a prior for this recording."""
     from imulab.procedures.tumble.checks import check_prior, made_from
@@ -117,16 +83,10 @@ def _further(text: str, called: str) -> tuple[str, ...]:
     return further_triads(text, called)
 
 
-def _order(text: str, called: str) -> int | str:
-    if text not in ORDERS:
-        raise OptionError(f"{called} {text!r}: expected one of {listed(ORDERS, text)}")
-    return int(text) if text.isdecimal() else text
-
-
 ORDER = Option(
     "order",
     "auto: by prediction; 0 (bias and scale factor only) to 5; blend: all, as far as data support them.",
-    _order,
+    texts.order,
     "auto",
     "auto|0..5|blend",
     ORDERS,
@@ -142,11 +102,19 @@ OPTIONS = (
     choice(
         "loss", "auto: set knocked attitudes aside and name them; square: keep all; huber: limit them.", LOSSES, "auto"
     ),
-    Option("nonlinearity", "Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known.", _spread, shows="20ug,20ug"),
+    Option(
+        "nonlinearity",
+        "Standard deviations of k2 (1/g^2) and k3 (1/g^3), if known.",
+        texts.nonlinearity,
+        shows="20ug,20ug",
+    ),
     *GRAVITY,
     file_option("prior", "Earlier record of this unit, as prior knowledge.", "RECORD"),
     Option(
-        "ageing", "What the unit may have changed since the prior, if known.", _ageing, shows="100ug,100ppm[,50urad]"
+        "ageing",
+        "What the unit may have changed since the prior, if known.",
+        texts.ageing,
+        shows="100ug,100ppm[,50urad]",
     ),
     whole("monte_carlo", "Trials of a propagation of distributions, 1000 or more."),
     switch("cross", "Fit cross terms k_xy, k_yz, k_zx: products of two axes."),
@@ -154,7 +122,7 @@ OPTIONS = (
         "threshold",
         "Changes of scale factors, biases and misalignments at which --method linearised rests; "
         'the source\'s "5 ppm, 2 ug, 3 arcsec" if not given.',
-        _threshold,
+        texts.threshold,
         shows="5ppm,2ug,3arcsec",
     ),
     Option("with", "Further triads on the same attitudes, in one record.", _further, shows="gyro,mag", choices=FURTHER),

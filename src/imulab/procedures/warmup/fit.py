@@ -10,6 +10,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.procedures.inputs import Data, Reading, as_blocks
+from imulab.procedures.options import names_of_columns
 from imulab.procedures.result import Result
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, settling_size
 from imulab.procedures.warmup.curves import Curves, make_curves
@@ -28,7 +29,7 @@ from imulab.procedures.warmup.judge import (
 from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
-from imulab.quantities import in_si
+from imulab.quantities import in_si, number, temperature_list
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -75,14 +76,14 @@ def fit_warmup(
     cycles: Annotated[Sequence[Cycle | Data], "a list of power cycles, one for each test"],
     *,
     model: str = "auto",
-    temperatures: Sequence[float] = SOURCE_TEMPERATURES,
-    tolerance: float = TOLERANCE,
-    settling_time: float | None = None,
+    temperatures: Sequence[float] | str = SOURCE_TEMPERATURES,
+    tolerance: float | str = TOLERANCE,
+    settling_time: float | str | None = None,
     settling_limit: Mapping[str, float] | str = "5 %",
     exit: str = "zero",  # noqa: A002
-    taper_time: float = 60.0,
+    taper_time: float | str = 60.0,
     pool: str = "unit",
-    axes: Sequence[str] | None = None,
+    axes: str | Sequence[str] | None = None,
     beyond: str = "zero",
     latest_start: float | str = "5 s",
     temperature_column: bool = False,
@@ -114,7 +115,7 @@ def fit_warmup(
     pool
         ``unit``: all cycles are of one unit. ``type``: several units share a table, with a random effect per unit.
     axes
-        Columns to fit; all gyro_* and accel_* if not given.
+        Columns to fit, as a list or a text such as ``"gyro_x,gyro_y"``; all gyro_* and accel_* if not given.
     beyond
         What the unit does at power-on temperatures beyond the outer ones: ``zero``, nothing; ``hold``, as there.
     latest_start
@@ -145,10 +146,14 @@ def fit_warmup(
     >>> fit.calibration.procedure
     'warmup'
     """
+    temperatures = temperature_list(temperatures, "temperatures")
+    tolerance = number(tolerance, "tolerance") if isinstance(tolerance, str) else tolerance
+    settling_time = None if settling_time is None else in_si(settling_time, "settling_time", "time", "s")
+    taper_time = in_si(taper_time, "taper_time", "time", "s")
     at = check_options(model, temperatures, tolerance, settling_time, exit, taper_time, pool, beyond)
     found = _cycles(cycles, reading, in_si(latest_start, "latest_start", "time", "s"), from_column=temperature_column)
     if axes is not None:
-        found = [with_axes(cycle, tuple(axes)) for cycle in found]
+        found = [with_axes(cycle, _names(axes)) for cycle in found]
     order = common_axes(found)
     found = [with_axes(cycle, order) for cycle in found]
     _check_units(found, pool)
@@ -184,6 +189,10 @@ def fit_warmup(
         },
     )
     return WarmupFit(record, table, tuple(rows), spread, curves)
+
+
+def _names(axes: str | Sequence[str]) -> tuple[str, ...]:
+    return tuple(names_of_columns(axes, "axes") if isinstance(axes, str) else axes)
 
 
 def _limits(given: Mapping[str, float] | str) -> dict[str, float]:

@@ -1,0 +1,75 @@
+"""Texts of the options of a tumble fit, as a person writes them, to values in SI."""
+
+from __future__ import annotations
+
+import math
+
+from imulab.errors import OptionError, listed
+from imulab.procedures.tumble.choices import ORDERS
+from imulab.quantities import quantity
+from imulab.units import STANDARD_GRAVITY
+
+_CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
+
+
+def ageing(text: str, name: str) -> tuple[float, ...]:
+    """Return standard deviations of what biases, scale factors and misalignments changed, in SI, as many as are given.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    kinds = (("acceleration", "ug"), ("number", "ppm"), ("angle", "urad"))
+    parts = text.split(",")
+    if len(parts) > len(kinds):
+        raise OptionError(f"{name} {text!r}: expected up to three, as in 100ug,100ppm,50urad")
+    return tuple(quantity(part, name, *kind) for part, kind in zip(parts, kinds, strict=False))
+
+
+def threshold(text: str, name: str) -> tuple[float, ...]:
+    """Return changes of scale factors, biases and misalignments at which method linearised rests, in SI.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    parts = text.split(",")
+    if len(parts) != len(_CHANGES):
+        raise OptionError(
+            f"{name} {text!r}: expected three changes, of scale factors, biases and misalignments, such as "
+            "5ppm,2ug,3arcsec"
+        )
+    found = tuple(quantity(part.strip(), name, *kind) for part, kind in zip(parts, _CHANGES, strict=True))
+    if not all(0 < value < math.inf for value in found):
+        raise OptionError(f"{name} {text!r}: expected three finite changes above 0")
+    return found
+
+
+def nonlinearity(text: str, name: str) -> tuple[float, float]:
+    """Return the standard deviations of k2 and k3 in units of 1/g and 1/g^2: ``20ug,20ug`` is 20 ug/g^2, 20 ug/g^3.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise OptionError(f"{name} {text!r}: expected two standard deviations, of k2 and k3, such as 20ug,20ug")
+    first, second = (quantity(part.strip(), name, "acceleration", "ug") / STANDARD_GRAVITY for part in parts)
+    return first, second
+
+
+def order(text: str, name: str) -> int | str:
+    """Return an order as a number, or the word that stands for how it is chosen.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    if text not in ORDERS:
+        raise OptionError(f"{name} {text!r}: expected one of {listed(ORDERS, text)}")
+    return int(text) if text.isdecimal() else text
