@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 
-.PHONY: demo test test-all core fuzz dist lint format bench truth docs clean
+.PHONY: demo test test-all core fuzz dist lint format bench footprint truth docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
@@ -51,6 +51,10 @@ format: $(STAMP)
 # All of it, quick parts first, into RESULTS.md; BENCH="tumble fleet" measures these parts alone and only prints.
 bench: $(STAMP) $(VENV)/.bench
 	$(BIN)/python benchmarks/run.py $(BENCH)
+
+# What an exported unit costs on a Cortex-M4F, emulated, into docs/runtime.md (Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm).
+footprint: $(STAMP)
+	$(BIN)/python benchmarks/target.py
 
 # Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md.
 truth: $(STAMP)

@@ -1,0 +1,179 @@
+/* One sample of everything that an exported unit corrects, on a Cortex-M4F.
+ *
+ * With EMPTY or CALLS only what is linked matters: the difference of the two images is what the unit costs in flash.
+ * Otherwise the emulator counts: with `qemu -icount shift=0` each instruction takes 1 ns of the clock that SysTick counts,
+ * so that a loop over samples, less the same loop without the calls, gives instructions a sample. */
+#include "unit.h"
+
+#if UNIT_HAS_WARMUP
+static il_warmup_state warm;
+static il_real warming[UNIT_WARMUP_AXES];
+#endif
+#if UNIT_HAS_ARRAY
+static il_array_state array;
+static il_real reading[UNIT_ARRAY_AXES * UNIT_ARRAY_ELEMENTS], rates[UNIT_ARRAY_AXES];
+#endif
+static uint32_t tick;
+static il_real accel[3], gyro[3], mag[3], level[2], drifting[2];
+volatile il_real seen; /* what a result is kept in, so that none is left out */
+
+__attribute__((noinline)) static void sample(void) {
+#ifndef EMPTY
+#if UNIT_HAS_TUMBLE
+    (void)il_tumble_apply(&unit_tumble, accel, accel);
+#endif
+#if UNIT_HAS_GYRO
+    (void)il_gyro_apply(&unit_gyro, gyro, accel, gyro);
+#endif
+#if UNIT_HAS_MAG
+    (void)il_mag_apply(&unit_mag, mag, mag);
+#endif
+#if UNIT_HAS_CENTRIFUGE
+    (void)il_centrifuge_apply(&unit_centrifuge, level, drifting);
+#endif
+#if UNIT_HAS_WARMUP
+    il_real bias[UNIT_WARMUP_AXES];
+    il_warmup_bias(&unit_warmup, &warm, tick, bias);
+    for (int i = 0; i < UNIT_WARMUP_AXES; i++) warming[i] -= bias[i];
+#endif
+#if UNIT_HAS_ARRAY
+    (void)il_array_step(&unit_array, &array, reading, rates);
+#endif
+#endif
+    __asm volatile("" ::: "memory");
+}
+
+static int start(void) {
+    tick = 0;
+#ifndef EMPTY
+#if UNIT_HAS_WARMUP
+    if (il_warmup_start(&unit_warmup, &warm, (il_real)21.5, (il_real)0.005) != IL_OK) return 0;
+#endif
+#if UNIT_HAS_ARRAY
+    if (il_array_start(&unit_array, &array) != IL_OK) return 0;
+#endif
+#endif
+    return 1;
+}
+
+#if defined(EMPTY) || defined(CALLS)
+extern uint32_t data_start;
+void reset(void);
+
+void reset(void) {
+    for (;;) {
+        accel[0] = gyro[0] = mag[0] = level[0] = drifting[0] = seen;
+        if (start()) sample();
+        seen = accel[0] + gyro[0] + mag[0] + level[0] + drifting[0];
+    }
+}
+
+__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {(void (*)(void))0x20400000u, reset};
+#else
+#include <stdio.h>
+#include <stdlib.h>
+
+enum { SAMPLES = 2000, BEFORE = 500, PAINTED = 16384, KNOWN = 100000 };
+#define SYSTICK ((volatile uint32_t *)0xE000E010u) /* control, reload, current */
+#define ONCE(i) for (int i = 0; i < 3; i++)
+
+static uint32_t state;
+
+static il_real uniform(void) {
+    state = state * 1664525u + 1013904223u;
+    return (il_real)((int32_t)(state >> 8) - (1 << 23)) / (il_real)(1 << 23);
+}
+
+/* Outputs of 1.5 g, 3 rad/s, one field; of gyros at rest with noise; as the unit's own numbers make them. */
+static void load(void) {
+    ONCE(i) accel[i] = gyro[i] = mag[i] = uniform();
+#if UNIT_HAS_TUMBLE
+    ONCE(i) accel[i] = ((il_real)14.7 * accel[i] + unit_tumble.bias[i]) / unit_tumble.gain[i];
+#endif
+#if UNIT_HAS_GYRO
+    ONCE(i) gyro[i] = ((il_real)3 * gyro[i] + unit_gyro.bias[i]) / unit_gyro.gain[i];
+#endif
+#if UNIT_HAS_MAG
+    ONCE(i) mag[i] = (mag[i] + unit_mag.bias[i]) / unit_mag.gain[i];
+#endif
+    for (int i = 0; i < 2; i++) {
+        level[i] = (il_real)50 * uniform();
+        drifting[i] = uniform();
+    }
+#if UNIT_HAS_WARMUP
+    for (int i = 0; i < UNIT_WARMUP_AXES; i++) warming[i] = uniform();
+#endif
+#if UNIT_HAS_ARRAY
+    for (int i = 0; i < UNIT_ARRAY_AXES * UNIT_ARRAY_ELEMENTS; i++) {
+        reading[i] = (il_real)1e-3 * (uniform() + uniform() + uniform());
+    }
+#endif
+    tick++;
+}
+
+__attribute__((noinline)) static void nothing(void) {
+    __asm volatile("" ::: "memory");
+}
+
+static uint32_t now(void) {
+    return 0xFFFFFFu - SYSTICK[2];
+}
+
+static double ticks_of(void (*const job)(void)) {
+    double total = 0;
+    state = 1;
+    if (!start()) exit(1);
+    for (int k = 0; k < BEFORE + SAMPLES; k++) {
+        static uint32_t begin;
+        if (k == BEFORE) begin = now();
+        load();
+        job();
+        if (k == BEFORE + SAMPLES - 1) total = (double)((now() - begin) & 0xFFFFFFu);
+    }
+    return total;
+}
+
+/* Instructions in a tick of SysTick, from a loop of two instructions. */
+static double in_a_tick(void) {
+    uint32_t left = KNOWN;
+    const uint32_t begin = now();
+    __asm volatile("1: subs %0, #1\n bne 1b" : "+r"(left)::"cc");
+    return 2.0 * KNOWN / (double)((now() - begin) & 0xFFFFFFu);
+}
+
+/* Bytes that a call changes below the stack pointer. */
+__attribute__((noinline)) static unsigned stack_of(void (*const job)(void)) {
+    volatile uint8_t *top;
+    __asm volatile("mov %0, sp" : "=r"(top));
+    for (int i = 1; i <= PAINTED; i++) top[-i] = 0xA5;
+    job();
+    int deepest = PAINTED;
+    while (deepest > 0 && top[-deepest] == 0xA5) deepest--;
+    return (unsigned)deepest;
+}
+
+int main(void) {
+    SYSTICK[1] = 0xFFFFFFu;
+    SYSTICK[2] = 0;
+    SYSTICK[0] = 5; /* on, at the processor's clock */
+    const double each = in_a_tick();
+    const double instructions = (ticks_of(sample) - ticks_of(nothing)) * each / SAMPLES;
+    unsigned stack = 0;
+    state = 1;
+    if (!start()) return 1;
+    for (int k = 0; k < 200; k++) {
+        load();
+        const unsigned used = stack_of(sample);
+        if (used > stack) stack = used;
+    }
+    unsigned ram = 0;
+#if UNIT_HAS_WARMUP
+    ram += (unsigned)sizeof warm;
+#endif
+#if UNIT_HAS_ARRAY
+    ram += (unsigned)sizeof array;
+#endif
+    printf("instructions %.1f stack %u state %u\n", instructions, stack, ram);
+    return 0;
+}
+#endif
