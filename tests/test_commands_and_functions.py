@@ -48,6 +48,8 @@ FUNCTIONS = {
     "noise simulate": il.simulate_noise,
     "thermal simulate": il.simulate_thermal,
     "thermal fit": il.fit_thermal,
+    "rate simulate": il.simulate_rate,
+    "rate fit": il.fit_rate,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,
@@ -261,6 +263,12 @@ MADE = {
         ["--temperatures", "-20,60", "--attitudes", "3", "--ramps", "1", "--duration", "2 min", "-o", "one"],
         lambda out: il.simulate_thermal([-20, 60], attitudes=3, ramps=1, duration=120.0).save(out),
     ),
+    "rate simulate": (
+        ["--rates", "50,100", "--faces", "+z", "--hold", "2 s", "--noise", "0.01", "--loop", "10 ppm", "-o", "one"],
+        lambda out: il.simulate_rate(
+            [50 * DEGREE, 100 * DEGREE], faces="+z", hold=2, noise=0.01 * DEGREE, loop=1e-5
+        ).save(out),
+    ),
     "warmup table": (
         ["warm.json", "--per-second", "-o", "one.csv"],
         lambda out: il.warmup_table("warm.json", per_second=True).save(out),
@@ -471,8 +479,9 @@ def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
         lambda: il.simulate_centrifuge(),
         lambda: il.simulate_warmup(),
         lambda: il.simulate_thermal(attitudes=2),
+        lambda: il.simulate_rate(hold=1.0),
     ],
-    ids=["tumble", "warmup", "centrifuge", "noise", "rig", "cycles", "chamber"],
+    ids=["tumble", "warmup", "centrifuge", "noise", "rig", "cycles", "chamber", "table"],
 )
 def test_results_show_themselves_in_twelve_lines_at_most(made):
     result = made()

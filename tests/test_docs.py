@@ -52,7 +52,7 @@ def test_five_lines_lead_from_a_data_frame_to_a_record_and_a_picture(tmp_path, m
     assert "Residual |f| \u2212 g of each attitude" in (tmp_path / "residuals.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal"])
+@pytest.mark.parametrize("page", ["tumble", "gyro_array", "warmup", "centrifuge", "noise", "thermal", "rate"])
 def test_every_procedure_has_a_worked_example(page):
     assert page in [found.stem for found in PAGES]
 

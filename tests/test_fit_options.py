@@ -20,6 +20,7 @@ COMMANDS = {
     "centrifuge": "centrifuge reduce",
     "noise": "noise fit",
     "thermal": "thermal fit",
+    "rate": "rate fit",
 }
 FUNCTIONS = {
     "tumble": il.fit_tumble,
@@ -28,6 +29,7 @@ FUNCTIONS = {
     "centrifuge": il.fit_centrifuge,
     "noise": il.fit_noise,
     "thermal": il.fit_thermal,
+    "rate": il.fit_rate,
 }
 OF_FILES = ("layout", "topic", "instance", "window", "element", "interval", "method", "memory")
 """Options that say how files are read, what is taken of their heads, and what a record carries along."""

@@ -22,8 +22,10 @@ KNOWN_NAMES = {
     "imulab.device.blob",
     "imulab.device.tables",
     "imulab.exporters.c",
+    "imulab.columns",
+    "imulab.live.simulated",
 }
-"""Modules that name the structs of the C core, some of which are called as procedures are."""
+"""Modules that name the structs of the C core, quantities or options, some of which are called as procedures are."""
 
 
 def _modules() -> dict[str, ast.Module]:

@@ -56,6 +56,9 @@ if TYPE_CHECKING:
     from imulab.procedures.noise.fit import fit_noise as fit_noise
     from imulab.procedures.noise.plan import plan_noise as plan_noise
     from imulab.procedures.noise.simulate import simulate_noise as simulate_noise
+    from imulab.procedures.rate.fit import RateFit as RateFit
+    from imulab.procedures.rate.fit import fit_rate as fit_rate
+    from imulab.procedures.rate.simulate import simulate_rate as simulate_rate
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
     from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
@@ -104,6 +107,7 @@ _HOME = {
     "ImulabError": "errors",
     "Recording": "recording",
     "MagFit": "procedures.tumble.mag.fit",
+    "RateFit": "procedures.rate.fit",
     "ThermalFit": "procedures.thermal.fit",
     "TumbleFit": "procedures.tumble.fit",
     "WarmupFit": "procedures.warmup.fit",
@@ -117,6 +121,7 @@ _HOME = {
     "NoiseFit": "procedures.noise.fit",
     "fit_noise": "procedures.noise.fit",
     "fit_centrifuge": "procedures.centrifuge.fit",
+    "fit_rate": "procedures.rate.fit",
     "fit_thermal": "procedures.thermal.fit",
     "fit_tumble": "procedures.tumble.fit",
     "fit_warmup": "procedures.warmup.fit",
@@ -136,6 +141,7 @@ _HOME = {
     "simulate_fleet": "procedures.tumble.simulated_line",
     "simulate_noise": "procedures.noise.simulate",
     "simulate_power_cycle": "procedures.warmup.simulate",
+    "simulate_rate": "procedures.rate.simulate",
     "simulate_thermal": "procedures.thermal.simulate",
     "simulate_tumble": "procedures.tumble.simulate",
     "simulate_warmup": "procedures.warmup.simulate",

@@ -12,13 +12,14 @@ from imulab.procedures.centrifuge.entry import ENTRY as CENTRIFUGE
 from imulab.procedures.gyro_array.entry import ENTRY as GYRO_ARRAY
 from imulab.procedures.noise.entry import ENTRY as NOISE
 from imulab.procedures.procedure import Procedure, Section
+from imulab.procedures.rate.entry import ENTRY as RATE
 from imulab.procedures.thermal.entry import ENTRY as THERMAL
 from imulab.procedures.tumble.entry import ENTRY as TUMBLE
 from imulab.procedures.warmup.entry import ENTRY as WARMUP
 from imulab.records.calibration import Calibration
 
 PROCEDURES: dict[str, Procedure] = {
-    entry.command: entry for entry in (TUMBLE, GYRO_ARRAY, WARMUP, CENTRIFUGE, NOISE, THERMAL)
+    entry.command: entry for entry in (TUMBLE, GYRO_ARRAY, WARMUP, CENTRIFUGE, NOISE, THERMAL, RATE)
 }
 """By the names of the command line and of fleets' manifests."""
 

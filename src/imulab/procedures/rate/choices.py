@@ -1,0 +1,30 @@
+"""The words and numbers that the options of a rate test take."""
+
+from __future__ import annotations
+
+from imulab.errors import OptionError
+from imulab.units import to_si
+
+AXES = "xyz"
+MOUNTINGS = tuple(sign + axis for axis in AXES for sign in "+-")
+ORDERS = ("1", "2", "3", "4", "5")
+RATES = "0,10,50,100,200,300"
+EARTH = 7.292115e-5
+"""Rate of the Earth, rad/s (WGS 84)."""
+
+
+def rates_of(text: str, option: str) -> tuple[float, ...]:
+    """Return ``0,10,-10`` (deg/s) as rates in rad/s.
+
+    Raises
+    ------
+    OptionError
+        It is no list of two different numbers or more.
+    """
+    try:
+        found = tuple(to_si(float(part), "deg/s") for part in text.split(","))
+    except ValueError:
+        found = ()
+    if len(set(found)) < 2 or not all(abs(rate) < 1e6 for rate in found):
+        raise OptionError(f"{option} {text!r}: expected rates of the table, deg/s, such as 0,10,100,-10,-100")
+    return found

@@ -1,0 +1,247 @@
+"""The dwells of a run: stretches in which the table turned at one rate, each with the gyroscopes' mean over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import DataError, SegmentError
+from imulab.procedures.rate.choices import AXES
+from imulab.procedures.rate.manifest import RateTest
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.units import from_si, parse_unit, to_si
+
+_BLOCK, _SIDE, _SETTLING, _LEAST = 0.1, 5, 3, 10
+"""s, and numbers of such blocks: compared on either side, left out at either end, and the shortest dwell."""
+_SIGMAS, _OF_STEP, _RIPPLE = 6.0, 1 / 20, 2e-3
+_BATCHES = 8
+_NEXT_TO = 0.3
+_STANDS = 0.2
+_WRONG = 0.5
+_ROUNDING = 1e-9
+_ROBUST = 0.6745 * np.sqrt(2)
+
+
+@dataclass(frozen=True)
+class Dwells:
+    """Dwells of one run, n of them, of g gyroscopes; SI except for the outputs.
+
+    Attributes
+    ----------
+    start, stop
+        s, shape (n,).
+    rate
+        Of the table, rad/s, shape (n,).
+    mean, variance
+        Of the outputs, and of that mean by its batches, shape (n, g).
+    level
+        Mean cosine and sine of the table's angle, shape (n, 2).
+    recorded
+        Whether the rates are those of a column of the recording.
+    """
+
+    start: Array
+    stop: Array
+    rate: Array
+    mean: Array
+    variance: Array
+    level: Array
+    recorded: bool
+
+
+def gyro_columns(recording: Recording) -> list[str]:
+    """Return the gyroscopes that a recording has, in the order of the axes."""
+    return [name for axis in AXES if (name := f"gyro_{axis}") in recording]
+
+
+def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
+    """Find the dwells of one run.
+
+    Raises
+    ------
+    SegmentError
+        There are none, or they cannot be at the rates that the manifest lists.
+    DataError
+        The gyroscope along the table axis does not follow the table, or its output stands still at an end.
+    """
+    run, place = test.runs[index], test.place(index)
+    names = gyro_columns(recording)
+    main = f"gyro_{AXES[run.axis]}"
+    recording.column(main)
+    check_finite(recording, names)
+    time = check_time(recording)
+    outputs = np.column_stack([recording.column(name) for name in names])
+    own = outputs[:, names.index(main)] * run.sign
+    column = _recorded(recording, time)
+    if column is None and run.rates is None:
+        raise SegmentError(
+            f"{place}: no column table_rate or table_angle; expected the table's rates (rates = [0, 10, -10] in the "
+            "manifest, or --rates)"
+        )
+    recorded = column is not None
+    signal = own if column is None else column
+    stretches = _stretches(time, signal, None if column is not None else _smallest_step(run.rates or (), own))
+    if len(stretches) < 3:
+        raise SegmentError(
+            f"{place}: {len(stretches)} stretches of a steady rate found, expected 3 or more of 2 s or longer: are the "
+            "steps too short?"
+        )
+    reading = np.array([own[a:b].mean() for a, b in stretches])
+    _check_ends(recording, main, own, stretches, reading, place)
+    _check_axis(names, outputs, stretches, main, place)
+    if column is None:
+        rate, zero, scale = _listed_rates(reading, stretches, time, run.rates or (), recording, main, place)
+        column = (own - zero) / scale
+    else:
+        rate = np.array([column[a:b].mean() for a, b in stretches])
+    angle = np.concatenate([[0.0], np.cumsum(np.diff(time) * (column[1:] + column[:-1]) / 2)])
+    return Dwells(
+        start=np.array([time[a] for a, _ in stretches]),
+        stop=np.array([time[b - 1] for _, b in stretches]),
+        rate=rate,
+        mean=np.array([outputs[a:b].mean(axis=0) for a, b in stretches]),
+        variance=np.array([_variance(outputs[a:b]) for a, b in stretches]),
+        level=np.array([[np.cos(angle[a:b]).mean(), np.sin(angle[a:b]).mean()] for a, b in stretches]),
+        recorded=recorded,
+    )
+
+
+def _recorded(recording: Recording, time: Array) -> Array | None:
+    """Return the rate of the table that a recording holds, rad/s, shape (n,)."""
+    for name, quantity in (("table_rate", "rate"), ("table_angle", "angle")):
+        if name not in recording:
+            continue
+        check_finite(recording, [name])
+        if parse_unit(recording.units[name]).quantity != quantity:
+            raise DataError(f"{recording.name}: column {name}: expected a unit of {quantity}")
+        values = recording.si(name)
+        return values if quantity == "rate" else np.gradient(np.unwrap(values), time)
+    return None
+
+
+def _smallest_step(rates: tuple[float, ...], own: Array) -> float:
+    """Return the smallest step between listed rates, in units of the output."""
+    listed = np.unique(rates)
+    return float(np.diff(listed).min() / (listed[-1] - listed[0]) * np.ptp(own))
+
+
+def _stretches(time: Array, signal: Array, step: float | None) -> list[tuple[int, int]]:
+    """Return first sample and end of each stretch in which the means of 0.5 s do not change."""
+    size = max(1, round(_BLOCK / float(np.median(np.diff(time)))))
+    count = len(signal) // size
+    if count < 2 * _SIDE + 1:
+        return []
+    blocks = signal[: count * size].reshape(count, size).mean(axis=1)
+    sigma = float(np.median(np.abs(np.diff(blocks)))) / _ROBUST
+    least = _OF_STEP * (float(np.abs(blocks).max()) / 30 if step is None else step)
+    sums = np.concatenate([[0.0], np.cumsum(blocks)])
+    k = np.arange(_SIDE, count - _SIDE + 1)
+    change = np.abs(sums[k + _SIDE] - 2 * sums[k] + sums[k - _SIDE]) / _SIDE
+    limit = _SIGMAS * sigma * np.sqrt(2 / _SIDE) + least + _RIPPLE * np.abs(blocks[k - 1])
+    moving = np.zeros(count + 1, dtype=bool)
+    moving[k] = change > limit
+    steady = ~(moving[:-1] | moving[1:])
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(int)))
+    found = []
+    for a, b in edges.reshape(-1, 2).tolist():
+        if b - a < 2:
+            continue
+        middle = float(np.median(blocks[a:b]))
+        near = _SIGMAS * sigma + least / 2 + _RIPPLE / 2 * abs(middle)
+        first, last = a, b
+        while first > max(0, a - _SIDE) and abs(blocks[first - 1] - middle) < near:
+            first -= 1
+        while last < min(count, b + _SIDE) and abs(blocks[last] - middle) < near:
+            last += 1
+        first, last = first + _SETTLING, last - _SETTLING  # what moves within it is left out, too
+        if last - first >= _LEAST:
+            found.append((first * size, last * size))
+    return found
+
+
+def _variance(outputs: Array) -> Array:
+    """Return the variance of the mean of outputs by the means of its batches, shape (g,)."""
+    size = len(outputs) // _BATCHES
+    means = outputs[: size * _BATCHES].reshape(_BATCHES, size, -1).mean(axis=1)
+    return np.asarray(means.var(axis=0, ddof=1) / _BATCHES)
+
+
+def _check_ends(
+    recording: Recording, main: str, own: Array, stretches: list[tuple[int, int]], reading: Array, place: str
+) -> None:
+    """Refuse a gyroscope whose output stands still at the largest rates while it is noisy at the others."""
+    spread = np.array([own[a:b].std() for a, b in stretches])
+    usual = float(np.median(spread))
+    noisy = usual > _ROUNDING * float(np.abs(reading).max())
+    for end in (int(np.argmax(reading)), int(np.argmin(reading))):
+        if noisy and spread[end] < _STANDS * usual:
+            a, b = stretches[end]
+            found = float(recording.column(main)[a:b].mean())
+            raise DataError(
+                f"{place}: {main} stands still at {found:.6g} {recording.units[main]} in the dwell at "
+                f"{recording.si('time')[a]:.1f} s: its output is saturated; expected rates within its range"
+            )
+
+
+def _check_axis(names: list[str], outputs: Array, stretches: list[tuple[int, int]], main: str, place: str) -> None:
+    """Refuse a run in which another gyroscope than that along the table axis follows the table."""
+    span = np.ptp(np.array([outputs[a:b].mean(axis=0) for a, b in stretches]), axis=0)
+    most = names[int(np.argmax(span))]
+    if span[names.index(main)] < _WRONG * span.max():
+        raise DataError(f"{place}: the table's rates are seen by {most}, not by {main}: expected mounting +{most[-1]}")
+
+
+def _listed_rates(
+    reading: Array,
+    stretches: list[tuple[int, int]],
+    time: Array,
+    rates: tuple[float, ...],
+    recording: Recording,
+    main: str,
+    place: str,
+) -> tuple[Array, float, float]:
+    """Return the listed rate of each stretch, and zero and scale of the output that lead to it."""
+    listed = np.unique(rates)
+    scale = float(np.ptp(reading) / np.ptp(listed))
+    nominal = parse_unit(recording.units[main])
+    first = from_si(1.0, nominal.symbol) if nominal.quantity == "rate" else scale
+    if not 0.7 < scale / first < 1.4:
+        low, high = (to_si(float(end), nominal.symbol) for end in (reading.min(), reading.max()))
+        raise SegmentError(
+            f"{place}: {main} saw {_degrees(low)} to {_degrees(high)}, the listed rates are {_degrees(listed[0])} to "
+            f"{_degrees(listed[-1])} deg/s: is a rate missing, or the unit or a sign wrong?"
+        )
+    zero = float(reading.min() - scale * listed[0])
+    if nominal.quantity == "rate" and abs(zero) > _WRONG / 2 * np.ptp(reading):
+        low, high = (to_si(float(end), nominal.symbol) for end in (reading.min(), reading.max()))
+        raise SegmentError(
+            f"{place}: about this axis {main} saw {_degrees(low)} to {_degrees(high)} deg/s, the listed rates are "
+            f"{_degrees(listed[0])} to {_degrees(listed[-1])} deg/s: is the sign of mounting wrong?"
+        )
+    gap = np.diff(listed).min()
+    for _ in range(2):
+        seen = (reading - zero) / scale
+        nearest = listed[np.argmin(np.abs(seen[:, None] - listed), axis=1)]
+        scale, zero = np.polyfit(nearest, reading, 1).tolist()
+    off = np.abs((reading - zero) / scale - nearest)
+    worst = int(np.argmax(off))
+    if off[worst] > _NEXT_TO * gap:
+        a, b = stretches[worst]
+        seen_rate = (reading[worst] - zero) / scale
+        raise SegmentError(
+            f"{place}: the dwell at {time[a]:.1f} to {time[b - 1]:.1f} s is at {_degrees(seen_rate)} deg/s, next to "
+            f"none of the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, or is the "
+            "mounting's sign wrong?"
+        )
+    missing = sorted(set(listed.tolist()) - set(nearest.tolist()))
+    if missing:
+        raise SegmentError(
+            f"{place}: no dwell of 2 s or longer at {', '.join(map(_degrees, missing))} deg/s; expected one at each "
+            "listed rate"
+        )
+    return nearest, zero, scale
+
+
+def _degrees(rate: float) -> str:
+    return f"{from_si(rate, 'deg/s'):.5g}"

@@ -1,0 +1,123 @@
+"""What a rate record shows: what the best line leaves over the rate, up and down apart, and what each source adds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from imulab.procedures.rate.engineering import rows as engineering_rows
+from imulab.procedures.rate.sections import Rate, Seen, rate_of
+from imulab.records.calibration import Calibration
+from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.traces import axis, rounded, scatter
+from imulab.units import from_si
+
+_PPM = 1e6
+_LOOKS = (("rising", "triangle-up", "#c8553d"), ("falling", "triangle-down", GOOD), ("turning", "circle", INK))
+
+
+def exhibits(record: Calibration) -> Exhibits:
+    """Return the figures and tables of a record."""
+    found = rate_of(record)
+    axes = found.model.axes
+    largest = from_si(found.model.largest_rate.value, "deg/s")
+    worst = max(record.value(f"gyro_nonlinearity_{a}") for a in axes) * _PPM
+    headline = (
+        f"Gyroscopes {' '.join(axes)} over {largest:.4g} deg/s: a line leaves {plain_number(worst, 3)} ppm of the "
+        "largest rate at most."
+    )
+    common = found.fit.table_uncertainty
+    facts = [
+        ("runs", str(found.fit.runs)),
+        ("dwells", str(found.fit.dwells)),
+        ("rates from", found.fit.rates_from),
+        ("common to all rates", "not stated" if common is None else f"{plain_number(common * _PPM, 3)} ppm"),
+    ]
+    items: list[Figure | ReportTable] = [
+        _parameters(record),
+        *(_left(a, found.data.dwells) for a in axes),
+        _of_line(record, found),
+        _budget(record, found),
+    ]
+    return Exhibits(headline, facts, items)
+
+
+def _parameters(record: Calibration) -> ReportTable:
+    rows = []
+    for row in engineering_rows(record):
+        value, u = format_uncertain(row.value, row.standard_uncertainty)
+        rows.append([row.name, value, u, row.unit])
+    return ReportTable(
+        "Parameters",
+        "Bias, scale factor and misalignment in the frame of the faces on which the unit was mounted; nonlinearity and "
+        "hysteresis as parts of the largest rate.",
+        ["parameter", "value", "u", "unit"],
+        rows,
+    )
+
+
+def _left(name: str, seen: Seen) -> Figure:
+    rate, left = (np.array(values) for values in (seen.rate, seen.residual))
+    u = np.array(seen.standard_uncertainty) * _PPM
+    traces: list[dict[str, Any]] = []
+    for label, symbol, colour in _LOOKS:
+        which = np.array([a == name and d == label for a, d in zip(seen.axis, seen.direction, strict=True)])
+        if which.any():
+            traces.append(
+                scatter(
+                    rounded(from_si(rate[which], "deg/s")), rounded(left[which] * _PPM), "markers", name=label,
+                    marker={"symbol": symbol, "color": colour, "size": 8},
+                    error_y={"type": "data", "array": rounded(u[which]), "thickness": 1, "width": 2},
+                )
+            )  # fmt: skip
+    return Figure(
+        title=f"What the best line leaves of gyro_{name}",
+        caption="Each dwell, in ppm of the largest rate; bars: one standard uncertainty by its noise. Rising and "
+        "falling rates that lie apart are hysteresis; a bend that both follow is nonlinearity.",
+        traces=traces,
+        layout={"xaxis": axis("rate, deg/s"), "yaxis": axis("left, ppm of the largest rate"), "legend": LEGEND},
+    )
+
+
+def _of_line(record: Calibration, found: Rate) -> ReportTable:
+    def ppm(value: float | None) -> str:
+        return "–" if value is None else plain_number(value * _PPM, 3)
+
+    rows = []
+    for name in found.model.axes:
+        of = found.fit.axes[name]
+        sizes = [
+            record.value(f"gyro_{kind}_{name}") if f"gyro_{kind}_{name}" in record.parameters else None
+            for kind in ("nonlinearity", "asymmetry", "hysteresis")
+        ]
+        rows.append(
+            [name, ppm(sizes[0]), ppm(of.by_noise), f"{of.probability:.3f}", ppm(sizes[1]), ppm(sizes[2]),
+             "–" if of.loop is None else f"{of.loop:.3f}", ppm(of.repeatability), ppm(of.repeatability_by_noise)]
+        )  # fmt: skip
+    return ReportTable(
+        "What a line does not hold, ppm",
+        "Nonlinearity: largest residual of a rate over the largest rate; by noise it stays below the next column with "
+        "95 %, and leaves as much with probability p. Asymmetry: slope of positive less slope of negative rates. "
+        "Hysteresis: largest rising less falling; p that noise makes such a loop. Repeatability: standard deviation of "
+        "the scale factor over runs, and that which noise makes.",
+        ["gyro", "nonlinearity", "95 % by noise", "p", "asymmetry", "hysteresis", "p", "repeatability", "by noise"],
+        rows,
+    )
+
+
+def _budget(record: Calibration, found: Rate) -> ReportTable:
+    common = (found.fit.table_uncertainty or 0.0) * _PPM
+    rows = []
+    for name in found.model.axes:
+        scale = record.parameter(f"gyro_scale_factor_{name}")
+        whole = (scale.standard_uncertainty or 0.0) / abs(scale.value) * _PPM
+        rest = float(np.sqrt(max(whole**2 - common**2, 0.0)))
+        rows.append([f"gyro_scale_factor_{name}", *(plain_number(value, 3) for value in (rest, common, whole))])
+    return ReportTable(
+        "What the uncertainty of a scale factor is made of, ppm",
+        "Dwells: noise, errors of single rates, and what scatters beyond them; more dwells make it smaller. Table: "
+        "what all rates have in common, which no number of dwells makes smaller.",
+        ["parameter", "dwells", "table", "all"],
+        rows,
+    )

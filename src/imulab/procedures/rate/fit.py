@@ -1,0 +1,225 @@
+"""A rate test to the calibration of its gyroscopes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
+from imulab.procedures.inputs import Data, Reading, as_recording
+from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, rates_of
+from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
+from imulab.procedures.rate.linearity import Linearity, linearity_of
+from imulab.procedures.rate.manifest import RateTest, Run, load_test
+from imulab.procedures.rate.record import make_record
+from imulab.procedures.rate.simulate import RateRecordings
+from imulab.procedures.rate.solve import Problem, Solution, solve
+from imulab.procedures.result import Result
+from imulab.quantities import fraction, in_si
+from imulab.recording import Recording
+from imulab.records.calibration import Calibration
+
+
+@dataclass(frozen=True, repr=False)
+class RateFit(Result):
+    """Result of a rate test.
+
+    Attributes
+    ----------
+    calibration
+        The record: bias, scale factor, misalignment and nonlinearity of each gyroscope, in SI.
+    dwells
+        Those of each run.
+    linearity
+        What a line leaves, by body axis.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_rate(il.simulate_rate(hold="3 s"))
+    >>> fit.calibration.parameters["gyro_bias_x"].unit
+    'rad/s'
+    """
+
+    calibration: Calibration
+    dwells: tuple[Dwells, ...]
+    linearity: dict[str, Linearity]
+
+
+def fit_rate(
+    data: Data | RateRecordings,
+    *,
+    rates: str | Sequence[float] | None = None,
+    axis: str = "+z",
+    order: int | str = "1",
+    latitude: float | str | None = None,
+    table_uncertainty: float | str | None = None,
+    **reading: Unpack[Reading],
+) -> RateFit:
+    """Calibrate gyroscopes from recordings on a rate table.
+
+    ``M_i = S_i (A_i + b_i)``, ``A_i = s_i + k2_i s_i^2 + ...``, ``s = T w``: by generalised least squares of the means
+    of the output M over dwells at the rates w of the table.
+
+    Parameters
+    ----------
+    data
+        A manifest (``TEST.toml``, docs/rate.md), what `simulate_rate` returns, or one recording: a file, a recording, a
+        data frame or arrays with ``gyro_*``, and ``table_rate`` or ``table_angle`` where the table wrote it.
+    rates
+        Of one recording without such a column: the rates of the table, rad/s, or deg/s in a text, in any order.
+    axis
+        Of one recording: the body axis along the table axis, about which positive rates turn.
+    order
+        Highest power of the rate, 1 to 5.
+    latitude
+        For the Earth's rate, rad; without it that stays in the bias.
+    table_uncertainty
+        Standard uncertainty that all rates of the table have in common, a fraction.
+    reading
+        How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
+
+    Raises
+    ------
+    SegmentError
+        The dwells cannot be found, or do not go with the rates.
+    ObservabilityError
+        The rates cannot separate the parameters: one direction only, or too few of them.
+    DataError
+        The gyroscopes cannot be those of such a test.
+    OptionError
+        An option has an unknown value, or does not go with a manifest.
+
+    Source: IEEE Std 528; GUM (JCGM 100:2008).
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fit = il.fit_rate(il.simulate_rate(hold="3 s"))
+    >>> sorted(fit.linearity)
+    ['x', 'y', 'z']
+    """
+    highest = str(order)
+    if highest not in ORDERS:
+        raise OptionError(f"order {highest!r}: expected one of {listed(ORDERS, highest)}")
+    place = None if latitude is None else in_si(latitude, "latitude", "angle", "deg")
+    common = None if table_uncertainty is None else fraction(table_uncertainty, "table_uncertainty")
+    manifest = isinstance(data, str | os.PathLike) and os.fspath(data).lower().endswith(".toml")
+    if isinstance(data, RateRecordings) or manifest:
+        if rates is not None or axis != "+z":
+            raise OptionError("rates: the manifest says the rates and axes of its runs; expected neither with it")
+        if isinstance(data, RateRecordings):
+            test, recordings = data.test, list(data.recordings)
+        else:
+            path = Path(os.fspath(data))  # type: ignore[arg-type]
+            test = load_test(path)
+            recordings = [as_recording(path.parent / run.file, reading, fit_rate) for run in test.runs]
+    else:
+        if axis not in MOUNTINGS:
+            raise OptionError(f"axis {axis!r}: expected one of {listed(MOUNTINGS, axis)}")
+        recordings = [as_recording(data, reading, fit_rate)]
+        given = rates_of(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
+        test = RateTest((Run(recordings[0].name, axis, given),), name=recordings[0].name)
+    if place is not None:
+        test = replace(test, latitude=place)
+    if common is not None:
+        test = replace(test, relative_uncertainty=common)
+    return fit_test(test, recordings, int(highest))
+
+
+def fit_test(test: RateTest, recordings: Sequence[Recording], order: int) -> RateFit:
+    """Calibrate the gyroscopes of a test from the recordings of its runs; what is raised is as for `fit_rate`."""
+    names, unit = _alike(test, recordings)
+    dwells = [find_dwells(recording, test, index) for index, recording in enumerate(recordings)]
+    problem = _problem(test, dwells, names)
+    _check_rates(test, problem, order)
+    solution = solve(problem, order)
+    measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
+    _check_signs(test, problem, solution, measured)
+    linearity = {}
+    for i in measured:
+        scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
+        linearity[AXES[problem.gyros[i]]] = linearity_of(problem, i, scale)
+    record = make_record(test, recordings, dwells, problem, solution, linearity, order, unit)
+    return RateFit(record, tuple(dwells), linearity)
+
+
+def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], str]:
+    """Return the gyroscopes and the unit that all recordings of a test share."""
+    first = gyro_columns(recordings[0])
+    if not first:
+        recordings[0].column("gyro_x")
+    unit = recordings[0].units[first[0]]
+    for index, recording in enumerate(recordings):
+        if gyro_columns(recording) != first:
+            raise DataError(
+                f"{test.place(index)}: columns {' '.join(gyro_columns(recording)) or 'without gyroscopes'}, but "
+                f"{' '.join(first)} in {test.runs[0].file}"
+            )
+        for name in first:
+            if recording.units[name] != unit:
+                raise UnitError(f"{test.place(index)}: column {name} is in {recording.units[name]}, expected {unit}")
+    return first, unit
+
+
+def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Problem:
+    counts = [len(found.rate) for found in dwells]
+    each: dict[str, Any] = {
+        key: np.repeat([getattr(run, key) for run in test.runs], counts) for key in ("axis", "sign")
+    }
+    earth = 0.0 if test.latitude is None else EARTH * np.sin(test.latitude)
+    table = np.concatenate([found.rate for found in dwells])
+    return Problem(
+        gyros=tuple(AXES.index(name[-1]) for name in names),
+        run=np.repeat(np.arange(len(dwells)), counts),
+        axis=each["axis"],
+        sign=each["sign"],
+        rate=each["sign"] * (table + earth),
+        table=table,
+        mean=np.vstack([found.mean for found in dwells]),
+        variance=np.vstack([_pooled(found) for found in dwells]),
+        level=np.vstack([found.level for found in dwells]),
+        rate_uncertainty=test.rate_uncertainty,
+    )
+
+
+def _pooled(found: Dwells) -> Any:
+    """Return the variances of the means, pooled over the dwells of a run in proportion to one over their length."""
+    length = (found.stop - found.start)[:, None]
+    return np.mean(found.variance * length, axis=0) / length
+
+
+def _check_rates(test: RateTest, problem: Problem, order: int) -> None:
+    """Refuse rates that do not tell bias, scale factor and asymmetry, or powers of the rate, apart."""
+    for face in problem.faces:
+        if face not in problem.gyros:
+            continue
+        rates = problem.rate[problem.axis == face]
+        near = 1e-3 * float(np.abs(rates).max())
+        if not ((rates > near).any() and (rates < -near).any()):
+            raise ObservabilityError(
+                f"{test.name}: body axis {AXES[face]} was turned one way round only: bias and asymmetry cannot be told "
+                "from the scale factor; add rates of the other sign"
+            )
+        different = len(np.unique(np.round(rates / (10 * near))))
+        if different < order + 2:
+            raise ObservabilityError(
+                f"{test.name}: {different} different rates about body axis {AXES[face]}, expected {order + 2} or more "
+                f"for order {order}"
+            )
+
+
+def _check_signs(test: RateTest, problem: Problem, solution: Solution, measured: list[int]) -> None:
+    for i in measured:
+        axis = problem.gyros[i]
+        if solution.coefficients[i][problem.faces.index(axis)] < 0:
+            run = int(problem.run[np.argmax(problem.axis == axis)])
+            raise DataError(
+                f"{test.place(run)}: gyro_{AXES[axis]} falls where the table's rate rises: is the sign of "
+                "mounting wrong?"
+            )

@@ -1,0 +1,171 @@
+"""What a straight line leaves of a gyroscope's output over the rate: nonlinearity, asymmetry and hysteresis.
+
+All are fractions of the largest rate or of the scale factor, so that the uncertainty that all rates share drops out.
+Terms: IEEE Std 528; definitions in docs/rate.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.estimation.least_squares import chi_square_probability, coverage_factor
+from imulab.procedures.rate.solve import Problem
+from imulab.recording import Array
+
+_EXACT = 1e-10
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """Of one gyroscope; fractions, with standard uncertainties.
+
+    Attributes
+    ----------
+    rate, residual, uncertainty
+        Of each dwell about its axis: rad/s, and what is left of the line, a fraction of the largest rate, shape (n,).
+    direction
+        1 where the rate was rising, -1 where it was falling, 0 at turning points, shape (n,).
+    nonlinearity, asymmetry, hysteresis
+        Value and standard uncertainty.
+    probability
+        That noise alone leaves as much of the line.
+    by_noise
+        What the largest residual stays below with 95 % by noise alone.
+    loop
+        Probability that noise alone makes the loop between rising and falling rates; None where no rate was visited
+        both ways.
+    repeatability
+        Standard deviation of the scale factor over runs, and what noise makes of it; None with one run.
+    """
+
+    rate: Array
+    residual: Array
+    uncertainty: Array
+    direction: NDArray[np.int64]
+    nonlinearity: tuple[float, float]
+    asymmetry: tuple[float, float] | None
+    hysteresis: tuple[float, float] | None
+    probability: float
+    by_noise: float
+    loop: float | None
+    repeatability: tuple[float, float] | None
+
+
+def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
+    """Return what a line leaves of gyroscope number `gyro` over the rates about its own axis."""
+    own = problem.axis == problem.gyros[gyro]
+    rate, runs = problem.rate[own], problem.run[own]
+    values = problem.mean[own, gyro] / scale
+    variance = problem.variance[own, gyro] / scale**2 + (_EXACT * np.abs(rate).max()) ** 2
+    key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
+    variance_of_rate = problem.rate_uncertainty**2
+    zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
+    largest = float(np.abs(rate).max())
+    left, _ = _fitted(np.column_stack([rate, zeros]), values, variance)
+    means = np.array(
+        [[left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2] for k in np.unique(key)]
+    )
+    spread = np.sqrt(means[:, 1] + variance_of_rate)
+    worst = int(np.argmax(np.abs(means[:, 0])))
+    freedom = len(means) - 2
+    chi_square = float(np.sum((means[:, 0] / spread) ** 2))
+    probability = chi_square_probability(chi_square, freedom) if freedom > 0 else 1.0
+    reach = coverage_factor(None, 1 - 0.05 / len(means))
+    direction = _directions(rate, runs)
+    loop, hysteresis = _hysteresis(left, variance, key, runs, direction, rate)
+    return Linearity(
+        rate=rate,
+        residual=left / largest,
+        uncertainty=np.sqrt(variance) / largest,
+        direction=direction,
+        nonlinearity=(float(abs(means[worst, 0])) / largest, float(spread[worst]) / largest),
+        asymmetry=_asymmetry(rate, values, variance, zeros, variance_of_rate),
+        hysteresis=hysteresis,
+        probability=probability,
+        by_noise=reach * float(spread.max()) / largest,
+        loop=loop,
+        repeatability=_repeatability(rate, values, variance, runs),
+    )
+
+
+def _fitted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
+    """Return what is left of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
+    weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
+    scaled = columns / size * weight[:, None]
+    inverse = np.linalg.pinv(scaled)
+    found = inverse @ (values * weight) / size
+    return values - columns @ found, np.column_stack([found, inverse @ inverse.T / np.outer(size, size)])
+
+
+def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return whether the rate rose (1) or fell (-1) into and out of each dwell, 0 elsewhere."""
+    found = np.zeros(len(rate), dtype=np.int64)
+    for run in np.unique(runs):
+        which = np.flatnonzero(runs == run)
+        step = np.sign(np.round(np.diff(rate[which]), 6))
+        inner = np.where(step[:-1] == step[1:], step[1:], 0.0)
+        found[which[1:-1]] = inner.astype(np.int64)
+    return found
+
+
+def _asymmetry(rate: Array, values: Array, variance: Array, zeros: Array, of_rate: float) -> tuple[float, float] | None:
+    """Return (S+ - S-)/S by two slopes and one zero; None where the rates are of one sign."""
+    if not (rate > 0).any() or not (rate < 0).any():
+        return None
+    columns = np.column_stack([np.maximum(rate, 0), np.minimum(rate, 0), zeros])
+    found = _fitted(columns, values, variance + of_rate)[1]
+    u = np.sqrt(max(found[0, 1] + found[1, 2] - 2 * found[0, 2], 0.0))
+    return float(found[0, 0] - found[1, 0]), float(u)
+
+
+def _hysteresis(
+    left: Array, variance: Array, key: NDArray[Any], runs: NDArray[Any], direction: NDArray[np.int64], rate: Array
+) -> tuple[float | None, tuple[float, float] | None]:
+    """Return the probability of a loop by noise, and the largest rising less falling over the largest rate."""
+    from imulab.estimation.special import stdtr
+
+    largest = float(np.abs(rate).max())
+    rows = []
+    for k in np.unique(key):
+        pairs = []
+        for run in np.unique(runs):
+            up, down = (np.flatnonzero((key == k) & (runs == run) & (direction == d)) for d in (1, -1))
+            if up.size and down.size:
+                u2 = variance[up].sum() / up.size**2 + variance[down].sum() / down.size**2
+                pairs.append((float(left[up].mean() - left[down].mean()), float(u2)))
+        if pairs:
+            means = np.array(pairs).mean(axis=0)
+            rows.append((float(rate[key == k].mean()), means[0], means[1] / len(pairs)))
+    if not rows:
+        return None, None
+    table = np.array(rows)
+    worst = int(np.argmax(np.abs(table[:, 1])))
+    size = (float(table[worst, 1]) / largest, float(np.sqrt(table[worst, 2])) / largest)
+    loop = 1 - (table[:, 0] / largest) ** 2
+    weight = 1 / table[:, 2]
+    spread = weight @ loop**2
+    if len(rows) < 2 or spread <= 0:
+        return None, size
+    slope = weight @ (loop * table[:, 1]) / spread
+    residual = table[:, 1] - slope * loop
+    ratio = max(1.0, float(weight @ residual**2) / (len(rows) - 1))
+    t = abs(slope) * np.sqrt(spread / ratio)
+    return 2 * float(stdtr(len(rows) - 1 if ratio > 1 else 1e6, -t)), size
+
+
+def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:
+    """Return the standard deviation of the scale factor over runs, relative, and that which noise makes."""
+    found = []
+    for run in np.unique(runs):
+        which = runs == run
+        if which.sum() > 2:
+            columns = np.column_stack([rate[which], np.ones(int(which.sum()))])
+            found.append(_fitted(columns, values[which], variance[which])[1][0, :2])
+    if len(found) < 2:
+        return None
+    table = np.array(found)
+    return float(table[:, 0].std(ddof=1)), float(np.sqrt(table[:, 1].mean()))

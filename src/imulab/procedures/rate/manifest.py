@@ -1,0 +1,171 @@
+"""The manifest of a rate test: which file was recorded with which body axis along the table's, at which rates.
+
+TOML; the keys are those of docs/rate.md. An unknown key is refused by name, so that a misspelt one does not pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from imulab.errors import ReadError, file_name, quoted
+from imulab.procedures.rate.choices import AXES, MOUNTINGS
+from imulab.quantity_entries import check_keys, number_of, unit_of, value_and_unit
+from imulab.toml import load_toml
+from imulab.units import from_si, to_si
+
+_KEYS = ("rates", "mounting", "latitude", "sensor", "run")
+_RATES = 'rates = { unit = "deg/s", relative_standard_uncertainty = 1e-4 }'
+_MOUNTING = 'mounting = { standard_uncertainty = 0.3, unit = "mrad" }'
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording: the body axis along the table's (``+z``), and the rates of the table, rad/s, None if recorded."""
+
+    file: str
+    mounting: str
+    rates: tuple[float, ...] | None = None
+
+    @property
+    def axis(self) -> int:
+        """Number of the body axis along the table's."""
+        return AXES.index(self.mounting[1])
+
+    @property
+    def sign(self) -> int:
+        """1 where that axis points up, -1 where it points down."""
+        return 1 if self.mounting[0] == "+" else -1
+
+
+@dataclass(frozen=True)
+class RateTest:
+    """A rate test as it was run.
+
+    Attributes
+    ----------
+    runs
+        A recording each.
+    relative_uncertainty
+        Standard uncertainty that all rates have in common, a fraction; None where the manifest does not say.
+    rate_uncertainty
+        Of each commanded rate, the same at every visit, rad/s.
+    mounting_uncertainty
+        Of the table axis across each face, rad; None where the manifest does not say.
+    latitude
+        rad; None where the manifest does not say.
+    """
+
+    runs: tuple[Run, ...]
+    relative_uncertainty: float | None = None
+    rate_uncertainty: float = 0.0
+    mounting_uncertainty: float | None = None
+    latitude: float | None = None
+    sensor: Mapping[str, str] = field(default_factory=dict)
+    name: str = "test"
+
+    def place(self, index: int) -> str:
+        """Return how messages name run `index`, counted from 0."""
+        run = self.runs[index]
+        return f"{run.file} ({run.mounting} along the table axis)"
+
+
+def load_test(path: str | Path, name: str | None = None) -> RateTest:
+    """Read a manifest; `name` is what messages call it.
+
+    Raises
+    ------
+    ReadError
+        The file is missing, is not TOML, or has a key or value that a manifest cannot have.
+    UnitError
+        A unit is unknown or of another quantity.
+    """
+    name = name or str(file_name(path))
+    table = load_toml(path, name, "manifest")
+    check_keys(table, _KEYS, name)
+    rates = table.get("rates", {"unit": "deg/s"})
+    if not isinstance(rates, dict) or "unit" not in rates:
+        raise ReadError(f"{name}: rates: expected {_RATES}, found {quoted(rates)}")
+    known = ("unit", "relative_standard_uncertainty", "standard_uncertainty")
+    check_keys(rates, known, f"{name}: rates")
+    unit = unit_of(rates["unit"], "rate", f"{name}: rates")
+    relative, each = (None if key not in rates else _size(rates[key], f"{name}: rates: {key}") for key in known[1:])
+    entries = table.get("run")
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise ReadError(f"{name}: run: expected tables [[run]], one for each file")
+    sensor = table.get("sensor", {})
+    if not isinstance(sensor, dict) or not all(isinstance(value, str | int | float) for value in sensor.values()):
+        raise ReadError(f'{name}: sensor: expected texts such as serial = "SN42"')
+    return RateTest(
+        runs=tuple(_run(entry, f"{name}: run {number}", unit) for number, entry in enumerate(entries, 1)),
+        relative_uncertainty=relative,
+        rate_uncertainty=to_si(each or 0.0, unit),
+        mounting_uncertainty=_mounting(table.get("mounting"), f"{name}: mounting"),
+        latitude=_latitude(table.get("latitude"), f"{name}: latitude"),
+        sensor={key: str(value) for key, value in sensor.items()},
+        name=name,
+    )
+
+
+def _size(value: Any, place: str) -> float:
+    found = number_of(value, place)
+    if found < 0:
+        raise ReadError(f"{place}: expected 0 or more, found {value!r}")
+    return found
+
+
+def _mounting(entry: Any, place: str) -> float | None:
+    if entry is None:
+        return None
+    if not isinstance(entry, dict) or set(entry) != {"standard_uncertainty", "unit"}:
+        raise ReadError(f"{place}: expected {_MOUNTING}, found {quoted(entry)}")
+    unit = unit_of(entry["unit"], "angle", place)
+    return to_si(_size(entry["standard_uncertainty"], place), unit)
+
+
+def _latitude(entry: Any, place: str) -> float | None:
+    if entry is None:
+        return None
+    value, unit = value_and_unit(entry, place, 'latitude = { value = 48.1, unit = "deg" }')
+    found = to_si(value, unit_of(unit, "angle", place))
+    if abs(found) > math.pi / 2:
+        raise ReadError(f"{place}: expected -90 to 90 deg, found {value:g} {unit}")
+    return found
+
+
+def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
+    file, mounting, rates = entry.get("file"), entry.get("mounting"), entry.get("rates")
+    if not isinstance(file, str) or not file:
+        raise ReadError(f'{place}: expected file = "NAME.csv", found {quoted(file)}')
+    check_keys(entry, ("file", "mounting", "rates"), f"{place} ({file})")
+    if mounting not in MOUNTINGS:
+        raise ReadError(f"{place} ({file}): mounting: expected one of {' '.join(MOUNTINGS)}, found {quoted(mounting)}")
+    if rates is None:
+        return Run(file, str(mounting))
+    if not isinstance(rates, list) or len(set(map(str, rates))) < 2:
+        raise ReadError(f"{place} ({file}): rates: expected a list of two rates or more, found {quoted(rates)}")
+    numbers = tuple(to_si(number_of(rate, f"{place} ({file}): rates"), unit) for rate in rates)
+    return Run(file, str(mounting), numbers)
+
+
+def manifest_text(test: RateTest) -> str:
+    """Return the manifest of a test as TOML, rates in deg/s."""
+    parts = ['unit = "deg/s"']
+    if test.relative_uncertainty is not None:
+        parts.append(f"relative_standard_uncertainty = {test.relative_uncertainty!r}")
+    if test.rate_uncertainty:
+        parts.append(f"standard_uncertainty = {from_si(test.rate_uncertainty, 'deg/s'):.9g}")
+    lines = [f"rates = {{ {', '.join(parts)} }}"]
+    if test.mounting_uncertainty is not None:
+        lines.append(f'mounting = {{ standard_uncertainty = {1e3 * test.mounting_uncertainty:.9g}, unit = "mrad" }}')
+    if test.latitude is not None:
+        lines.append(f'latitude = {{ value = {from_si(test.latitude, "deg"):.9g}, unit = "deg" }}')
+    for run in test.runs:
+        lines += ["", "[[run]]", f'file = "{run.file}"', f'mounting = "{run.mounting}"']
+        if run.rates is not None:
+            listed_rates = ", ".join(f"{from_si(rate, 'deg/s'):.9g}" for rate in run.rates)
+            lines.append(f"rates = [{listed_rates}]")
+    return "\n".join(lines) + "\n"

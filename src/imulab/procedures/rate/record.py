@@ -1,0 +1,306 @@
+"""The calibration record of a rate test: parameters under tumble gyro's names, in SI, and what its figures need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imulab.estimation.least_squares import chi_square_probability, coverage_factor
+from imulab.procedures.rate.choices import AXES, EARTH
+from imulab.procedures.rate.dwells import Dwells
+from imulab.procedures.rate.linearity import Linearity
+from imulab.procedures.rate.manifest import RateTest
+from imulab.procedures.rate.solve import Problem, Solution
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.units import from_si, parse_unit
+from imulab.verdict import Bad, Note
+
+_CHANCE = 0.01
+_OFF = 0.1
+_MATTERS = 3.0
+
+
+def make_record(
+    test: RateTest,
+    recordings: Sequence[Recording],
+    dwells: Sequence[Dwells],
+    problem: Problem,
+    solution: Solution,
+    linearity: Mapping[str, Linearity],
+    order: int,
+    unit: str,
+) -> Calibration:
+    """Turn a solution into the record."""
+    names, values, matrix, units = _model_parameters(test, problem, solution, order, unit)
+    nu = solution.cycle_freedom
+    parameters = {}
+    for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
+        wide = coverage_factor(float(nu)) * u if nu is not None and name.startswith("gyro_scale_factor") else None
+        parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
+    figures = _figures(linearity)
+    joined = np.zeros((len(matrix) + len(figures),) * 2)
+    joined[: len(matrix), : len(matrix)] = matrix
+    joined[len(matrix) :, len(matrix) :] = np.diag([(p.standard_uncertainty or 0.0) ** 2 for p in figures.values()])
+    heads = [recording.metadata for recording in recordings]
+    sensor = {key: text for head in heads for key in ("serial", "model", "element") if (text := head.get(key))}
+    temperatures = [t for recording in recordings if (t := recording.mean_temperature()) is not None]
+    model: dict[str, Any] = {
+        "gyro_order": order,
+        "gyro_output_unit": unit,
+        "axes": "".join(linearity),
+        "frame": "the faces on which the unit was mounted",
+        "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
+    }
+    if temperatures:
+        model["temperature"] = {"value": float(np.mean(temperatures)), "unit": "degC"}
+    return Calibration(
+        procedure="rate",
+        parameters=parameters | figures,
+        covariance=Covariance((*names, *figures), tuple(map(tuple, joined.tolist()))),
+        model=model,
+        fit=_fit(test, problem, solution, linearity, dwells),
+        options={"order": order},
+        data={"dwells": _dwells(linearity)},
+        sensor={**sensor, **test.sensor},
+        sources=tuple(recording.source for recording in recordings if recording.source is not None),
+        warnings=tuple(_findings(test, problem, solution, linearity, parameters, unit, order)),
+    )
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A parameter: its derivative by all coefficients, what the table's common error does to it, and the mounting's."""
+
+    name: str
+    unit: str
+    value: float
+    line: Array
+    common: float = 0.0
+    mounted: float = 0.0
+
+
+def _entries(problem: Problem, solution: Solution, i: int, order: int, unit: str) -> list[_Entry]:
+    """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
+    faces, size, found = problem.faces, len(problem.faces), solution.coefficients[i]
+    axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
+    own, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
+    scale = float(found[own])
+    unity = np.eye(len(found))
+    zero = np.concatenate([np.zeros(size + order - 1), _average_of_zeros(problem)])
+
+    def spread(part: Array) -> Array:
+        return np.concatenate([np.zeros(first), part, np.zeros(count - first - len(part))])
+
+    def quotient(name: str, of: str, at: Array, mounted: float = 0.0) -> _Entry:
+        value = float(at @ found) / scale
+        return _Entry(name, of, value, spread((at - value * unity[own]) / scale), mounted=mounted)
+
+    return [
+        quotient(f"gyro_bias_{axis}", "rad/s", zero),
+        _Entry(f"gyro_scale_factor_{axis}", f"{unit}/(rad/s)", scale, spread(unity[own]), common=scale),
+        *(
+            quotient(f"gyro_misalignment_{axis}{AXES[face]}", "rad", unity[k], 1.0)
+            for k, face in enumerate(faces)
+            if k != own
+        ),
+        *(
+            quotient(f"gyro_k{p}_{axis}", "1/(rad/s)" + (f"^{p - 1}" if p > 2 else ""), unity[size + p - 2])
+            for p in range(2, order + 1)
+        ),
+    ]
+
+
+def _model_parameters(
+    test: RateTest, problem: Problem, solution: Solution, order: int, unit: str
+) -> tuple[list[str], Array, Array, list[str]]:
+    """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate."""
+    measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
+    found = [entry for i in measured for entry in _entries(problem, solution, i, order, unit)]
+    found.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
+    jacobian = np.array([entry.line for entry in found])
+    shared = np.array([entry.common for entry in found]) * (test.relative_uncertainty or 0.0)
+    own = np.array([entry.mounted for entry in found]) * (test.mounting_uncertainty or 0.0) ** 2
+    for k, entry in enumerate(found):
+        if entry.name.startswith("gyro_bias"):
+            own[k] = _between_faces(problem, solution, AXES.index(entry.name[-1])) ** 2
+    matrix = np.asarray(jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(own))
+    values = np.array([entry.value for entry in found])
+    return [entry.name for entry in found], values, matrix, [entry.unit for entry in found]
+
+
+_ORDER = ["gyro_bias", "gyro_scale_factor", "gyro_misalignment", *(f"gyro_k{power}" for power in range(2, 6))]
+
+
+def _faces_of_runs(problem: Problem) -> dict[tuple[int, int], list[int]]:
+    """Return the runs of each face: body axis along the table's, and which way it points."""
+    found: dict[tuple[int, int], list[int]] = {}
+    for run in range(problem.runs):
+        first = int(np.argmax(problem.run == run))
+        found.setdefault((int(problem.axis[first]), int(problem.sign[first])), []).append(run)
+    return found
+
+
+def _average_of_zeros(problem: Problem) -> Array:
+    """Return the weight of each run's zero in the bias: every face counts alike, its runs alike, shape (runs,)."""
+    weights, groups = np.zeros(problem.runs), _faces_of_runs(problem)
+    axes = sorted({axis for axis, _ in groups})
+    for (axis, _), runs in groups.items():
+        ways = sum(1 for other, _ in groups if other == axis)
+        weights[runs] = 1 / len(axes) / ways / len(runs)
+    return weights
+
+
+def _between_faces(problem: Problem, solution: Solution, axis: int) -> float:
+    """Return what the zeros' scatter from face to face adds to the bias of a gyroscope, rad/s."""
+    i = problem.gyros.index(axis)
+    found = solution.coefficients[i]
+    scale = float(found[problem.faces.index(axis)])
+    zeros = found[len(found) - problem.runs :] / scale
+    groups = list(_faces_of_runs(problem).values())
+    if len(groups) < 2:
+        return 0.0
+    means = np.array([zeros[runs].mean() for runs in groups])
+    return float(means.std(ddof=1) / np.sqrt(len(groups)))
+
+
+def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
+    found = {}
+    for kind in ("nonlinearity", "asymmetry", "hysteresis"):
+        for axis, of in linearity.items():
+            pair = getattr(of, kind)
+            if pair is not None:
+                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], "1")
+    return found
+
+
+def _fit(
+    test: RateTest,
+    problem: Problem,
+    solution: Solution,
+    linearity: Mapping[str, Linearity],
+    dwells: Sequence[Dwells],
+) -> dict[str, Any]:
+    return {
+        "runs": len(dwells),
+        "dwells": len(problem.rate),
+        "rates_from": "the table's column" if all(found.recorded for found in dwells) else "the list of rates",
+        "chi_square": solution.chi_square,
+        "degrees_of_freedom": solution.freedom,
+        "between_runs": solution.cycle,
+        "table_uncertainty": test.relative_uncertainty,
+        "rate_uncertainty": {"value": test.rate_uncertainty, "unit": "rad/s"},
+        "mounting_uncertainty": test.mounting_uncertainty,
+        "latitude": test.latitude,
+        "axes": {
+            axis: {
+                "probability": found.probability,
+                "by_noise": found.by_noise,
+                "loop": found.loop,
+                "repeatability": None if found.repeatability is None else found.repeatability[0],
+                "repeatability_by_noise": None if found.repeatability is None else found.repeatability[1],
+                "scatter": float(solution.scatter[problem.gyros.index(AXES.index(axis))]),
+            }
+            for axis, found in linearity.items()
+        },
+    }
+
+
+def _dwells(linearity: Mapping[str, Linearity]) -> dict[str, Any]:
+    """Return each dwell about the axis of a gyroscope, as the figures draw it."""
+    words = ("falling", "turning", "rising")
+    return {
+        "axis": [axis for axis, found in linearity.items() for _ in found.rate],
+        "rate": [value for found in linearity.values() for value in found.rate.tolist()],
+        "residual": [value for found in linearity.values() for value in found.residual.tolist()],
+        "standard_uncertainty": [value for found in linearity.values() for value in found.uncertainty.tolist()],
+        "direction": [words[d + 1] for found in linearity.values() for d in found.direction.tolist()],
+    }
+
+
+def _findings(
+    test: RateTest,
+    problem: Problem,
+    solution: Solution,
+    linearity: Mapping[str, Linearity],
+    parameters: Mapping[str, Parameter],
+    unit: str,
+    order: int,
+) -> list[str]:
+    return [
+        *_of_unit(parameters, unit),
+        *_of_table(test, parameters),
+        *_of_line(linearity, order),
+        *_of_scatter(problem, solution),
+    ]
+
+
+def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
+    nominal = parse_unit(unit)
+    if nominal.quantity != "rate":
+        return []
+    off = {n[-1]: p.value * nominal.factor - 1 for n, p in parameters.items() if n.startswith("gyro_scale_factor")}
+    if max(map(abs, off.values())) <= _OFF:
+        return []
+    said = " ".join(f"{axis} {100 * value:+.3g} %" for axis, value in off.items())
+    return [Bad(f"the scale factors are off by {said}: is the unit ({unit}) right, or that of the table's rates?")]
+
+
+def _of_table(test: RateTest, parameters: Mapping[str, Parameter]) -> list[str]:
+    found: list[str] = []
+    if test.relative_uncertainty is None:
+        found.append(
+            Note(
+                "the uncertainty that all rates of the table have in common was not stated, and is in no uncertainty "
+                "of a scale factor (relative_standard_uncertainty, or --table-uncertainty)"
+            )
+        )
+    triad = any(name.startswith("gyro_misalignment") for name in parameters)
+    if test.mounting_uncertainty is None and triad:
+        found.append(Note("the uncertainty of the mounting was not stated, and is in no uncertainty of a misalignment"))
+    least = min(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_bias"))
+    if test.latitude is None and _MATTERS * least < EARTH:
+        hourly = from_si(EARTH, "deg/h")
+        found.append(
+            f"the Earth's rate, up to {hourly:.0f} deg/h, stays in the biases: their uncertainty of "
+            f"{from_si(least, 'deg/h'):.2g} deg/h does not hold it; state the latitude (--latitude)"
+        )
+    return found
+
+
+def _of_line(linearity: Mapping[str, Linearity], order: int) -> list[str]:
+    found: list[str] = []
+    for axis, of in linearity.items():
+        if of.probability < _CHANCE and order == 1:
+            found.append(
+                Note(
+                    f"gyro_{axis}: the output bends by {1e6 * of.nonlinearity[0]:.3g} ppm of the largest rate, beyond "
+                    "the noise of its dwells: --order 2 to 5 describes it"
+                )
+            )
+        if of.loop is not None and of.loop < _CHANCE and of.hysteresis is not None:
+            found.append(
+                f"gyro_{axis}: rising and falling rates differ by {1e6 * of.hysteresis[0]:+.3g} ppm of the largest "
+                "rate (hysteresis), which no calibration removes"
+            )
+    return found
+
+
+def _of_scatter(problem: Problem, solution: Solution) -> list[str]:
+    found: list[str] = []
+    if chi_square_probability(solution.chi_square, solution.freedom) < _CHANCE:
+        ratio = solution.chi_square / max(solution.freedom, 1)
+        found.append(
+            Note(
+                f"the dwells scatter more than their noise (reduced chi-square {ratio:.3g}); the uncertainties hold "
+                "what was added"
+            )
+        )
+    if solution.cycle:
+        found.append(
+            Note(f"the scale factors differ by {1e6 * solution.cycle:.3g} ppm from run to run, beyond their noise")
+        )
+    return found

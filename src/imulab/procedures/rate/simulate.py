@@ -1,0 +1,179 @@
+"""A simulated unit on a rate table: a run for each face and cycle, with its truth.
+
+The forward model is written here on its own, apart from the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from imulab.errors import OptionError, readable
+from imulab.procedures.rate.choices import AXES, EARTH, RATES, rates_of
+from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
+from imulab.quantities import fraction, in_si, whole
+from imulab.recording import Array, Recording
+from imulab.shown import Shown
+from imulab.units import from_si
+from imulab.writers import write_csv
+
+_ACCELERATION = np.radians(200.0)  # rad/s^2, of the table
+_SCALE, _TILT, _ZERO = 5e-3, 3e-3, np.radians(0.3)
+
+
+@dataclass(frozen=True, repr=False)
+class RateRecordings(Shown):
+    """The recordings of a simulated rate test and the manifest that names them.
+
+    Attributes
+    ----------
+    test
+        As its manifest states it.
+    recordings
+        One for each run.
+    truth
+        Parameters by the names that the record has.
+    """
+
+    test: RateTest
+    recordings: tuple[Recording, ...]
+    truth: dict[str, float]
+
+    def save(self, folder: str | Path) -> None:
+        """Write the recordings and ``test.toml`` into a folder, which is made."""
+        where = Path(folder)
+        with readable(folder):
+            where.mkdir(parents=True, exist_ok=True)
+        for run, recording in zip(self.test.runs, self.recordings, strict=True):
+            write_csv(recording, where / run.file)
+        (where / "test.toml").write_text(manifest_text(self.test), encoding="utf-8")
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return the headline and a table of the runs."""
+        rows = [
+            [run.file, run.mounting, f"{len(recording)}"]
+            for run, recording in zip(self.test.runs, self.recordings, strict=True)
+        ]
+        return f"Rate test of {len(rows)} runs", ["file", "mounting", "samples"], rows
+
+
+def simulate_rate(
+    rates: Sequence[float] | str = RATES,
+    *,
+    faces: str = "+x,+y,+z",
+    cycles: int | str = 1,
+    hold: float | str = "8 s",
+    noise: float | str = "0.03 deg/s",
+    rate: float | str = "100 Hz",
+    bend: float | str = "0",
+    loop: float | str = "0",
+    latitude: float | str = "48 deg",
+    table: float | str = "0",
+    seed: int | str = 1,
+) -> RateRecordings:
+    """Simulate a unit on a rate table: up through the rates, down, and the same the other way round, for each face.
+
+    ``M = S (s + k3 s^3 + loop) + S b``, ``s = T w``, with the Earth's rate in w.
+
+    Parameters
+    ----------
+    rates
+        Sizes of the rates, rad/s, or deg/s in a text.
+    faces
+        Body axes that point up along the table axis, one after the other.
+    cycles
+        Runs of each face.
+    hold
+        Time at each rate, s.
+    noise
+        Standard deviation of one sample, rad/s.
+    rate
+        Samples per second, Hz.
+    bend
+        Largest contribution of k3, a fraction of the largest rate.
+    loop
+        Rising less falling at rate zero, a fraction of the largest rate.
+    latitude
+        rad.
+    table
+        Standard deviation of what all rates of the table are off by, a fraction.
+    seed
+        Of the random numbers.
+
+    Raises
+    ------
+    OptionError
+        An option cannot be used; the message says which.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> len(il.simulate_rate(cycles=2, hold="1 s").recordings)
+    6
+    """
+    sizes = np.unique(np.abs(rates_of(rates, "rates") if isinstance(rates, str) else np.asarray(rates, dtype=float)))
+    words = faces.split(",")
+    if not all(len(word) == 2 and word[0] in "+-" and word[1] in AXES for word in words):
+        raise OptionError(f"faces {faces!r}: expected body axes such as +x,+y,+z")
+    duration, period = in_si(hold, "hold", "time", "s"), 1 / in_si(rate, "rate", "frequency", "Hz")
+    spread, place = in_si(noise, "noise", "rate", "deg/s"), in_si(latitude, "latitude", "angle", "deg")
+    common, bent, split = fraction(table, "table"), fraction(bend, "bend"), fraction(loop, "loop")
+    if sizes.size < 2 or not duration >= 1 or not 0 < period <= 0.1:
+        raise OptionError("rates, hold, rate: expected two rates or more, a hold of 1 s or more, and 10 Hz or more")
+    rng = np.random.default_rng(whole(seed, "seed"))
+    scale, zero = 1 + _SCALE * rng.standard_normal(3), _ZERO * rng.standard_normal(3)
+    turn = np.eye(3) + _TILT * rng.standard_normal((3, 3)) * (1 - np.eye(3))
+    off = common * rng.standard_normal()
+    k3 = bent / sizes[-1] ** 2
+    up = sizes[sizes >= 0]
+    way = np.concatenate([up, up[-2::-1], -up[1:], -up[-2::-1]])
+    runs, recordings = [], []
+    for word in words:
+        for cycle in range(1, whole(cycles, "cycles") + 1):
+            axis, sign = AXES.index(word[1]), 1.0 if word[0] == "+" else -1.0
+            time, table_rate, rising = _profile(way, duration, period)
+            body = np.zeros((len(time), 3))
+            body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(place))
+            angle = np.cumsum(table_rate) * period
+            body[:, (axis + 1) % 3] += EARTH * np.cos(place) * np.cos(angle)
+            body[:, (axis + 2) % 3] -= EARTH * np.cos(place) * np.sin(angle) * sign
+            along = body @ turn.T
+            along = along + k3 * along**3
+            along[:, axis] += sign * split * sizes[-1] / 2 * rising * (1 - (table_rate / sizes[-1]) ** 2)
+            output = scale * (along + zero) + spread * rng.standard_normal(along.shape)
+            recordings.append(_recording(time, output, f"{'np'[sign > 0]}{word[1]}_{cycle}.csv"))
+            runs.append(Run(recordings[-1].name, word, tuple(way.tolist())))
+    test = RateTest(tuple(runs), common, 0.0, 0.0, place, name="test.toml")
+    return RateRecordings(test, tuple(recordings), _truth(scale, zero, turn, k3))
+
+
+def _profile(way: Array, hold: float, period: float) -> tuple[Array, Array, Array]:
+    """Return time, the table's rate and whether it rose (1) or fell (-1) last, at a bounded acceleration."""
+    times, rates = [0.0], [way[0]]
+    for number, target in enumerate(way):
+        times += [times[-1] + max(abs(target - rates[-1]) / _ACCELERATION, 1e-9)] if number else []
+        rates += [target] if number else []
+        times.append(times[-1] + hold)
+        rates.append(target)
+    time = np.asarray(np.arange(int(times[-1] / period)) * period, dtype=np.float64)
+    table = np.interp(time, times, rates)
+    step = np.sign(np.diff(way, prepend=way[0] - 1))
+    part = np.searchsorted(np.array(times[1::2]), time)
+    return time, np.asarray(table), np.asarray(step[np.minimum(part, len(step) - 1)])
+
+
+def _recording(time: Array, output: Array, name: str) -> Recording:
+    columns = {"time": time, **{f"gyro_{a}": from_si(output[:, k], "deg/s") for k, a in enumerate(AXES)}}
+    return Recording(columns, {key: "s" if key == "time" else "deg/s" for key in columns}, {"serial": "SIM"}, name=name)
+
+
+def _truth(scale: Array, zero: Array, turn: Array, k3: float) -> dict[str, float]:
+    found = {f"gyro_bias_{a}": float(zero[i]) for i, a in enumerate(AXES)}
+    found |= {f"gyro_scale_factor_{a}": float(from_si(scale[i], "deg/s")) for i, a in enumerate(AXES)}
+    found |= {
+        f"gyro_misalignment_{a}{b}": float(turn[i, j]) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
+    }
+    return found | {f"gyro_k3_{a}": float(k3) for a in AXES}

@@ -1,0 +1,77 @@
+"""A rate test from its manifest, which names the recordings, or from one recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from imulab.errors import OptionError
+from imulab.procedures.options import (
+    ELEMENT,
+    READING,
+    Option,
+    choice,
+    measure,
+    part_of,
+    read_options,
+)
+from imulab.procedures.procedure import Files, Task, source_of
+from imulab.procedures.rate.choices import MOUNTINGS, ORDERS, rates_of
+from imulab.quantities import fraction
+
+if TYPE_CHECKING:
+    from imulab.records.calibration import Calibration
+
+OPTIONS = (
+    Option("rates", "Of the table, deg/s, in any order; for one recording without a column table_rate.", rates_of,
+           None, "R,R,..."),
+    choice("axis", "Body axis along the table axis, about which positive rates turn; for one recording.", MOUNTINGS,
+           "+z"),
+    choice("order", "Highest power of the rate in the model.", ORDERS, "1"),
+    measure("latitude", "Of the place, deg, for the Earth's rate.", "angle", "deg", shows="DEG"),
+    Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
+           lambda text, called: fraction(text, called), None, "FRACTION"),
+    *READING,
+    ELEMENT,
+)  # fmt: skip
+
+
+def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    return read_options(OPTIONS, texts, label)
+
+
+def _fit(
+    files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
+) -> Calibration:
+    from imulab.procedures.rate.fit import fit_rate, fit_test
+    from imulab.procedures.rate.manifest import load_test
+
+    (name,) = files
+    part = part_of(values)
+    if not name.lower().endswith(".toml"):
+        recording = access.recording(name, values["layout"], **part)
+        chosen = {key: values[key] for key in ("rates", "axis", "order", "latitude", "table_uncertainty")}
+        return fit_rate(recording, **chosen).calibration
+    if values["rates"] is not None or values["axis"] != "+z":
+        raise OptionError(
+            f"{name}: a manifest says the rates and axes of its runs; expected neither --rates nor --axis"
+        )
+    test = load_test(access.path(name), name)
+    if values["latitude"] is not None:
+        test = replace(test, latitude=values["latitude"])
+    if values["table_uncertainty"] is not None:
+        test = replace(test, relative_uncertainty=values["table_uncertainty"])
+    recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
+    record = fit_test(test, recordings, int(values["order"])).calibration
+    own = source_of(access, name)
+    return record if own is None else replace(record, sources=(own, *record.sources))
+
+
+TASK = Task(
+    files="the manifest of one test, or one recording",
+    count=(1, 1),
+    options=OPTIONS,
+    values=_values,
+    fit=_fit,
+)

@@ -1,0 +1,38 @@
+"""Gyroscopes on a rate table, transcribed apart: samples of steps of rate, and Earth's rate as the table turns.
+
+M_i = S_i (A_i + b_i), A_i = s_i + k2 s_i^2 + k3 s_i^3, s = T w (IEEE Std 528 terms); the Earth's rate has the axial
+part Omega sin(latitude) upward and a level part that turns against the table.
+"""
+
+import math
+
+import numpy as np
+
+OMEGA = 2 * math.pi / 86164.0905  # a sidereal day
+DEGREE = math.pi / 180
+
+
+def steps(rates, hold, frequency):
+    """Rate of the table, rad/s, for rates in deg/s held one after the other, without ramps."""
+    return np.repeat(np.asarray(rates, dtype=float) * DEGREE, round(hold * frequency))
+
+
+def outputs(table, frequency, axis, sign, scale, turn, bias, powers=(), latitude=None, noise=0.0, rng=None):
+    """Outputs of three gyroscopes, rad/s, while body axis `axis` (0 to 2) points up (1) or down (-1) on the table."""
+    body = []
+    angle = 0.0
+    for rate in table:
+        up, one, two = rate, 0.0, 0.0
+        if latitude is not None:
+            up += OMEGA * math.sin(latitude)
+            one = OMEGA * math.cos(latitude) * math.cos(angle)
+            two = -OMEGA * math.cos(latitude) * math.sin(angle)
+        angle += rate / frequency
+        w = [0.0, 0.0, 0.0]
+        w[axis] = sign * up
+        w[(axis + 1) % 3], w[(axis + 2) % 3] = one, sign * two
+        body.append(w)
+    s = np.array([[sum(turn[i][j] * w[j] for j in range(3)) for i in range(3)] for w in body])
+    a = s + sum(np.asarray(k) * s ** (p + 2) for p, k in enumerate(powers))
+    out = np.asarray(scale) * (a + np.asarray(bias))
+    return out if rng is None else out + noise * rng.standard_normal(out.shape)

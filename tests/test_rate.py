@@ -1,0 +1,319 @@
+"""Gyroscopes on a rate table: against a simulator apart, within its own uncertainties, and every refusal."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from imulab.procedures.rate.manifest import RateTest, Run
+from imulab.procedures.rate.simulate import RateRecordings
+from reference import rate as reference
+
+DEGREE = reference.DEGREE
+WAY = [0, 10, 50, 100, 200, 100, 50, 10, 0, -10, -50, -100, -200, -100, -50, -10, 0]
+SCALE, BIAS = np.array([1.004, 0.997, 1.01]), np.array([0.003, -0.006, 0.001])
+TURN = np.array([[1.0, 2e-3, -1e-3], [3e-3, 1.0, 5e-4], [-2e-3, 1e-3, 1.0]])
+
+
+def recording(mounting="+z", way=WAY, hold=3.0, frequency=50.0, unit="rad/s", column=True, **how):
+    """One run by the reference simulator."""
+    table = reference.steps(way, hold, frequency)
+    axis, sign = "xyz".index(mounting[1]), 1 if mounting[0] == "+" else -1
+    out = reference.outputs(table, frequency, axis, sign, SCALE, TURN, BIAS, **how)
+    factor = 1 / DEGREE if unit == "deg/s" else 1.0
+    columns = {"time": np.arange(len(table)) / frequency}
+    columns |= {f"gyro_{a}": factor * out[:, i] for i, a in enumerate("xyz")}
+    columns |= {"table_rate": table / DEGREE} if column else {}
+    units = {name: {"time": "s", "table_rate": "deg/s"}.get(name, unit) for name in columns}
+    return il.Recording(columns, units, {"serial": "SN7"}, name=f"{mounting}.csv")
+
+
+def whole(column=True, way=WAY, faces=("+x", "+y", "+z"), test=None, **how):
+    """A test of several runs."""
+    made = [recording(mounting, way, column=column, **how) for mounting in faces]
+    rates = None if column else tuple(np.asarray(way) * DEGREE)
+    runs = tuple(Run(f"{mounting}.csv", mounting, rates) for mounting in faces)
+    stated = {"relative_uncertainty": 0.0, "mounting_uncertainty": 0.0, **(test or {})}
+    return RateRecordings(RateTest(runs, **stated), tuple(made), {})
+
+
+def truth(name):
+    stem, axes = name.rsplit("_", 1)
+    kind = stem.removeprefix("gyro_")
+    i = "xyz".index(axes[0])
+    return TURN[i, "xyz".index(axes[1])] if kind == "misalignment" else {"scale_factor": SCALE, "bias": BIAS}[kind][i]
+
+
+LINEAR = [f"gyro_{kind}_{a}" for kind in ("bias", "scale_factor") for a in "xyz"]
+LINEAR += [f"gyro_misalignment_{p}" for p in ("xy", "xz", "yx", "yz", "zx", "zy")]
+
+
+@pytest.mark.parametrize("column", [True, False])
+def test_without_noise_every_parameter_is_exact(column):
+    found = il.fit_rate(whole(column)).calibration
+    for name in LINEAR:
+        assert found.value(name) == pytest.approx(truth(name), abs=1e-9), name
+    for axis in "xyz":
+        assert abs(found.value(f"gyro_nonlinearity_{axis}")) < 1e-9
+        assert abs(found.value(f"gyro_asymmetry_{axis}")) < 1e-9
+
+
+def test_without_noise_powers_of_the_rate_are_exact():
+    k2, k3 = np.array([1e-5, -2e-5, 3e-5]), np.array([2e-5, 1e-5, -1e-5])
+    found = il.fit_rate(whole(powers=(k2, k3)), order=3).calibration
+    for i, axis in enumerate("xyz"):
+        assert found.value(f"gyro_k2_{axis}") == pytest.approx(k2[i], abs=1e-9)
+        assert found.value(f"gyro_k3_{axis}") == pytest.approx(k3[i], abs=1e-9)
+        assert found.value(f"gyro_scale_factor_{axis}") == pytest.approx(SCALE[i], abs=2e-9)
+
+
+def test_errors_are_those_that_the_record_states():
+    scores = []
+    for seed in range(8):
+        made = whole(noise=2e-3, rng=np.random.default_rng(seed), hold=2.5)
+        found = il.fit_rate(made).calibration
+        parameters = [(found.parameters[name], truth(name)) for name in LINEAR]
+        scores += [(p.value - true) / p.standard_uncertainty for p, true in parameters]
+    squares = np.square(scores)
+    # chi-square over its number: 96 scores scatter by 0.14 about 1; biases hold the faces' scatter beside their own
+    assert 0.5 < squares.mean() < 1 + 4 * np.sqrt(2 / len(squares))
+
+
+def test_what_all_rates_have_in_common_is_not_averaged_away():
+    parts = [il.fit_rate(whole(test={"relative_uncertainty": u, "mounting_uncertainty": m})).calibration
+             for u, m in ((0.0, 0.0), (1e-4, 3e-4))]  # fmt: skip
+    for axis in "xyz":
+        alone, common = (p.parameters[f"gyro_scale_factor_{axis}"].standard_uncertainty for p in parts)
+        assert np.sqrt(common**2 - alone**2) == pytest.approx(1e-4 * SCALE["xyz".index(axis)], rel=1e-6)
+    assert parts[1].parameters["gyro_misalignment_xy"].standard_uncertainty == pytest.approx(3e-4, rel=1e-3)
+    block = parts[1].cov("gyro_scale_factor_x", "gyro_scale_factor_y")
+    assert block[0, 1] == pytest.approx(1e-8 * SCALE[0] * SCALE[1], rel=1e-6)
+
+
+def test_the_error_of_a_commanded_rate_is_shared_by_its_visits():
+    """A slope through zero-mean rates whose errors are u each: u(S)/S = u / sqrt(sum of the distinct rates squared)."""
+    u, visits = 0.01 * DEGREE, 4
+    way = [-200, -100, 100, 200, 100, -100, -200] * visits
+    found = il.fit_rate(whole(way=way, column=False, test={"rate_uncertainty": u})).calibration
+    distinct = DEGREE * np.array([-200.0, -100.0, 100.0, 200.0])
+    expected = u / np.sqrt(np.sum(distinct**2))
+    stated = found.parameters["gyro_scale_factor_x"].standard_uncertainty / SCALE[0]
+    assert stated == pytest.approx(expected, rel=0.02)
+
+
+def test_the_rate_of_the_earth_is_taken_off_where_the_latitude_is_known():
+    how = {"latitude": 1.0, "noise": 1e-5, "hold": 4.0}
+    known, unknown = (
+        il.fit_rate(whole(rng=np.random.default_rng(1), test={"latitude": place}, **how)).calibration
+        for place in (1.0, None)
+    )
+    for i, axis in enumerate("xyz"):
+        parameter = known.parameters[f"gyro_bias_{axis}"]
+        assert abs(parameter.value - BIAS[i]) < 4 * parameter.standard_uncertainty
+        # a third of the faces sees the axial part
+        axial = reference.OMEGA * np.sin(1.0)
+        assert unknown.value(f"gyro_bias_{axis}") - parameter.value == pytest.approx(axial / 3, rel=0.02)
+    assert any("latitude" in warning for warning in unknown.warnings)
+    assert not any("latitude" in warning for warning in known.warnings)
+
+
+def test_nonlinearity_asymmetry_and_hysteresis_are_as_defined():
+    sizes = np.array([-200.0, -100, -50, -10, 0, 10, 50, 100, 200]) * DEGREE
+    weight = np.array([1, 2, 2, 2, 3, 2, 2, 2, 1])
+    k2 = 1e-4
+    found = il.fit_rate(whole(powers=([k2] * 3,))).calibration
+    # a line through w + k2 w^2, rates weighted by their visits and symmetric, has slope 1 and the mean of k2 w^2
+    left = k2 * (sizes**2 - weight @ sizes**2 / weight.sum())
+    # s of a face is its rate, since T has a unit diagonal
+    assert found.value("gyro_nonlinearity_x") == pytest.approx(np.abs(left).max() / sizes[-1], rel=1e-6)
+    positive = np.column_stack([np.maximum(sizes, 0), np.minimum(sizes, 0), np.ones(9)])
+    root = np.sqrt(weight)[:, None]
+    slopes = np.linalg.lstsq(positive * root, (k2 * sizes**2) * root[:, 0], rcond=None)[0]
+    assert found.value("gyro_asymmetry_x") == pytest.approx(slopes[0] - slopes[1], rel=1e-5)
+    looped = il.fit_rate(il.simulate_rate(loop=1e-4, noise="0.003 deg/s", hold="4 s")).calibration
+    for axis in "xyz":
+        assert looped.value(f"gyro_hysteresis_{axis}") == pytest.approx(1e-4, rel=0.1)
+    assert any("hysteresis" in warning for warning in looped.warnings)
+
+
+def test_hysteresis_is_seldom_found_where_there_is_none():
+    found = [il.fit_rate(il.simulate_rate(hold="2 s", seed=seed, rate="50 Hz")).calibration for seed in range(8)]
+    loops = [axis["loop"] for record in found for axis in record.fit["axes"].values()]
+    assert sum(loop < 0.01 for loop in loops) <= 2  # 24 tests at 1 %: more than 2 happens once in 500
+
+
+def test_a_record_corrects_recordings_and_goes_through_the_core(tmp_path):
+    record = il.fit_rate(whole()).calibration
+    rng = np.random.default_rng(3)
+    rates = rng.uniform(-3, 3, (50, 3))
+    out = SCALE * (rates @ TURN.T + BIAS)
+    flight = il.Recording.from_arrays(gyro=out / DEGREE, rate=100.0, units={"gyro": "deg/s"})
+    np.testing.assert_allclose(il.apply(record, flight).triad("gyro") * DEGREE, rates, atol=1e-8)
+    record.save(tmp_path / "r.json")
+    il.export("blob", il.load(tmp_path / "r.json"), tmp_path / "fw")
+    by_blob = il.apply(str(tmp_path / "fw" / "unit.blob"), flight).triad("gyro") * DEGREE
+    np.testing.assert_allclose(by_blob, rates, atol=1e-5)  # single precision
+    il.export("c", record, tmp_path / "c")
+    assert (tmp_path / "c" / "imulab.h").exists()
+    with pytest.raises(il.ImulabError, match="gyroscopes alone"):
+        il.export("px4", record, tmp_path / "px4")
+
+
+def test_a_single_gyroscope_is_calibrated_and_applied_alone():
+    made = recording("-x", unit="deg/s")
+    alone = il.Recording({n: made.column(n) for n in ("time", "gyro_x", "table_rate")},
+                         {"time": "s", "gyro_x": "deg/s", "table_rate": "deg/s"}, name="one.csv")  # fmt: skip
+    record = il.fit_rate(alone, axis="-x").calibration
+    assert sorted(n for n in record.parameters if "misalignment" in n) == []
+    corrected = il.apply(record, alone)
+    np.testing.assert_allclose(corrected.column("gyro_x"), -made.column("table_rate"), atol=1e-6)
+    of_three = il.apply(record, made)
+    np.testing.assert_allclose(of_three.column("gyro_y"), made.column("gyro_y"))
+    with pytest.raises(il.ImulabError, match="no column gyro_x"):
+        il.apply(
+            record, il.Recording({"time": np.arange(3.0), "gyro_y": np.zeros(3)}, {"time": "s", "gyro_y": "deg/s"})
+        )
+
+
+def test_outputs_in_counts_need_no_nominal():
+    counted = recording("+z", column=False)
+    factor = 1875.0
+    columns = {n: v if n == "time" else v * factor for n, v in counted.columns.items()}
+    one = il.Recording(columns, {n: "s" if n == "time" else "count" for n in columns}, name="count.csv")
+    record = il.fit_rate(one, rates=np.array(WAY) * DEGREE).calibration
+    assert record.value("gyro_scale_factor_z") == pytest.approx(factor * SCALE[2], rel=1e-9)
+    assert record.parameters["gyro_scale_factor_z"].unit == "count/(rad/s)"
+
+
+def test_an_angle_of_the_table_serves_as_its_rate():
+    made = recording("+z", noise=1e-4, rng=np.random.default_rng(1))
+    angle = np.cumsum(made.column("table_rate")) / 50
+    turned = il.Recording({**{n: v for n, v in made.columns.items() if n != "table_rate"}, "table_angle": angle % 360},
+                          {**{n: u for n, u in made.units.items() if n != "table_rate"}, "table_angle": "deg"},
+                          name="angle.csv")  # fmt: skip
+    found = il.fit_rate(turned).calibration.parameters["gyro_scale_factor_z"]
+    assert found.value == pytest.approx(SCALE[2], abs=4 * found.standard_uncertainty)
+
+
+def test_the_scatter_of_scale_factors_from_cycle_to_cycle_is_in_their_uncertainty():
+    runs = [il.simulate_rate(faces="+z", noise="0.001 deg/s", hold="3 s", rate="50 Hz", seed=1) for _ in range(4)]
+    made = []
+    for number, run in enumerate(runs):
+        (one,) = run.recordings
+        column = one.column("gyro_z") * (1 + 2e-4 * (number - 1.5))
+        made.append(dataclasses.replace(one, columns={**one.columns, "gyro_z": column}, name=f"{number}.csv"))
+    test = dataclasses.replace(runs[0].test, runs=tuple(dataclasses.replace(runs[0].test.runs[0], file=f"{n}.csv")
+                                                        for n in range(4)))  # fmt: skip
+    record = il.fit_rate(RateRecordings(test, tuple(made), {})).calibration
+    spread = 2e-4 * np.std([-1.5, -0.5, 0.5, 1.5], ddof=1)
+    scale = record.parameters["gyro_scale_factor_z"]
+    assert record.fit["axes"]["z"]["repeatability"] == pytest.approx(spread, rel=0.02)
+    assert scale.standard_uncertainty / scale.value == pytest.approx(spread / 2, rel=0.05)
+    low, high = scale.interval_95
+    assert (high - low) / 2 == pytest.approx(3.182 * scale.standard_uncertainty, rel=1e-3)  # Student's t of three
+
+
+def changed(made, **columns):
+    return dataclasses.replace(made, columns={**made.columns, **columns})
+
+
+def _clipped():
+    made = recording(noise=1e-3, rng=np.random.default_rng(1), column=False)
+    return changed(made, gyro_z=np.clip(made.column("gyro_z"), -150 * DEGREE, 150 * DEGREE))
+
+
+def _slipped():
+    made = recording(column=False)
+    values = made.column("gyro_z").copy()
+    values[450:600] = 70 * DEGREE  # 100 deg/s were commanded
+    return changed(made, gyro_z=values)
+
+
+RATES = np.array(WAY) * DEGREE
+REFUSED = {
+    "no rates": (lambda: il.fit_rate(recording(column=False)), "no column table_rate or table_angle"),
+    "one direction": (
+        lambda: il.fit_rate(recording(way=[0, 10, 50, 100, 200, 100, 50])),
+        "turned one way round only",
+    ),
+    "too short": (lambda: il.fit_rate(recording(hold=0.4)), "are the steps too short"),
+    "one too short": (
+        lambda: il.fit_rate(recording(column=False), rates=[*RATES, 150 * DEGREE]),
+        "no dwell of 2 s or longer at 150 deg/s",
+    ),
+    "clipped": (lambda: il.fit_rate(_clipped(), rates=RATES), "its output is saturated"),
+    "wrong axis": (lambda: il.fit_rate(recording(), axis="+x"), "are seen by gyro_z, not by gyro_x"),
+    "slipped": (lambda: il.fit_rate(_slipped(), rates=RATES), "did the table slip"),
+    "sign": (lambda: il.fit_rate(recording(), axis="-z"), "is the sign of mounting wrong"),
+    "sign of a list": (
+        lambda: il.fit_rate(
+            recording("-z", [0, 100, 200, 100, -20], column=False), rates=DEGREE * np.array([0, 100, 200, 100, -20])
+        ),
+        "is the sign of mounting wrong",
+    ),
+    "another unit": (
+        lambda: il.fit_rate(changed(recording(column=False), gyro_z=57.3 * recording().column("gyro_z")), rates=RATES),
+        "or the unit or a sign wrong",
+    ),
+    "few rates": (lambda: il.fit_rate(recording(way=[100, -100, 100, -100]), order=2), "2 different rates"),
+    "no order": (lambda: il.fit_rate(recording(), order=6), "order '6': expected one of"),
+    "an axis": (lambda: il.fit_rate(recording(), axis="up"), "axis 'up': expected one of"),
+    "rates of a test": (lambda: il.fit_rate(whole(), rates="0,1"), "the manifest says the rates"),
+    "no gyroscope": (lambda: il.fit_rate(np.zeros((200, 3)), rate=50, unit="g"), "no column gyro_"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_refused_in_a_line(name):
+    call, said = REFUSED[name]
+    with pytest.raises(il.ImulabError, match=said) as refused:
+        call()
+    assert "\n" not in str(refused.value)
+
+
+def ran(*words, status=0):
+    assert main([str(word) for word in words], project=False) == status
+
+
+def test_the_command_goes_from_a_manifest_to_record_report_and_comparison(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for seed in (1, 2):
+        ran("rate", "simulate", "-o", f"t{seed}", "--hold", "3 s", "--rate", "50", "--seed", seed, "--table", "20ppm")
+        ran("rate", "fit", f"t{seed}/test.toml", "-o", f"{seed}.json", "--report", f"{seed}.html")
+    page = Path("1.html").read_text(encoding="utf-8")
+    assert "What the best line leaves of gyro_x" in page
+    assert "What the uncertainty of a scale factor is made of" in page
+    capsys.readouterr()
+    ran("show", "1.json")
+    assert "gyro_misalignment_xy" in capsys.readouterr().out
+    ran("show", "1.json", "2.json")
+    assert "gyro_scale_factor_x" in capsys.readouterr().out
+    ran("apply", "1.json", "t1/px_1.csv", "-o", "out.csv")
+    assert json.loads(Path("1.json").read_text())["sources"][0]["file"].endswith("test.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "run: expected tables"),
+        ('[[run]]\nfile = "a.csv"\nmounting = "up"', "mounting: expected one of +x -x"),
+        ('[[run]]\nfile = "a.csv"\nmounting = "+z"\nrate = [1]', "unknown key 'rate'"),
+        ('[[run]]\nfile = "a.csv"\nmounting = "+z"\nrates = [1]', "rates: expected a list of two rates"),
+        ('rates = { unit = "m" }\n[[run]]\nfile = "a.csv"\nmounting = "+z"', "expected a unit of rate"),
+        ('latitude = { value = 91, unit = "deg" }\n[[run]]\nfile = "a.csv"\nmounting = "+z"', "expected -90 to 90 deg"),
+        ('mounting = 0.3\n[[run]]\nfile = "a.csv"\nmounting = "+z"', "mounting: expected mounting = {"),
+        ('[[run]]\nfile = "a.csv"\nmounting = "+z"', "a.csv"),
+    ],
+)
+def test_a_manifest_that_cannot_be_is_refused_by_its_place(text, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("t.toml").write_text(text, encoding="utf-8")
+    ran("rate", "fit", "t.toml", "-o", "r.json", status=2)
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert not Path("r.json").exists()
