@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 
-.PHONY: demo test test-all core fuzz dist lint format bench footprint truth docs clean
+.PHONY: demo test test-all core fuzz dist lint format bench compare footprint truth docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
@@ -55,6 +55,10 @@ bench: $(STAMP) $(VENV)/.bench
 # What an exported unit costs on a Cortex-M4F, emulated, into docs/runtime.md (Debian: gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm).
 footprint: $(STAMP)
 	$(BIN)/python benchmarks/target.py
+
+# Beside other programs on public recordings; writes benchmarks/comparison.json and the tables of docs/comparison.md.
+compare: $(STAMP) $(VENV)/.bench
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/comparison.py
 
 # Coverage, warnings and errors under the disturbances and defaults that people have; writes docs/truth.md.
 truth: $(STAMP)
