@@ -262,6 +262,12 @@ def replaced(**columns):
         (log, {"terms": "NXB"}, OptionError, "terms 'NXB': expected auto, or N and any"),
         (log, {"terms": "K"}, OptionError, "terms 'K': expected auto, or N"),
         (log, {"horizon": 5000.0}, OptionError, "horizon 5000 s: expected at most the length of the record, 600 s"),
+        (
+            lambda: log(count=700),
+            {"horizon": 10.0},
+            OptionError,
+            "horizon 10 s: expected at most .* 7 s in one stretch",
+        ),
         (log, {"horizon": -1.0}, OptionError, "horizon -1 s: expected more than 0"),
         (log, {"band": 0.0}, OptionError, "band 0 Hz: expected more than 0"),
         (log, {"regress": "pressure"}, OptionError, "regress 'pressure': expected one of time temperature"),

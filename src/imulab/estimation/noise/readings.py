@@ -21,7 +21,7 @@ LEVELS = 6
 _FEW, _PILED, _MOST = 10, 4, 0.05
 """Zeros are dropouts beyond so many, and so many times as many as the next level holds: a reading cut to whole counts
 has twice as many. So large a share is refused."""
-_BESIDE, _STEPS, _SHARE = 0.5, 5.0, 0.05
+_BESIDE, _STEPS, _SHARE = 0.5, 5.0, 0.15
 """Standard deviations, or steps, next to a limit in which there are readings: more than this share of those at it."""
 _COARSE = 0.25
 """Standard deviations: zeros among readings of larger steps are not told from lost ones."""

@@ -40,7 +40,7 @@ def check_terms(text: str, called: str = "terms") -> str:
 
 
 def check_options(
-    terms: str, horizon: float, band: float | None, regress: str | None, steps: str | None, label: str = "{}"
+    terms: str, horizon: float | None, band: float | None, regress: str | None, steps: str | None, label: str = "{}"
 ) -> None:
     """Check what can be checked before there is data; `label` is how messages call an option.
 
@@ -50,7 +50,7 @@ def check_options(
         An option has a value that cannot be used.
     """
     check_terms(terms, label.format("terms"))
-    if not 0 < horizon < 1e6:
+    if horizon is not None and not 0 < horizon < 1e6:
         raise OptionError(f"{label.format('horizon')} {horizon:g} s: expected more than 0")
     if band is not None and not 0 < band < 1e9:
         raise OptionError(f"{label.format('band')} {band:g} Hz: expected more than 0")

@@ -56,7 +56,9 @@ def _of_column(column: ColumnModel) -> list[tuple[type[str], str]]:
         found.append((str, "the spectrum is level nowhere, so that white noise is not told apart from other noise"))
     elif analysis.band.filtered(analysis.interval):
         highest, low = analysis.band.highest, 2 * analysis.band.roll_off
-        lean = f", which may leave the white noise up to {100 * low:.1g} % too small" if low > _LEANS else ""
+        lean = (
+            f", which may leave the white noise up to {plain_number(100 * low, 1)} % too small" if low > _LEANS else ""
+        )
         text = f"fitted up to {highest:.3g} Hz; from about {2 * highest:.3g} Hz on the spectrum is not level"
         found.append((Note, text + lean))
     if at_band_edge(analysis.values, analysis.limits[0]).any():

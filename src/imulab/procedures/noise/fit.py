@@ -140,7 +140,7 @@ def fit_noise(
     data: Data | Sequence[Data],
     *,
     terms: str = "auto",
-    horizon: float | str = HORIZON,
+    horizon: float | str | None = None,
     band: float | str | None = None,
     regress: str | None = NO_COVARIATE,
     columns: str | Sequence[str] | None = None,
@@ -163,7 +163,7 @@ def fit_noise(
         quantisation.
     horizon
         Time over which a filter predicts without aiding, s: the random walk for filters is that which predicts a mean
-        over it.
+        over it; 10 s if not given, or the length of a shorter log.
     band
         Highest frequency to use, Hz; up to where the spectrum is flat if not given.
     regress
@@ -232,7 +232,7 @@ def fit_recordings(
     recordings: Iterable[Recording | Rest],
     *,
     terms: str,
-    horizon: float,
+    horizon: float | None,
     band: float | None,
     regress: str | None,
     columns: Sequence[str] | None,
@@ -245,7 +245,7 @@ def fit_recordings(
     rests = read_rests(recordings, columns)
     names = chosen_columns(rests[0].recording, columns)
     longest = max(stop[1] - stop[0] for rest in rests for stop in rest.parts) * rests[0].interval
-    if horizon > longest and horizon != HORIZON:
+    if horizon is not None and horizon > longest:
         raise OptionError(
             f"horizon {horizon:g} s: expected at most the length of the record, {longest:.4g} s in one stretch"
         )
@@ -253,7 +253,7 @@ def fit_recordings(
     if regress == "temperature" and None in temperatures:
         where = rests[temperatures.index(None)].recording.name
         raise DataError(f"{where}: regress temperature: expected a column temperature that changes, found none")
-    horizon = min(horizon, longest)  # the default is of the usual, longer, records
+    horizon = min(HORIZON, longest) if horizon is None else horizon
     candidates = CANDIDATES if terms == "auto" else (terms,)
     found = {name: _column(name, rests, temperatures, candidates, band, regress, steps == "remove") for name in names}
     options = {"terms": terms, "horizon": horizon, "band": band, "regress": regress, "steps": steps}

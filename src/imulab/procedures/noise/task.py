@@ -39,7 +39,13 @@ LARGE = 1 << 28
 """Bytes of a file whose rows are not kept in memory."""
 OPTIONS = (
     Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
-    measure("horizon", "Time that a filter predicts without aiding, s.", "time", "s", f"{HORIZON:g} s", shows="TIME"),
+    measure(
+        "horizon",
+        f"Time that a filter predicts without aiding; {HORIZON:g} s if not given, or the length of a shorter log.",
+        "time",
+        "s",
+        shows="TIME",
+    ),
     measure("band", "Highest frequency to use, Hz; found from the spectrum if not given.", "frequency", "Hz"),
     choice("regress", "Take out what follows it.", (NO_COVARIATE, *COVARIATES), NO_COVARIATE),
     Option("columns", "Columns to fit; all sensors if not given.", names_of_columns, shows="A,A,..."),
