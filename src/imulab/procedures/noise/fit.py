@@ -197,7 +197,7 @@ def fit_noise(
 
     Source: Whittle (1953); IEEE Std 952 and 647 (terms).
     """
-    horizon = in_si(horizon, "horizon", "time", "s")
+    horizon = None if horizon is None else in_si(horizon, "horizon", "time", "s")
     band = None if band is None else in_si(band, "band", "frequency", "Hz")
     columns = names_of_columns(columns, "columns") if isinstance(columns, str) else columns
     check_options(terms, horizon, band, regress, steps)
