@@ -290,6 +290,9 @@ def _imucal(attitudes: il.Attitudes, time: np.ndarray, rate: np.ndarray, force: 
 def main() -> None:
     if not (DATA / "xsens_mti").is_dir():
         sys.exit("the recordings are not here: IMULAB_DATA names their folder")
+    for name in set(NEEDS.values()):
+        if name in os.environ and not Path(os.environ[name]).exists():
+            sys.exit(f"{name}: {os.environ[name]} is not there; docs/comparison.md says what it names")
     measured: dict[str, Any] = {"splits": SPLITS, "versions": {n: version(n) for n in ("imulab", "numpy", "scipy")}}
     if importlib.util.find_spec("imucal"):
         measured["versions"]["imucal"] = version("imucal")

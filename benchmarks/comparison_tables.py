@@ -115,15 +115,12 @@ def _ratio(spent: list[float] | None, ours: list[float]) -> str:
 def session(found: dict[str, Any]) -> str:
     """imucal's own session."""
     value = {name: f"{found[name]:.0f}" if name in found else ABSENT for name in ("imucal", "imu-calib-toolkit")}
-    largest = found.get("misalignment", ABSENT)
+    largest = found.get("misalignment")
+    bound = f"none is left; largest misalignment {largest}, no warning" if largest else ABSENT
     rows = [
         ["imucal", "six rests, taken as level, and three turns", value["imucal"]],
         ["imu-calib-toolkit", "six rests; leaves misalignment out by itself", value["imu-calib-toolkit"]],
-        [
-            "imu-calib-toolkit",
-            f"all {found['attitudes']} rests",
-            f"none is left; largest misalignment {largest}, no warning",
-        ],
+        ["imu-calib-toolkit", f"all {found['attitudes']} rests", bound],
         ["imulab", f"all {found['attitudes']} rests", f"refuses: {found['imulab']}"],
     ]
     return _table(["program", "is given", "rms of \\|f\\| - g at three rests that were not used, µg"], rows)

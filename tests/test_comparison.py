@@ -41,12 +41,14 @@ def test_a_program_that_is_absent_is_said_to_be_not_measured(tables, measured):
                 del errors[name]
     measured["processes"].pop("imu_tk")
     measured["fits"].pop("imu-calib-toolkit")
-    for name in ("imucal", "imu-calib-toolkit"):
+    for name in ("imucal", "imu-calib-toolkit", "misalignment"):
         measured["session"].pop(name)
     rows = tables.prediction(measured["quarter"], measured["processes"]).splitlines()
     assert [tables.ABSENT in row for row in rows] == [False] * 5 + [True] * 3
-    for text in (tables.cost(measured), tables.session(measured["session"])):
-        assert tables.ABSENT in text
+    rows = tables.session(measured["session"]).splitlines()
+    assert [tables.ABSENT in row for row in rows] == [False] * 2 + [True] * 3 + [False]
+    rows = tables.cost(measured).splitlines()
+    assert [tables.ABSENT in row for row in rows] == [False] * 3 + [True, False, False, True]
 
 
 def test_who_wins_is_decided_by_the_median_of_the_ratios(tables):
