@@ -285,3 +285,26 @@ def test_a_call_that_cannot_be_is_refused_in_a_line(logged, call, words):
     with pytest.raises(ImulabError, match=words) as refused:
         call(logged["recording"][0], logged["attitudes"][0])
     assert "\n" not in str(refused.value)
+
+
+SCRIPT = """
+import imulab as il
+import LIBRARY
+
+fit = il.fit_tumble(LIBRARY.read_csv("recording.csv"), gravity=9.81362)
+fit.save("sn42.json")
+fit.plot("residual").save("residuals.html")
+"""
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_five_lines_lead_from_a_data_frame_to_a_record_and_a_picture(library, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = il.simulate_tumble(order=1, gravity=9.81362)
+    made.to_frame("polars").write_csv("recording.csv")
+    script = SCRIPT.replace("LIBRARY", library)
+    assert sum(bool(line) for line in script.splitlines()) == 5
+    exec(script, {})
+    off = il.load("sn42.json").value("bias_x") - float(made.metadata["truth_bias_x"])
+    assert abs(off) < 1e-3
+    assert "Residual" in (tmp_path / "residuals.html").read_text(encoding="utf-8")

@@ -162,3 +162,13 @@ def test_no_file_is_two_rooms():
         for path in [*(SOURCE / "imulab").rglob("*.[ch]"), *(SOURCE / "imulab").rglob("*.py")]
     }
     assert {name: count for name, count in lines.items() if count > 420} == {}
+
+
+def test_public_names_are_those_that_type_checkers_see():
+    import imulab
+
+    tree = ast.parse(Path(imulab.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    assert ast.unparse(block.test) == "TYPE_CHECKING"
+    seen = {name.asname: node.module for node in block.body for name in node.names}
+    assert seen == {name: f"imulab.{home}" for name, home in imulab._HOME.items()}

@@ -389,7 +389,7 @@ LAYOUTS = {
     "not TOML": ("columns = [", "the layout file is not TOML"),
     "unit unknown": (
         '[columns]\nfog = { from = 0, unit = "vo" }\n',
-        "column fog: unknown unit 'vo'; known units: s ms",
+        "column fog: unknown unit 'vo'; known units: rad/s mrad/s",
     ),
     "unit wrong": (
         '[columns]\nfog = { from = 0, unit = "s" }\n',

@@ -88,7 +88,7 @@ def test_other_columns_may_have_any_unit_or_none():
     [
         ("accel_x [g", "column title 'accel_x [g': expected 'name [unit]'"),
         ("accel_x [g] raw", "column title 'accel_x [g] raw': expected 'name [unit]'"),
-        ("accel_x [gee]", "column accel_x: unknown unit 'gee'; known units: s ms"),
+        ("accel_x [gee]", "column accel_x: unknown unit 'gee'; known units: m/s^2 g mg ug count"),
         ("accel_x []", "column accel_x: unknown unit ''"),
     ],
 )

@@ -7,6 +7,7 @@ SCRIPT = """
 from pathlib import Path
 
 import numpy as np
+import polars
 from numpy.typing import NDArray
 
 import imulab as il
@@ -22,7 +23,9 @@ layout: dict[str, object] = one.to_dict()
 first: Plot = every["sphere"]
 drawn: Plots = recording.plot()
 covariance: NDArray[np.float64] = fit.cov("bias_x", "bias_y")
-frame = fit.to_frame("polars")
+rows: int = fit.to_frame("polars").height
+samples: polars.DataFrame = recording.to_frame("polars")
+titles = list(recording.to_frame().columns)
 files: list[Path] = fit.export("c", Path("firmware"))
 corrected: il.Recording = fit.apply(np.ones((9, 3)), rate=100.0, unit="g")
 record: il.Calibration = il.load("sn42.json")

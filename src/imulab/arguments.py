@@ -83,6 +83,8 @@ def described(found: object) -> str:
         return f"the recording {getattr(found, 'name', '')} (arguments in the wrong order?)"
     if kind.__module__.partition(".")[0] == "imulab":
         return kind.__name__
+    if kind.__name__ == "LazyFrame":
+        return "a LazyFrame, which collect() makes a data frame"
     shape = getattr(found, "shape", None)
     return f"{kind.__name__} of shape {shape}" if isinstance(shape, tuple) and shape else quoted(found)
 

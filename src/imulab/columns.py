@@ -77,7 +77,7 @@ def parse_column_title(title: str, file: str) -> tuple[str, str]:
         raise UnitError(f"{file}: column title {title.strip()!r}: expected 'name [unit]'")
     symbol = rest.rstrip()[:-1].strip()
     try:
-        return name, parse_unit(symbol).symbol
+        return name, parse_unit(symbol, expected_quantities(name) or ()).symbol
     except UnitError as error:
         if expected_quantities(name) is None and symbol:
             return name, symbol  # not ours to convert: it passes through
@@ -130,7 +130,7 @@ def check_unit(name: str, unit: str, file: str) -> None:
     expected = expected_quantities(name)
     if expected is None:
         return
-    quantity = parse_unit(unit).quantity if unit else "nothing"
+    quantity = parse_unit(unit, expected).quantity if unit else "nothing"
     if quantity not in expected:
         raise UnitError(
             f"{file}: column {name}: expected a unit of {' or '.join(expected)}, found {unit!r} ({quantity})"

@@ -6,12 +6,14 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.arguments import described
 from imulab.columns import TRIADS, check_name, example_unit, expected_quantities
 from imulab.errors import DataError, OptionError, UnitError, listed, meant, quoted
 from imulab.units import parse_unit
@@ -20,6 +22,7 @@ DEFAULT_UNITS = {"time": "s", "temperature": "degC"}
 """Units of arrays that are given without one; a data frame states all its units."""
 _LIBRARIES = ("pandas", "polars")
 _WORDS = (*TRIADS, "temperature", "time", "rate", "unit", "units", "metadata", "name")
+_OF_SENSORS = ("acceleration", "rate", "magnetic field", "output")
 _LIKE_NUMBERS = "iufb"
 _TEXTS = ("object", "str", "string", "category")
 _TIMES = ("datetime64", "timedelta64")
@@ -56,7 +59,7 @@ class Units:
         if self.common is not None:
             if not isinstance(self.common, str):
                 raise OptionError(f"unit {quoted(self.common)}: expected a text such as 'g' or 'deg/s'")
-            parse_unit(self.common)
+            parse_unit(self.common, _OF_SENSORS)
 
     def of(self, column: str, stated: str | None = None) -> str:
         """Return the unit of a column; `stated` is that of its title."""
@@ -81,7 +84,8 @@ class Units:
         if quantities is None and sensor not in TRIADS:
             return "1"
         how = self.where.format(name=column, sensor=sensor, unit=example_unit(column))
-        raise UnitError(f"{self.name}: column {column} has no unit; expected {how}")
+        other = "" if self.common is None else f"; unit {self.common!r} is one of {parse_unit(self.common).quantity}"
+        raise UnitError(f"{self.name}: column {column} has no unit; expected {how}{other}")
 
     def check_used(self, columns: Iterable[str]) -> None:
         """Refuse a unit that is of no column."""
@@ -98,7 +102,7 @@ class Units:
     def _known(self, column: str, symbol: str) -> str:
         """Return the unit as it is written here; of a column outside the vocabulary it may be any."""
         try:
-            return parse_unit(symbol).symbol
+            return parse_unit(symbol, expected_quantities(column) or ()).symbol
         except UnitError as error:
             if expected_quantities(column) is None and symbol:
                 return symbol
@@ -155,23 +159,23 @@ def columns_of_frame(
         Time is stated twice.
     """
     if not is_frame(frame):
-        raise DataError(f"expected a data frame of pandas or polars, found {quoted(frame)}")
+        raise DataError(f"expected a data frame of pandas or polars, found {described(frame)}")
     where = "a title such as '{name} [{unit}]', or units={{'{sensor}': '{unit}'}}"
     found = Units(name, units or {}, unit, where)
     titles = {original: _joined(original) for original in frame.columns}
     if len(titles) < len(frame.columns):
         twice = next(title for title in titles if list(frame.columns).count(title) > 1)
         raise DataError(f"{name}: column {twice} appears twice")
-    entries = [(*_title(title, name), _numbers(frame[at], title, name)) for at, title in titles.items()]
+    entries = [(*_title(title, name), _column(frame[at], title, name)) for at, title in titles.items()]
     index = getattr(frame, "index", None)
-    if _dtype(index).startswith(_TIMES) and not any(key == "time" for key, _, _ in entries):
-        entries.insert(0, ("time", None, _numbers(index, "time", name)))
+    if index is not None and not any(key == "time" for key, _, _ in entries):
+        entries[:0] = _times_of(index, name, stated=rate is not None)
     return _put_together(entries, found, rate)
 
 
 def is_frame(value: object) -> bool:
     """Return whether something is a data frame, to this module's purposes."""
-    return hasattr(value, "columns") and hasattr(value, "__getitem__") and hasattr(value, "shape")
+    return hasattr(value, "shape") and hasattr(value, "columns") and hasattr(value, "__getitem__")
 
 
 def data_frame(columns: Mapping[str, Any], library: str | None = None) -> Any:
@@ -242,18 +246,66 @@ def _split(title: str, values: Any, name: str) -> Iterator[tuple[str, str | None
 def _numbers(column: Any, title: str, name: str) -> NDArray[Any]:
     """Return an array of floats, or of times; missing values are NaN."""
     try:
-        values = column.to_numpy() if hasattr(column, "to_numpy") else np.asarray(column)
+        values = column.to_numpy() if hasattr(column, "to_numpy") else unmasked(column)
         if values.dtype.kind == "O" and _dtype(column).startswith(_TIMES):
             values = column.to_numpy(dtype="datetime64[ns]")  # pandas' dates of a time zone
-        elif values.dtype.kind == "O" and _dtype(column) not in _TEXTS:
+        elif values.dtype.kind == "O" and hasattr(column, "array") and _dtype(column) not in _TEXTS:
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)  # pandas' own numbers, some of them missing
-    except (TypeError, ValueError) as error:
+        elif values.dtype.kind == "O":
+            values = _of_objects(values)
+    except (TypeError, ValueError, AttributeError) as error:
         raise DataError(f"{name}: column {title}: expected numbers ({error})") from None
     if values.dtype.kind in _LIKE_NUMBERS:
         return np.asarray(values, dtype=np.float64)
     if values.dtype.kind in "mM" and _title(title, name) == ("time", None):
         return values
     raise DataError(f"{name}: column {title}: expected numbers, found {_kind(column, values)}")
+
+
+def unmasked(values: Any) -> NDArray[Any]:
+    """Return an array, with NaN in the place of what a masked array leaves out."""
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    return np.asarray(values)
+
+
+def _of_objects(values: NDArray[Any]) -> NDArray[Any]:
+    """Return what Python's own objects stand for, numbers or dates; texts, and what is neither, stay as they are."""
+    kinds = {type(value) for value in values.flat}
+    if any(issubclass(kind, str | bytes) for kind in kinds):
+        return values
+    if kinds and all(issubclass(kind, datetime) for kind in kinds):
+        return np.array([value - values[0] for value in values], dtype="timedelta64[us]")
+    return values.astype(np.float64)
+
+
+def _column(column: Any, title: str, name: str) -> NDArray[Any]:
+    """Return a column of a data frame, shape (n,)."""
+    values = _numbers(column, title, name)
+    if values.ndim != 1:
+        raise DataError(f"{name}: column {title}: expected a number in each row, found {values.shape[1:]} of them")
+    return values
+
+
+def _times_of(index: Any, name: str, *, stated: bool) -> list[tuple[str, str | None, NDArray[Any]]]:
+    """Return the times that an index holds as a column, none where it only counts the rows.
+
+    Raises
+    ------
+    DataError
+        It may hold times, but does not say so: rows without a time would be taken for attitudes at rest.
+    """
+    title = str(index.name) if getattr(index, "name", None) is not None else ""
+    if _dtype(index).startswith(_TIMES):
+        return [("time", None, _numbers(index, "time", name))]
+    if title.partition("[")[0].strip() == "time":
+        return [(*_title(title, name), _column(index, title, name))]
+    if not stated and _dtype(index).startswith(("period", "float")):
+        raise DataError(
+            f"{name}: the index holds {_dtype(index)} and there is no column 'time'; expected an index of dates or "
+            "durations, one named 'time [s]', or reset_index(drop=True) where it is no time"
+        )
+    return []
 
 
 def _dtype(column: Any) -> str:

@@ -35,7 +35,7 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     if match is None:
         raise OptionError(expected)
     try:
-        unit = parse_unit(match[2].strip() if match[2] else default_unit)
+        unit = parse_unit(match[2].strip() if match[2] else default_unit, (kind,))
     except UnitError as error:
         raise OptionError(f"{option} {text!r}: {error}") from None
     if unit.quantity != kind:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,9 @@ from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
 
 if TYPE_CHECKING:
+    import pandas
+    import polars
+
     from imulab.report.plots import Plot, Plots
 
 Array = NDArray[np.float64]
@@ -319,8 +322,12 @@ class Recording:
         found, symbols = columns_of_frame(frame, rate=rate, unit=unit, units=units, name=name)
         return cls(found, symbols, metadata or {}, name)
 
+    @overload
+    def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
+    @overload
+    def to_frame(self, library: Literal["polars"]) -> polars.DataFrame: ...
     @checked
-    def to_frame(self, library: str | None = None) -> Any:
+    def to_frame(self, library: str | None = None) -> pandas.DataFrame | polars.DataFrame:
         """Return a data frame with columns named ``name [unit]``: of pandas, or of the `library` ``"polars"``.
 
         Raises

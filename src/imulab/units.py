@@ -10,6 +10,7 @@ Source: SI brochure, 9th edition; standard gravity: 3rd CGPM (1901), 9.80665 m/s
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, overload
 
@@ -120,13 +121,15 @@ _SPELLINGS = {
 _ELECTRIC = {"V": ("V", 1.0), "mV": ("V", 1e-3), "A": ("A", 1.0), "mA": ("A", 1e-3)}
 
 
-def parse_unit(text: str) -> Unit:
+def parse_unit(text: str, quantities: Iterable[str] = ()) -> Unit:
     """Return the unit that a symbol stands for.
 
     Parameters
     ----------
     text
         Symbol, e.g. ``"m/s^2"``, ``"mg"``, ``"deg/h"``, ``"count"``.
+    quantities
+        What it is expected to measure: a message lists these units alone; any that is known is returned.
 
     Raises
     ------
@@ -136,7 +139,9 @@ def parse_unit(text: str) -> Unit:
     symbol = text.strip()
     unit = _UNITS.get(_SPELLINGS.get(symbol, symbol))
     if unit is None:
-        raise UnitError(f"unknown unit {text!r}; known units: {listed(_UNITS, symbol)}")
+        wanted = set(quantities)
+        known = [other.symbol for other in _UNITS.values() if not wanted or other.quantity in wanted]
+        raise UnitError(f"unknown unit {text!r}; known units: {listed(known, symbol)}")
     return unit
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import allan
 from imulab.estimation.sampling import sampling_rate
-from imulab.frames import is_frame
+from imulab.frames import is_frame, unmasked
 from imulab.procedures.inputs import Data, Part, Window, as_recording
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording, check_finite
@@ -126,7 +126,7 @@ def allan_deviation(
         for name, value in {**reading, "column": column, "window": window}.items():
             if value is not None:
                 raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
-        return _curve(allan.allan_deviation(np.asarray(data, dtype=np.float64), rate, taus))
+        return _curve(allan.allan_deviation(unmasked(data).astype(np.float64), rate, taus))
     given: dict[str, Any] = {**reading, "rate": rate, "window": window}
     recording = as_recording(data, given, allan_deviation)
     names = [name for name in recording.columns if name != "time"]

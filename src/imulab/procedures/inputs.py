@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import check, described
 from imulab.errors import DataError, OptionError, listed
-from imulab.frames import Frame, columns_of_arrays, is_frame
+from imulab.frames import Frame, columns_of_arrays, is_frame, unmasked
 from imulab.procedures.result import Result
 from imulab.readers import Layout, read, read_blocks
 from imulab.readers.selection import Selection
@@ -187,10 +187,10 @@ def _array(data: object, called: str, name: str) -> NDArray[Any]:
     """Return samples without a name as an array of numbers."""
     if isinstance(data, np.ndarray | list | tuple) or hasattr(data, "__array__"):
         try:
-            found = np.asarray(data)
+            found = unmasked(data)
         except ValueError:
             found = np.empty(0, dtype=object)
-        if found.dtype.kind in "iufb" and found.ndim > 1:
+        if found.dtype.kind in "iufbO" and found.ndim > 1:
             return found
         shape = f"an array of shape {found.shape}" if found.dtype.kind in "iufb" else "a list of something else"
         raise DataError(f"{called}: {name}: expected an array of numbers, a row for each sample, found {shape}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 from imulab.arguments import checked
 from imulab.records.calibration import Calibration
@@ -12,6 +12,9 @@ from imulab.shown import Shown
 
 if TYPE_CHECKING:
     from typing import Unpack
+
+    import pandas
+    import polars
 
     from imulab.procedures.inputs import Data, Reading
     from imulab.recording import Array, Recording
@@ -48,10 +51,14 @@ class Result:
         """Return the report's figures, or one of them; see `Calibration.plot`."""
         return self.calibration.plot(name)
 
+    @overload
+    def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
+    @overload
+    def to_frame(self, library: Literal["polars"]) -> polars.DataFrame: ...
     @checked
-    def to_frame(self, library: str | None = None) -> Any:
+    def to_frame(self, library: str | None = None) -> pandas.DataFrame | polars.DataFrame:
         """Return the parameters as a data frame; see `Calibration.to_frame`."""
-        return self.calibration.to_frame(library)
+        return self.calibration.to_frame(library)  # type: ignore[arg-type]
 
     def cov(self, *names: str) -> Array:
         """Return the covariance; see `Calibration.cov`."""

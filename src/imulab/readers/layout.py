@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.columns import check_unit
+from imulab.columns import check_unit, expected_quantities
 from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.quantity_entries import check_keys, number_of, scale_factor_of, unit_of, value_and_unit
 from imulab.recording import Array
@@ -261,7 +261,7 @@ def _column(name: str, entry: Any, path: str, *, counted: bool) -> LayoutColumn:
             raise ReadError(f"{place}: {converts[0]}: expected none for dates, whose seconds are counted")
         return LayoutColumn(origin, "s", date=True)
     try:
-        unit = parse_unit(str(entry["unit"]))
+        unit = parse_unit(str(entry["unit"]), expected_quantities(name) or ())
     except UnitError as error:
         raise UnitError(f"{place}: {error}") from None
     zero = _zero(entry.get("zero"), unit, f"{place}: zero")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,9 @@ from imulab.verdict import UNJUDGED, Verdict, verdict_of
 
 if TYPE_CHECKING:
     from typing import Unpack
+
+    import pandas
+    import polars
 
     from imulab.procedures.inputs import Data, Reading
     from imulab.recording import Recording
@@ -259,8 +262,12 @@ class Calibration:
 
         return front.plots(self, name)
 
+    @overload
+    def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
+    @overload
+    def to_frame(self, library: Literal["polars"]) -> polars.DataFrame: ...
     @checked
-    def to_frame(self, library: str | None = None) -> Any:
+    def to_frame(self, library: str | None = None) -> pandas.DataFrame | polars.DataFrame:
         """Return the parameters in SI as a data frame of pandas, or of the `library` ``"polars"``.
 
         Raises

@@ -304,7 +304,7 @@ def _timed(recording: Recording, called: str) -> Recording:
 
 def _has_time(data: object) -> bool:
     """Return whether data bring a time of their own, beside which a rate is the nominal one."""
-    columns = data if isinstance(data, Mapping) else getattr(data, "columns", ())
+    columns = data if isinstance(data, Mapping) else getattr(data, "columns", ()) if hasattr(data, "__len__") else ()
     return isinstance(data, str | PathLike) or any(str(name).partition("[")[0].strip() == "time" for name in columns)
 
 
