@@ -110,6 +110,24 @@ def test_a_field_in_every_row_needs_no_note(tmp_path):
     assert recording.notes == ()
 
 
+def test_a_magnetometer_whose_clock_is_wrong_does_not_cost_the_rest(tmp_path):
+    clock, _ = clocks()
+    values = vectors(400, 6, 4e-5)
+    back = clock.copy()
+    back[100:110] -= 10_000_000_000
+
+    def at(stamps, topic="/imu/mag"):
+        for i, (stamp, logged) in enumerate(zip(stamps.tolist(), clock.tolist(), strict=True)):
+            yield topic, FIELD, logged, lambda t, k, i=i, s=stamp: bags.magnetic_field(t, k, s, values[i])
+
+    for number, (stamps, kept) in enumerate(((back, 390), (np.zeros(400, dtype=np.int64), 0))):
+        path = bags.write(tmp_path, "mcap", merged(imus(clock), at(stamps)), name=f"rec{number}")
+        recording = il.read(path)
+        assert len(recording) == 400
+        assert np.isfinite(recording.column("mag_x")).sum() == kept
+        assert f"{kept} of its 400 samples" in recording.notes[-1]
+
+
 def test_a_field_that_is_not_reported_is_nan(tmp_path):
     clock, _ = clocks()
     messages = merged(imus(clock), fields(clock, vectors(400, 6, 4e-5), first_covariance=-1.0))

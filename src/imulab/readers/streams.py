@@ -136,6 +136,9 @@ def on_one_clock(
     for piece in _with_end(pieces):
         if piece is not None:
             if piece.stream and piece.ticks.size and piece.ticks[-1] < done:
+                if streams[piece.stream].placed:
+                    buffers[piece.stream].total += len(piece.ticks)
+                    continue
                 _refuse_late(buffers[piece.stream], clock, name)
             buffers[piece.stream].add(piece)
             if piece.stream or clock.count < _ROWS:
@@ -235,7 +238,6 @@ def _block(
     notes = []
     for buffer in buffers:
         if buffer.stream.placed:
-            _check_rising(buffer, origin, per_second, name)
             values = _placed(buffer, clock.step, *rows)
         elif buffer is not clock:
             values, moved = _interpolated(buffer, ticks, origin, per_second, name)
@@ -292,8 +294,12 @@ def _placements(clock: _Buffer, others: list[_Buffer], rows: int, per_second: in
 def _placed(buffer: _Buffer, step: float, ticks: Ticks, following: int | None) -> Array:
     """Values of a stream in the rows nearest in time to each sample, shape (n, columns), NaN in the other rows.
 
-    Samples further than a step of the clock from any row have none, and of several in one row the nearest stays.
+    Samples further than a step of the clock from any row have none, nor have those whose time runs backwards; of
+    several in one row the nearest stays.
     """
+    rising = buffer.ticks == np.maximum.accumulate(buffer.ticks)
+    buffer.ticks, buffer.values = buffer.ticks[rising], buffer.values[rising]
+    buffer.count = len(buffer.ticks)
     middles = ticks[:-1] + np.diff(ticks) // 2
     end = buffer.count
     if following is not None:
