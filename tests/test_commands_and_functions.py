@@ -50,6 +50,7 @@ FUNCTIONS = {
     "thermal fit": il.fit_thermal,
     "rate simulate": il.simulate_rate,
     "rate fit": il.fit_rate,
+    "rate turn": il.fit_turns,
     "fleet run": il.run_fleet,
     "fleet status": il.fleet_status,
     "fleet report": il.write_fleet_report,

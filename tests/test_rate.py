@@ -263,7 +263,7 @@ REFUSED = {
     "no order": (lambda: il.fit_rate(recording(), order=6), "order '6': expected one of"),
     "an axis": (lambda: il.fit_rate(recording(), axis="up"), "axis 'up': expected one of"),
     "rates of a test": (lambda: il.fit_rate(whole(), rates="0,1"), "the manifest says the rates"),
-    "no gyroscope": (lambda: il.fit_rate(np.zeros((200, 3)), rate=50, unit="g"), "no column gyro_"),
+    "no gyroscope": (lambda: il.fit_rate({"accel": np.zeros((200, 3))}, rate=50, unit="g"), "no column gyro_"),
 }
 
 

@@ -59,6 +59,8 @@ if TYPE_CHECKING:
     from imulab.procedures.rate.fit import RateFit as RateFit
     from imulab.procedures.rate.fit import fit_rate as fit_rate
     from imulab.procedures.rate.simulate import simulate_rate as simulate_rate
+    from imulab.procedures.rate.turns import TurnsFit as TurnsFit
+    from imulab.procedures.rate.turns import fit_turns as fit_turns
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
     from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
@@ -108,6 +110,8 @@ _HOME = {
     "Recording": "recording",
     "MagFit": "procedures.tumble.mag.fit",
     "RateFit": "procedures.rate.fit",
+    "TurnsFit": "procedures.rate.turns",
+    "fit_turns": "procedures.rate.turns",
     "ThermalFit": "procedures.thermal.fit",
     "TumbleFit": "procedures.tumble.fit",
     "WarmupFit": "procedures.warmup.fit",

@@ -32,7 +32,7 @@ _GROUPS = {
     "warmup": "Tabulate and subtract the bias after power-on.",
     "noise": "Model the noise of sensors at rest, for filters.",
     "thermal": "Calibrate an accelerometer triad over temperature.",
-    "rate": "Calibrate gyroscopes on a rate table.",
+    "rate": "Calibrate gyroscopes by a rate table or by turns.",
     "fleet": "Calibrate many units, and watch the line.",
 }
 _SINGLE = ("convert", "export", "allan", "live", "open")
@@ -73,6 +73,7 @@ _SUMMARIES = {
     "thermal fit": "Fit one model to recordings at several temperatures.",
     "rate simulate": "Simulate a unit on a rate table.",
     "rate fit": "Calibrate gyroscopes from steps of rate.",
+    "rate turn": "Find scale factors from whole turns by hand.",
     "fleet run": "Calibrate every unit of a manifest that has no record.",
     "fleet status": "Say what is done, failed and missing.",
     "fleet report": "Draw the statistics of the line.",

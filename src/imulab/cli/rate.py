@@ -1,4 +1,4 @@
-"""``imulab rate``: simulate and fit."""
+"""``imulab rate``: simulate, fit and turn."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import with_options
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs
-from imulab.procedures.rate.choices import RATES
+from imulab.cli.fit_options import READ, reading, with_options
+from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, read_recording
+from imulab.procedures.rate.choices import FENCE, RATES
 from imulab.procedures.rate.task import OPTIONS
 
 
@@ -17,6 +17,7 @@ def commands(settings: dict[str, Any]) -> typer.Typer:
     group = typer.Typer(**settings)
     group.command("simulate")(simulate)
     group.command("fit")(fit)
+    group.command("turn")(turn)
     return group
 
 
@@ -62,3 +63,27 @@ def fit(
 
     check_outputs([output, report], [file, *([options["layout"]] if options["layout"] else [])])
     finish(run_task("rate", [file], options, GivenFiles()), output, report, json=json)
+
+
+@with_options(READ)
+def turn(
+    file: Annotated[str, typer.Argument(metavar="FILE", help="Recording of whole turns, with a rest around each.")],
+    options: dict[str, str | None],
+    fence: Annotated[str, typer.Option(help="Uncertainty of the difference of two stops, deg.")] = FENCE,
+    turns: Annotated[
+        str | None, typer.Option(metavar="N,N,...", help="Number of turns of each, such as 1,5,-6; else counted.")
+    ] = None,
+    clock: Annotated[
+        str | None, typer.Option(metavar="FRACTION", help="Uncertainty of the sample rate, such as 50ppm.")
+    ] = None,
+    output: OutputFile = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> None:
+    """Find the scale factors of gyroscopes from whole turns by hand against a fence, no equipment needed."""
+    from imulab.cli.result import finish
+    from imulab.procedures.rate.turns import fit_turns
+
+    check_outputs([output, report], [file, *([options["layout"]] if options["layout"] else [])])
+    recording = read_recording(file, **reading(options))
+    finish(call(fit_turns, recording, fence=fence, turns=turns, clock=clock).calibration, output, report, json=json)

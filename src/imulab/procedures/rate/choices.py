@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from imulab.errors import OptionError
+from imulab.recording import Array
 from imulab.units import to_si
 
 AXES = "xyz"
 MOUNTINGS = tuple(sign + axis for axis in AXES for sign in "+-")
 ORDERS = ("1", "2", "3", "4", "5")
 RATES = "0,10,50,100,200,300"
+FENCE = "0.5 deg"
 EARTH = 7.292115e-5
 """Rate of the Earth, rad/s (WGS 84)."""
 
@@ -28,3 +32,8 @@ def rates_of(text: str, option: str) -> tuple[float, ...]:
     if len(set(found)) < 2 or not all(abs(rate) < 1e6 for rate in found):
         raise OptionError(f"{option} {text!r}: expected rates of the table, deg/s, such as 0,10,100,-10,-100")
     return found
+
+
+def gyros_of(samples: Array) -> Mapping[str, Array]:
+    """Return an array without names as a triad of gyroscopes, or the one about z."""
+    return {"gyro": samples} if samples.shape[1] == 3 else {"gyro_z": samples[:, 0]}

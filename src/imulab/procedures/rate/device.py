@@ -11,7 +11,7 @@ from imulab.device.tables import DeviceTable, Field, nonzero, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.procedures.rate.choices import AXES
-from imulab.procedures.rate.sections import rate_of
+from imulab.procedures.rate.sections import model_of
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
@@ -25,7 +25,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     RecordError
         The record lacks a parameter, or holds powers of the rate, which the C core does not.
     """
-    model = rate_of(record).model
+    model = model_of(record)
     if model.gyro_order != 1:
         raise RecordError(
             f"the record describes gyroscopes of order {model.gyro_order}, which the C core does not hold yet; "
@@ -38,7 +38,9 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
         i = AXES.index(axis)
         scale[i], bias[i] = record.value(f"gyro_scale_factor_{axis}"), record.value(f"gyro_bias_{axis}")
         for other in model.axes.replace(axis, ""):
-            misalignment[i, AXES.index(other)] = record.value(f"gyro_misalignment_{axis}{other}")
+            name = f"gyro_misalignment_{axis}{other}"
+            if name in record.parameters or model.from_ != "turns":  # turns by hand do not show it
+                misalignment[i, AXES.index(other)] = record.value(name)
     fields = (
         Field("has_sensitivity", whole(False)),
         Field("gain", 1.0 / nonzero(scale)),

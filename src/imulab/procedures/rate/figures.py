@@ -8,6 +8,7 @@ import numpy as np
 
 from imulab.procedures.rate.engineering import rows as engineering_rows
 from imulab.procedures.rate.sections import Rate, Seen, rate_of
+from imulab.procedures.rate.turnrecord import turns_exhibits
 from imulab.records.calibration import Calibration
 from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
 from imulab.report.traces import axis, rounded, scatter
@@ -19,6 +20,8 @@ _LOOKS = (("rising", "triangle-up", "#c8553d"), ("falling", "triangle-down", GOO
 
 def exhibits(record: Calibration) -> Exhibits:
     """Return the figures and tables of a record."""
+    if record.model.get("from") == "turns":
+        return turns_exhibits(record)
     found = rate_of(record)
     axes = found.model.axes
     largest = from_si(found.model.largest_rate.value, "deg/s")

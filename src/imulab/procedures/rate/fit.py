@@ -12,7 +12,7 @@ import numpy as np
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
 from imulab.procedures.inputs import Data, Reading, as_recording
-from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, rates_of
+from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, gyros_of, rates_of
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
 from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
@@ -122,7 +122,7 @@ def fit_rate(
     else:
         if axis not in MOUNTINGS:
             raise OptionError(f"axis {axis!r}: expected one of {listed(MOUNTINGS, axis)}")
-        recordings = [as_recording(data, reading, fit_rate)]
+        recordings = [as_recording(data, reading, fit_rate, gyros_of)]
         given = rates_of(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
         test = RateTest((Run(recordings[0].name, axis, given),), name=recordings[0].name)
     if place is not None:

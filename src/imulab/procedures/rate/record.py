@@ -52,6 +52,7 @@ def make_record(
         "gyro_order": order,
         "gyro_output_unit": unit,
         "axes": "".join(linearity),
+        "from": "steps",
         "frame": "the faces on which the unit was mounted",
         "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
     }

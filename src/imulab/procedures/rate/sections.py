@@ -11,6 +11,7 @@ from imulab.records.sections import Part, Quantity, Size, part
 
 T = TypeVar("T")
 PerDwell = Annotated[list[T], "dwells"]
+PerTurn = Annotated[list[T], "turns"]
 
 
 class Model(Part):
@@ -19,7 +20,14 @@ class Model(Part):
     gyro_order: int
     gyro_output_unit: str
     axes: str
+    from_: str
     largest_rate: Quantity
+
+
+class OfModel(Part):
+    """The part of a record that one of steps and one of turns share."""
+
+    model: Model
 
 
 class OfAxis(Part):
@@ -62,6 +70,40 @@ class Data(Part):
     dwells: Seen
 
 
+class TurnsFit(Part):
+    """``fit`` of turns."""
+
+    turns: int
+    fence: Quantity
+    clock: Size | None
+
+
+class Turned(Part):
+    """``data.turns``; angles in rad."""
+
+    axis: PerTurn[str]
+    start: PerTurn[float]
+    stop: PerTurn[float]
+    count: PerTurn[float]
+    angle: PerTurn[float]
+    residual: PerTurn[float]
+    standard_uncertainty: PerTurn[float]
+
+
+class TurnsData(Part):
+    """``data`` of turns."""
+
+    turns: Turned
+
+
+class Turns(Part):
+    """A record of turns."""
+
+    model: Model
+    fit: TurnsFit
+    data: TurnsData
+
+
 class Rate(Part):
     """A rate record."""
 
@@ -72,11 +114,25 @@ class Rate(Part):
 
 def check(record: Calibration) -> None:
     """Check the sections of a record as it is read from its file; raises RecordError."""
-    axes = part(record, Rate).model.axes
+    if record.model.get("from") == "turns":
+        part(record, Turns)
+    else:
+        part(record, Rate)
+    axes = model_of(record).axes
     if not axes or any(axis not in AXES for axis in axes) or len(set(axes)) < len(axes):
         raise RecordError(f"model.axes: expected axes such as xyz, found {axes!r}")
+
+
+def model_of(record: Calibration) -> Model:
+    """Return the model of a record of steps or of turns; errors as for `rate_of`."""
+    return part(record, OfModel).model
 
 
 def rate_of(record: Calibration) -> Rate:
     """Return the sections of a record; a part that is wrong raises RecordError, one that is missing when it is read."""
     return part(record, Rate)
+
+
+def turns_of(record: Calibration) -> Turns:
+    """Return the sections of a record of turns; errors as for `rate_of`."""
+    return part(record, Turns)

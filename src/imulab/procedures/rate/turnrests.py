@@ -1,0 +1,152 @@
+"""Rests of a recording of turns by hand, and how far the unit turned between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import DataError, SegmentError
+from imulab.procedures.rate.choices import AXES
+from imulab.recording import Array, Recording, check_finite, check_time
+from imulab.units import parse_unit, to_si
+
+_BLOCK = 0.1  # s
+_LEAST, _TRIM = 6, 1
+_STILL, _OF_LARGEST = 5.0, 0.02
+_TURNED = np.radians(15)
+
+
+@dataclass(frozen=True)
+class Motions:
+    """What happened between rests, m of them.
+
+    Attributes
+    ----------
+    start, stop
+        End of the rest before and start of the rest after, s, shape (m,).
+    angle
+        Net turn by the gyroscopes as they state it, whole turns included, about each body axis, rad, shape (m, 3).
+    closing
+        Rotation vector from the attitude before to that after, rad, shape (m, 3).
+    zero
+        Standard uncertainty of the angle by that of the zero between both rests, rad, shape (m, 3).
+    before, after
+        Mean specific force at the rests, m/s^2, shape (m, 3); None without accelerometers.
+    steps
+        Turns of each sample of a motion, rad, one array of shape (n, 3) each.
+    bias
+        Mean output at rest, rad/s, shape (3,), and its standard uncertainty.
+    """
+
+    start: Array
+    stop: Array
+    angle: Array
+    closing: Array
+    zero: Array
+    before: Array | None
+    after: Array | None
+    steps: tuple[Array, ...]
+    bias: Array
+    bias_uncertainty: Array
+
+
+def find_motions(recording: Recording) -> Motions:
+    """Find rests, and what the gyroscopes say of the motion between each two.
+
+    Raises
+    ------
+    SegmentError
+        There are fewer than two rests.
+    DataError
+        The gyroscopes are not in a unit of rate.
+    """
+    names = [f"gyro_{axis}" for axis in AXES]
+    check_finite(recording, [name for name in names if name in recording])
+    time = check_time(recording)
+    unit = recording.triad_unit("gyro")
+    if parse_unit(unit).quantity != "rate":
+        raise DataError(f"{recording.name}: gyroscopes in {unit}; turns are counted in a unit of rate, such as deg/s")
+    rate = to_si(recording.triad("gyro"), unit)
+    force = to_si(recording.triad("accel"), recording.triad_unit("accel")) if "accel_x" in recording else None
+    rests = _rests(time, rate)
+    if len(rests) < 2:
+        raise SegmentError(
+            f"{recording.name}: {len(rests)} rests of 0.5 s found, expected one before and one after each turn: lay "
+            "the unit against its fence, and wait 2 s"
+        )
+    zero = np.array([rate[a:b].mean(axis=0) for a, b in rests])
+    spread = np.array([_of_mean(rate[a:b]) for a, b in rests])
+    middle = np.array([(time[a] + time[b - 1]) / 2 for a, b in rests])
+    rows = []
+    for k in range(len(rests) - 1):
+        a, b = rests[k][1] - 1, rests[k + 1][0]
+        share = ((time[a : b + 1] - middle[k]) / (middle[k + 1] - middle[k]))[:, None]
+        free = rate[a : b + 1] - zero[k] * (1 - share) - zero[k + 1] * share
+        steps = (free[1:] + free[:-1]) / 2 * np.diff(time[a : b + 1])[:, None]
+        duration = float(time[b] - time[a])
+        rows.append((time[a], time[b], steps, duration / 2 * np.sqrt(spread[k] ** 2 + spread[k + 1] ** 2)))
+    means = None if force is None else np.array([force[a:b].mean(axis=0) for a, b in rests])
+    return Motions(
+        start=np.array([row[0] for row in rows]),
+        stop=np.array([row[1] for row in rows]),
+        angle=np.array([row[2].sum(axis=0) for row in rows]),
+        closing=np.array([rotation_vector(composed(row[2])) for row in rows]),
+        zero=np.array([row[3] for row in rows]),
+        before=None if means is None else means[:-1],
+        after=None if means is None else means[1:],
+        steps=tuple(row[2] for row in rows),
+        bias=zero.mean(axis=0),
+        bias_uncertainty=zero.std(axis=0, ddof=1) / np.sqrt(len(zero)),
+    )
+
+
+def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
+    """Return first sample and end of each stretch in which the gyroscopes are still."""
+    size = max(2, round(_BLOCK / float(np.median(np.diff(time)))))
+    count = len(rate) // size
+    if count < 2 * _LEAST:
+        return []
+    blocks = rate[: count * size].reshape(count, size, 3)
+    means, variance = blocks.mean(axis=1), blocks.var(axis=1).sum(axis=1)
+    quiet = float(np.quantile(variance, 0.1))
+    calm = variance <= _STILL**2 * quiet + 1e-24
+    zero = np.median(means[calm][: 2 * _LEAST], axis=0)
+    off = np.linalg.norm(means - zero, axis=1)
+    still = calm & (off < max(_OF_LARGEST * float(off.max()), 10 * np.sqrt(quiet / size)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
+    return [((a + _TRIM) * size, (b - _TRIM) * size) for a, b in edges.tolist() if b - a >= _LEAST]
+
+
+def _of_mean(rate: Array) -> Array:
+    """Return the standard uncertainty of a mean by those of its four quarters, shape (3,)."""
+    quarter = len(rate) // 4
+    means = rate[: 4 * quarter].reshape(4, quarter, 3).mean(axis=1)
+    return np.asarray(means.std(axis=0, ddof=1) / 2)
+
+
+def composed(steps: Array) -> Array:
+    """Return the quaternion of small turns one after the other, rad, shape (n, 3), by halving their number."""
+    size = np.linalg.norm(steps, axis=1, keepdims=True)
+    found = np.hstack([np.cos(size / 2), steps * np.sinc(size / 2 / np.pi) / 2])
+    while len(found) > 1:
+        if len(found) % 2:
+            found = np.vstack([found, [1.0, 0.0, 0.0, 0.0]])
+        a, b = found[::2], found[1::2]
+        scalar = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(axis=1, keepdims=True)
+        vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
+        found = np.hstack([scalar, vector])
+    return np.asarray(found[0] / np.linalg.norm(found[0]))
+
+
+def rotation_vector(quaternion: Array) -> Array:
+    """Return the shortest rotation vector of a quaternion, rad, shape (3,)."""
+    q = quaternion if quaternion[0] >= 0 else -quaternion
+    size = float(np.linalg.norm(q[1:]))
+    return np.asarray(q[1:] * (2 * np.arctan2(size, q[0]) / max(size, 1e-300)))
+
+
+def carried(quaternion: Array, direction: Array) -> Array:
+    """Return what a fixed direction becomes in body components through a turn of the body, shape (3,)."""
+    w, v = quaternion[0], -quaternion[1:]
+    return np.asarray(direction + 2 * w * np.cross(v, direction) + 2 * np.cross(v, np.cross(v, direction)))

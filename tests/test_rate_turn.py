@@ -1,0 +1,169 @@
+"""Whole turns by hand: a real recording, a simulator apart, the number of turns, and every refusal."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+
+FREQUENCY = 100.0
+BIAS = np.array([0.3, -0.2, 0.5])
+
+
+def turned(counts, scale=1.0, stops=None, axis=2, wobble=0.0, noise=0.02, seed=1, speed=90.0):
+    """Rates of turns with rests between, deg/s; stops are the errors of the stops, deg; wobble tilts the axis, deg."""
+    rng = np.random.default_rng(seed)
+    stops = np.zeros(len(counts) + 1) if stops is None else stops
+    parts = [np.zeros((300, 3))]
+    for k, count in enumerate(counts):
+        angle = 360.0 * count + stops[k + 1] - stops[k]
+        length = round(abs(angle) / speed * FREQUENCY)
+        shape = np.sin(np.pi * (np.arange(length) + 0.5) / length)
+        rate = np.zeros((length, 3))
+        rate[:, axis] = angle * shape / shape.sum() * FREQUENCY
+        if wobble:
+            # the body tips by `wobble` about its first cross axis and back, at a rate that a turning body sees
+            tip = np.radians(wobble) * np.sin(2 * np.pi * np.arange(length) / length)
+            about = np.cumsum(rate[:, axis]) / FREQUENCY * np.pi / 180
+            rate[:, (axis + 1) % 3] = np.gradient(tip) * FREQUENCY * 180 / np.pi
+            rate[:, (axis + 2) % 3] = rate[:, axis] * np.sin(tip)
+            rate[:, axis] *= np.cos(tip)
+            assert about.size == length
+        parts += [rate, np.zeros((300, 3))]
+    out = scale * np.vstack(parts) + BIAS
+    return il.Recording.from_arrays(
+        gyro=out + noise * rng.standard_normal(out.shape), rate=FREQUENCY, units={"gyro": "deg/s"}
+    )
+
+
+IMUCAL = Path(os.environ.get("IMULAB_DATA", "")) / "imucal" / "example_ferraris_session.csv"
+
+
+@pytest.fixture(scope="module")
+def session():
+    if not IMUCAL.is_file():
+        pytest.skip("the recording of imucal is not here (IMULAB_DATA)")
+    return np.loadtxt(IMUCAL, delimiter=",", skiprows=1)
+
+
+def of(session, rate):
+    units = {"gyro": "deg/s", "accel": "m/s^2"}
+    return il.Recording.from_arrays(gyro=session[:, 1:4], accel=session[:, 4:7], rate=rate, units=units)
+
+
+def test_a_real_recording_has_a_turn_about_each_axis(session):
+    """imucal's example: 370.0, 353.7 and 359.3 deg; by gravity alone the scales are 1.025(2), .994(7) and .996(2)."""
+    found = il.fit_turns(of(session, 102.4))
+    angles = [abs(float(np.degrees(found.turns[axis].angle[0]))) for axis in "xyz"]
+    assert angles == pytest.approx([370.0, 353.7, 359.3], abs=0.15)
+    assert [found.turns[axis].scale for axis in "xyz"] == pytest.approx([1.0280, 0.9823, 0.9980], abs=5e-4)
+    for axis, gravity, spread in (("x", 1.025, 0.002), ("y", 0.994, 0.007), ("z", 0.996, 0.002)):
+        own = found.turns[axis]
+        assert own.scale_uncertainty == pytest.approx(1389e-6, rel=0.1)
+        assert abs(own.scale - gravity) < 3 * np.hypot(own.scale_uncertainty, spread)
+
+
+def test_a_sample_rate_twice_too_high_or_low_is_found_and_said(session):
+    with pytest.raises(il.ImulabError, match=r"was (1\.9\d|2\.0\d) times .*is the stated sample rate 2 times too high"):
+        il.fit_turns(of(session, 204.8))
+    with pytest.raises(il.ImulabError, match="is the stated sample rate 2 times too low"):
+        il.fit_turns(of(session, 51.2))
+
+
+@pytest.mark.parametrize(
+    ("counts", "ppm"),
+    [
+        ([1], 1389),
+        ([1, -1], 1203),
+        ([1] * 3 + [-1] * 3, 360),
+        ([1] * 5 + [-1] * 5, 185),
+        ([1] * 10 + [-1] * 10, 71),
+        ([1, -1] * 5, 595),
+        ([3, -3], None),
+    ],
+)
+def test_the_uncertainty_is_that_of_the_stops(counts, ppm):
+    """The slope of stop angle over turns made; the formula is worked out apart, by the stops themselves."""
+    found = il.fit_turns(turned(counts, noise=1e-4), fence="0.5 deg").turns["z"]
+    made = np.concatenate([[0], np.cumsum(counts)])
+    expected = 0.5 / np.sqrt(2) / (360 * np.sqrt(np.sum((made - made.mean()) ** 2)))
+    if len(counts) == 1:
+        expected = 0.5 / 360
+    assert found.scale_uncertainty == pytest.approx(expected, rel=0.01)
+    if ppm is not None:
+        assert 1e6 * expected == pytest.approx(ppm, abs=0.6)
+
+
+def test_intervals_hold_the_scale_factor_as_often_as_they_say():
+    rng = np.random.default_rng(5)
+    counts = [1, -1, 3, -3]
+    scores = []
+    for seed in range(60):
+        stops = 0.5 / np.sqrt(2) * rng.standard_normal(5)
+        found = il.fit_turns(turned(counts, 1.02, stops, seed=seed, speed=360)).turns["z"]
+        scores.append((found.scale - 1.02) / 1.02 / found.scale_uncertainty)
+    # 60 squares scatter by 0.18 about 1
+    assert 0.4 < np.mean(np.square(scores)) < 1.75
+
+
+def test_turns_that_wobble_are_composed():
+    found = il.fit_turns(turned([1, -1], wobble=2.0, noise=1e-4)).turns["z"]
+    assert found.scale == pytest.approx(1.0, abs=300e-6)
+
+
+@pytest.mark.parametrize("scale", [0.95, 1.0, 1.05])
+@pytest.mark.parametrize("counts", [[1, 7, -8], [2, 12, -10], [1, -1, 20], [3, 5, -8]])
+def test_the_number_of_turns_is_counted_by_the_smaller_ones(scale, counts):
+    found = il.fit_turns(turned(counts, scale, speed=720)).turns["z"]
+    assert found.count.tolist() == counts
+    assert found.scale == pytest.approx(scale, rel=1e-3)
+
+
+def test_stated_turns_are_taken():
+    found = il.fit_turns(turned([20, -20], 1.04, speed=720), turns="20,-20").turns["z"]
+    assert found.scale == pytest.approx(1.04, rel=1e-4)
+
+
+def test_the_uncertainty_of_the_clock_is_common_to_all(session):
+    record = il.fit_turns(of(session, 102.4), clock="1%").calibration
+    scale = record.parameters["gyro_scale_factor_x"]
+    assert scale.standard_uncertainty / scale.value == pytest.approx(np.hypot(0.01, 0.5 / 370), rel=0.01)
+    block = record.cov("gyro_scale_factor_x", "gyro_scale_factor_y")
+    assert block[0, 1] == pytest.approx(1e-4 * scale.value * record.value("gyro_scale_factor_y"), rel=1e-6)
+
+
+def test_a_record_of_turns_is_applied_shown_and_reported(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    il.write(turned([1, -1], 1.02), "turns.csv")
+    assert main(["rate", "turn", "turns.csv", "-o", "t.json", "--report", "t.html"], project=False) == 0
+    assert "What is left of each turn" in Path("t.html").read_text(encoding="utf-8")
+    capsys.readouterr()
+    assert main(["show", "t.json"], project=False) == 0
+    assert "gyro_scale_factor_z" in capsys.readouterr().out
+    corrected = il.apply("t.json", "turns.csv")
+    made = np.sum(corrected.column("gyro_z")[:720]) / FREQUENCY
+    assert made == pytest.approx(360, abs=1.0)
+
+
+REFUSED = {
+    "no rest": (lambda: il.fit_turns(np.full((500, 3), 90.0), rate=100, unit="deg/s"), "rests of 0.5 s found"),
+    "not whole": (lambda: il.fit_turns(turned([1.25, -1.25])), "turns; expected a whole number"),
+    "half": (lambda: il.fit_turns(turned([0.5, -0.5])), "half a turn, or a whole one with a stated sample rate"),
+    "too many": (lambda: il.fit_turns(turned([10, -10], 1.05, speed=720)), "begin with one turn, or say how many"),
+    "no turn": (lambda: il.fit_turns(turned([0.2, -0.2])), "no whole turn between two rests"),
+    "numbers": (lambda: il.fit_turns(turned([1]), turns="one"), "turns 'one': expected whole numbers"),
+    "too few": (lambda: il.fit_turns(turned([1, -1]), turns="1"), "1 given, 2 found"),
+    "fence": (lambda: il.fit_turns(turned([1]), fence=0), "fence 0: expected the uncertainty"),
+    "counts": (lambda: il.fit_turns(np.zeros((500, 3)), rate=100, unit="count"), "counted in a unit of rate"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_refused_in_a_line(name):
+    call, said = REFUSED[name]
+    with pytest.raises(il.ImulabError, match=said) as refused:
+        call()
+    assert "\n" not in str(refused.value)
