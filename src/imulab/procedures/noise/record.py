@@ -106,6 +106,9 @@ def _parameters(
         analysis, unit = column.analysis, column.unit
         values, covariance = edge_as_white(analysis.values, analysis.covariance, analysis.limits[0])
         low, high = _intervals(analysis, more, values, covariance)
+        white = analysis.average(lambda each, t=analysis.limits[0]: white_square(each, np.zeros(1), t))  # type: ignore[misc]
+        ends_of_all = [float(np.sqrt(white.quantile(tail)[0, 0])) for tail in _TAILS]
+        low[0], high[0] = min(float(low[0]), ends_of_all[0]), max(float(high[0]), ends_of_all[1])
         if analysis.band.filtered(analysis.interval):  # what its roll-off leaves in the band is not in the model
             covariance, more_of_white = covariance.copy(), analysis.band.roll_off * values[0]
             covariance[0, 0] += analysis.band.roll_off**2
