@@ -22,6 +22,7 @@ PARTS = {
     "gyro_array": "Gyro array and Allan deviation",
     "tumble": "Tumble",
     "runtime": "The C core",
+    "peers": "The same tasks call by call with peers",
     "growth": "Growth",
     "recordings": "Recordings",
     "warmup": "Warm-up",
@@ -30,7 +31,7 @@ PARTS = {
     "centrifuge": "Centrifuge",
 }
 """From the quickest to the slowest."""
-PEERS = ("numpy", "scipy", "polars", "allantools", "filterpy", "imucal", "rosbags", "joblib", "dask")
+PEERS = ("numpy", "scipy", "polars", "allantools", "filterpy", "imucal", "lmfit", "rosbags", "joblib", "dask")
 
 
 def main(chosen: list[str]) -> None:

@@ -131,6 +131,7 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
             "xaxis": {**log, "title": {"text": "averaging time, s"}},
             "yaxis": {**log, "title": {"text": f"Allan deviation, {unit}"}, "automargin": True},
             "legend": LEGEND,
+            "showlegend": len(names) > 1,
         },
         height=430,
     )
