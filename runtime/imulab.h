@@ -52,8 +52,8 @@ enum {
     IL_JUMPED = 8,     /* array: bias jump, being estimated again */
     IL_EXCLUDED = 16,  /* array: not in the fused output in this sample */
     IL_QUIET = 32,     /* array: coming back, watched before it is used */
-    IL_BEYOND = 64,    /* tumble: output that no specific force gives; centrifuge: beyond the levels tested; array: a
-                        * reading held, as at the end of a range */
+    IL_BEYOND = 64,    /* tumble: output that no specific force gives; centrifuge: beyond the levels tested; thermal:
+                        * outside the temperatures measured; array: a reading held, as at the end of a range */
     IL_ALONE = 128     /* array: fewer than three gyros left, nothing to compare with */
 };
 
@@ -117,6 +117,41 @@ unsigned il_mag_apply(const il_mag *settings, const il_real output[3], il_real f
 /* The same for n samples. */
 unsigned il_mag_block(const il_mag *settings, size_t n, const il_real *const output[3], size_t stride,
                       il_real *const field[3], size_t field_stride);
+
+/* ---- accelerometer triad over temperature: M_i = S_i(T) (A_i + b_i(T)), A = T_m(T) f ------------------------------ */
+
+#define IL_THERMAL_LAWS 9
+#define IL_THERMAL_TERMS 8
+
+typedef struct {
+    int32_t pieces;             /* intervals between knots, 1 for polynomials over the whole range */
+    int32_t terms;              /* coefficients of each law in each piece, 1 to IL_THERMAL_TERMS */
+    const il_real *knot;        /* [pieces + 1], ascending, degC; the first and last are the range that was measured */
+    const il_real *coefficient; /* [piece][law][term], of powers of theta, which is -1 to 1 over a piece; the laws are
+                                 * b of x, y, z, m/s^2; S of x, y, z, output per m/s^2; m_yx, m_zx, m_zy, rad */
+} il_thermal;
+
+typedef struct {
+    int32_t known;       /* 0: no temperature yet */
+    unsigned flags;      /* of that temperature */
+    il_real temperature; /* the last one, degC */
+    il_tumble at;        /* the triad there */
+} il_thermal_state;
+
+/* The triad at one temperature, degC: IL_BEYOND outside the range, where the laws hold their values at its ends;
+ * IL_NOT_FINITE, and nothing but not a number, for a temperature that is none. */
+unsigned il_thermal_at(const il_thermal *settings, il_real temperature, il_tumble *at);
+
+/* Clear the state for the first sample. */
+void il_thermal_start(il_thermal_state *state);
+
+/* Outputs at a temperature [degC] to specific force [m/s^2]; force may be output. */
+unsigned il_thermal_apply(const il_thermal *settings, il_thermal_state *state, il_real temperature,
+                          const il_real output[3], il_real force[3]);
+
+/* The same for n samples; temperatures are `stride` apart as the outputs are. Returns the flags of all samples or-ed. */
+unsigned il_thermal_block(const il_thermal *settings, size_t n, const il_real *temperature,
+                          const il_real *const output[3], size_t stride, il_real *const force[3], size_t force_stride);
 
 /* ---- flexible gyroscope: drift K(a) (ax cos theta + ay sin theta), K(a) = K0 (1 + c1 a + c2 a^2) ------------------ */
 
@@ -265,7 +300,8 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
 
 /* ---- all that one unit has, from a table ("blob") ----------------------------------------------------------------- */
 
-enum { IL_HAS_TUMBLE = 1, IL_HAS_GYRO = 2, IL_HAS_CENTRIFUGE = 4, IL_HAS_WARMUP = 8, IL_HAS_ARRAY = 16, IL_HAS_MAG = 32 };
+enum { IL_HAS_TUMBLE = 1, IL_HAS_GYRO = 2, IL_HAS_CENTRIFUGE = 4, IL_HAS_WARMUP = 8, IL_HAS_ARRAY = 16, IL_HAS_MAG = 32,
+       IL_HAS_THERMAL = 64 };
 
 typedef struct {
     uint32_t has; /* IL_HAS_TUMBLE ... or-ed */
@@ -275,6 +311,7 @@ typedef struct {
     il_warmup warmup;
     il_array array;
     il_mag mag;
+    il_thermal thermal;
 } il_unit;
 
 /* Check a table and unpack it; arrays go to the caller's memory, which must outlive the unit; the bytes need not. On

@@ -34,6 +34,7 @@ enum { IS_FLOAT = sizeof(il_real) == sizeof(float) };
 il_real random_real(void);
 
 void test_triads(void);
+void test_thermal(void);
 void test_warmup(void);
 void test_array(void);
 void test_robust(void);

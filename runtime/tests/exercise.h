@@ -20,6 +20,11 @@ static inline void exercise(const il_unit *unit) {
         if (unit->has & IL_HAS_TUMBLE) (void)il_tumble_apply(&unit->tumble, in, out);
         if (unit->has & IL_HAS_GYRO) (void)il_gyro_apply(&unit->gyro, in, odd, out);
         if (unit->has & IL_HAS_MAG) (void)il_mag_apply(&unit->mag, in, out);
+        if (unit->has & IL_HAS_THERMAL) {
+            il_thermal_state state;
+            il_thermal_start(&state);
+            (void)il_thermal_apply(&unit->thermal, &state, odd[k], in, out);
+        }
         if (unit->has & IL_HAS_CENTRIFUGE) (void)il_centrifuge_apply(&unit->centrifuge, in, rate);
         if ((unit->has & IL_HAS_WARMUP) && unit->warmup.axes <= EXERCISE_AXES) {
             static il_real columns[EXERCISE_AXES][8];

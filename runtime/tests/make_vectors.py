@@ -498,7 +498,11 @@ def make_blobs(w):
     made = [blob(w), blob(w, text), blob(w, text, tumble_of[1], gyro_of[1], drift, warm[3], sensors[4])]
     field = [section(6, words(1), counted(w, 15, 3)), section(6, words(2), counted(w, 18, 3))]
     crossed = section(1, words(256 + 2), counted(w, 15, 2), counted(w, 6, 50))  # with cross terms
-    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field)]
+    laws = [
+        section(7, words(pieces, terms), counted(w, pieces + 1, -20), counted(w, 9 * pieces * terms, 30))
+        for pieces, terms in ((1, 4), (3, 2))
+    ]
+    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field, *laws)]
 
 
 def blobs():
@@ -511,7 +515,7 @@ def blobs():
         LINES.append(f"static const size_t v_blob{w}_size[] = {{{', '.join(str(len(b)) for b in made)}}};")
     LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
     LINES.append(
-        "enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16, V_BLOB_MAG = 23 };"
+        "enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16, V_BLOB_MAG = 23, V_BLOB_THERMAL = 25 };"
     )
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)

@@ -25,6 +25,7 @@ il_real random_real(void) {
 
 int main(void) {
     test_triads();
+    test_thermal();
     test_warmup();
     test_array();
     test_robust();

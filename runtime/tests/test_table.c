@@ -46,7 +46,7 @@ static void crc_is_that_of_ieee_802_3(void) {
 }
 
 static void whole_tables_load(void) {
-    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32};
+    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32, 64, 64};
     for (int b = 0; b < V_BLOBS; b++) {
         uint32_t found = 99;
         CHECK(load_exactly(v_blob4[b], v_blob4_size[b], &found) == IL_OK && found == has[b]);
@@ -103,6 +103,13 @@ static void contents_arrive(void) {
             counted(&unit.mag.turn[0][0], 9, REAL(3), 6);
             if (order > 1) counted(unit.mag.quadratic, 3, REAL(3), 15);
             else CHECK(unit.mag.quadratic[2] == REAL(0));
+        }
+        for (int k = 0; k < 2; k++) {
+            const int b = V_BLOB_THERMAL + k;
+            CHECK(il_table_load(&unit, blobs[b], sizes[b], memory, LENGTH(memory)) == IL_OK);
+            CHECK(unit.thermal.pieces == (k ? 3 : 1) && unit.thermal.terms == (k ? 2 : 4));
+            counted(unit.thermal.knot, unit.thermal.pieces + 1, REAL(-20), 0);
+            counted(unit.thermal.coefficient, 9 * unit.thermal.pieces * unit.thermal.terms, REAL(30), 0);
         }
         CHECK(il_table_load(&unit, blobs[V_BLOB_DRIFT], sizes[V_BLOB_DRIFT], NULL, 0) == IL_OK);
         CHECK(unit.centrifuge.has[0] == 1 && unit.centrifuge.has[1] == 0 && unit.centrifuge.highest == REAL(2));
@@ -226,7 +233,7 @@ static void contents_that_cannot_be_are_refused(void) {
     EXPECT(0, 2, 0x00020001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00000001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00080001u, IS_FLOAT ? IL_TABLE_WIDTH : IL_OK); /* no numbers in it */
-    EXPECT(V_BLOB_TUMBLE, KIND, 7, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_TUMBLE, KIND, 8, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, KIND, 0xFFFFFFFFu, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, LENGTH_WORD, 0xFFFFFFFFu, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_TUMBLE, LENGTH_WORD, 3, IL_TABLE_CONTENT);
@@ -246,6 +253,17 @@ static void contents_that_cannot_be_are_refused(void) {
     EXPECT(V_BLOB_MAG, BODY, 3, IL_TABLE_CONTENT); /* order */
     EXPECT(V_BLOB_MAG, BODY, 0, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_MAG + 1, BODY + 18, nan_bits, IL_TABLE_NOT_FINITE);
+    for (int b = V_BLOB_THERMAL; b < V_BLOBS; b++) {
+        EXPECT(b, BODY, 0, IL_TABLE_CONTENT); /* pieces */
+        EXPECT(b, BODY, 2, IL_TABLE_CONTENT);
+        EXPECT(b, BODY, 65536, IL_TABLE_CONTENT);
+        EXPECT(b, BODY, 65537, IL_TABLE_CONTENT);
+        EXPECT(b, BODY + 1, 0, IL_TABLE_CONTENT); /* terms */
+        EXPECT(b, BODY + 1, IL_THERMAL_TERMS + 1, IL_TABLE_CONTENT);
+        EXPECT(b, BODY + 2, 0x42480000u, IL_TABLE_CONTENT); /* 50 before -19.875 */
+        EXPECT(b, BODY + 3, nan_bits, IL_TABLE_NOT_FINITE);
+        EXPECT(b, BODY + 12, inf_bits, IL_TABLE_NOT_FINITE);
+    }
     EXPECT(V_BLOB_DRIFT, BODY, 2, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_DRIFT, BODY + 1, 2, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_DRIFT, BODY + 2, zero, IL_TABLE_CONTENT); /* highest level */

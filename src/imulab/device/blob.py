@@ -35,6 +35,12 @@ class _Triad(Part):
     output_unit: str
 
 
+class _Thermal(Part):
+    output_unit: str
+    temperature: str
+    range: Annotated[list[float], 2]
+
+
 class _Centrifuge(Part):
     axes: list[str]
     highest: Size
@@ -58,6 +64,7 @@ _COLUMNS: dict[str, type[Part]] = {
     "tumble": _Triad,
     "gyro": _Triad,
     "mag": _Triad,
+    "thermal": _Thermal,
     "centrifuge": _Centrifuge,
     "warmup": _Warmup,
     "array": _Array,

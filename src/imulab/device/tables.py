@@ -22,7 +22,7 @@ from imulab.records.calibration import BLOB_MAGIC, Calibration
 
 VERSION = 1
 TEXT = 0
-KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6}
+KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7}
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,12 @@ class DeviceUnit:
         field = [np.empty(len(output[0])) for _ in range(3)]
         return field, _runtime.mag(self._unit, _columns(output), tuple(field))
 
+    def thermal(self, temperature: Array, output: Sequence[Array]) -> tuple[list[Array], int]:
+        """Return the specific force, m/s^2, of outputs at temperatures, degC, (n,) each, and the flags met."""
+        force = [np.empty(len(output[0])) for _ in range(3)]
+        (at,) = _columns([temperature])
+        return force, _runtime.thermal(self._unit, at, _columns(output), tuple(force))
+
     def centrifuge(self, force: Sequence[Array], rate: Sequence[Array | None]) -> tuple[list[Array | None], int]:
         """Return the rates of the x and y input axes, rad/s, less their drift under the level specific force, m/s^2."""
         out = [None if column is None else np.array(column, dtype=np.float64) for column in rate]

@@ -51,6 +51,18 @@ static void run_mag(void) {
 }
 #endif
 
+#if UNIT_HAS_THERMAL
+static void run_thermal(void) {
+    il_thermal_state state;
+    il_thermal_start(&state);
+    for (int k = 0; k < GOLDEN_THERMAL; k++) {
+        il_real force[3];
+        (void)il_thermal_apply(&unit_thermal, &state, golden_thermal_temperature[k], golden_thermal_output[k], force);
+        for (int i = 0; i < 3; i++) compare(force[i], golden_thermal_force[k][i], golden_thermal_scale);
+    }
+}
+#endif
+
 #if UNIT_HAS_CENTRIFUGE
 static void run_centrifuge(void) {
     for (int k = 0; k < GOLDEN_CENTRIFUGE; k++) {
@@ -114,6 +126,9 @@ int main(void) {
 #endif
 #if UNIT_HAS_MAG
     run_mag();
+#endif
+#if UNIT_HAS_THERMAL
+    run_thermal();
 #endif
 #if UNIT_HAS_CENTRIFUGE
     run_centrifuge();

@@ -35,4 +35,4 @@ def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
 
 def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
     """Return whether a coefficient means the same in both records: powers of T - T0 with the same T0 and degree."""
-    return all(first.model[key] == second.model[key] for key in ("reference", "degrees", "output_unit"))
+    return all(first.model[key] == second.model[key] for key in ("reference_temperature", "degrees", "output_unit"))

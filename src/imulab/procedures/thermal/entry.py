@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imulab.procedures.procedure import Procedure, deferred
+from imulab.procedures.procedure import Procedure, Section, deferred
 from imulab.procedures.thermal.task import TASK
 
 _HERE = "imulab.procedures.thermal"
@@ -15,10 +15,17 @@ ENTRY = Procedure(
     task=TASK,
     check=deferred(f"{_HERE}.sections:check"),
     exhibits=deferred(f"{_HERE}.figures:exhibits"),
-    tables=deferred(f"{_HERE}.record:no_tables"),
-    sections=(),
-    not_applied="laws over temperature are not in the C core yet; 'imulab show' and 'imulab report' read it",
-    elsewhere="laws over temperature are not exported yet",
+    tables=deferred(f"{_HERE}.device:tables_of"),
+    sections=(
+        Section(
+            "thermal",
+            golden=deferred(f"{_HERE}.device:golden"),
+            apply=deferred(f"{_HERE}.apply:apply_thermal"),
+            triad="accel",
+            remarks=deferred(f"{_HERE}.apply:remarks"),
+        ),
+    ),
+    elsewhere="{target} takes no laws over temperature",
     rows=deferred(f"{_HERE}.engineering:rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
     same_meaning=deferred(f"{_HERE}.engineering:same_meaning"),

@@ -30,15 +30,15 @@ def exhibits(record: Calibration) -> Exhibits:
     found = thermal_of(record)
     low, high = found.model.range
     temperature = np.linspace(low, high, _POINTS)
-    values, spread = predicted(record, found.model.degrees, temperature)
+    values, spread = predicted(record, temperature)
     fit = found.fit
     worst = float(spread[:3].max()) * _MICRO_G
-    degrees = ", ".join(map(str, found.model.degrees))
+    degrees = ", ".join(map(str, found.model.degrees.each))
     headline = (
         f"{low:.0f} to {high:.0f} degC, degrees {degrees}: |f| - g is {plain_number(fit.rms.value * _MICRO_G, 3)} µg "
         f"rms over {fit.holds} holds; biases are known to {plain_number(worst, 2)} µg or better."
     )
-    tau = fit.turn_on
+    tau = fit.between_recordings
     told = "not known" if tau.from_ == "unknown" else f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg ({tau.from_})"
     facts = [
         ("recordings", str(fit.recordings)),
@@ -51,7 +51,7 @@ def exhibits(record: Calibration) -> Exhibits:
         *(_over_temperature(k, temperature, values, spread) for k in range(3)),
         _residuals(found),
     ]
-    if fit.left_out:
+    if fit.left_out_temperature:
         items.append(_predicted(found))
     if fit.degrees:
         items.append(_compared(found))
@@ -59,7 +59,7 @@ def exhibits(record: Calibration) -> Exhibits:
 
 
 def _left(found: Thermal) -> str:
-    rows = found.fit.left_out
+    rows = found.fit.left_out_temperature
     return f"{plain_number(max(row.rms for row in rows) * _MICRO_G, 2)} µg rms at worst" if rows else "–"
 
 
@@ -68,10 +68,10 @@ def _coefficients(record: Calibration) -> ReportTable:
     for row in engineering_rows(record):
         value, u = format_uncertain(row.value, row.standard_uncertainty)
         rows.append([row.name, value, u, row.unit])
-    reference = record.model["reference"]["value"]
+    reference = record.model["reference_temperature"]["value"]
     return ReportTable(
         f"Coefficients of powers of T - {reference:g} degC",
-        "bias_x is the value at that temperature, bias_x_1 its change per kelvin, bias_x_2 the coefficient of the "
+        "bias_x is the value at that temperature, bias_x_t1 its change per kelvin, bias_x_t2 the coefficient of the "
         "square ... Outside the range each law is held at its end.",
         ["parameter", "value", "u", "unit"],
         rows,
@@ -130,7 +130,7 @@ def _residuals(found: Thermal) -> Figure:
 def _predicted(found: Thermal) -> ReportTable:
     rows = [
         [f"{row.temperature:.1f}", str(row.holds), plain_number(row.rms * _MICRO_G, 3), f"{row.chi_square:.2f}"]
-        for row in found.fit.left_out
+        for row in found.fit.left_out_temperature
     ]
     return ReportTable(
         "Temperatures left out",

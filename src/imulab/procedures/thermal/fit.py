@@ -111,7 +111,7 @@ def fit_thermal(
     --------
     >>> import imulab as il
     >>> fit = il.fit_thermal(il.simulate_thermal(attitudes=12))
-    >>> fit.calibration.model["degrees"][0]
+    >>> fit.calibration.model["degrees"]["bias"]
     3
     """
     single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
@@ -147,6 +147,7 @@ def fit_thermal(
         "gravity": local.value,
         "tilt": leaning,
         **({} if scatter is None else {"turn_on_scatter": scatter * local.value}),
+        **({} if temperature_column is None else {"temperature_column": temperature_column}),
         **({} if settle is None else {"settle": in_si(settle, "settle", "time", "s")}),
     }
     record = make_record(holds, problem, solution, steps, held, view, local, scale, options, name)

@@ -83,9 +83,9 @@ class Laws:
         return matrix
 
     def names(self) -> list[str]:
-        """Return the names of the coefficients in a record: ``bias_x``, ``bias_x_1`` (per K), ``bias_x_2`` ..."""
+        """Return the names of the coefficients in a record: ``bias_x``, ``bias_x_t1`` (per K), ``bias_x_t2`` ..."""
         return [
-            f"{kind}_{axis}" + (f"_{power}" if power else "")
+            f"{kind}_{axis}" + (f"_t{power}" if power else "")
             for (kind, axes), degree in zip(GROUPS, self.degrees, strict=True)
             for axis in axes
             for power in range(degree + 1)

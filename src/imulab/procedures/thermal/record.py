@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.tables import DeviceTable
-from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability, coverage_factor
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
+from imulab.procedures.thermal.model import GROUPS
+from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Problem, Solution
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -56,9 +56,9 @@ def make_record(
         covariance=Covariance(tuple(names), tuple(map(tuple, matrix.tolist()))),
         model={
             "order": 1,
-            "degrees": list(laws.degrees),
+            "degrees": {kind: degree for (kind, _), degree in zip(GROUPS, laws.degrees, strict=True)},
             "range": [laws.low, laws.high],
-            "reference": {"value": laws.middle, "unit": "degC"},
+            "reference_temperature": {"value": laws.middle, "unit": "degC"},
             "gravity": gravity.entry(),
             "output_unit": holds.unit,
             "gauge": _GAUGE,
@@ -91,8 +91,8 @@ def _fit(
         "chi_square": solution.chi_square,
         "degrees_of_freedom": solution.freedom,
         "condition_number": view.condition,
-        "turn_on": _turn_on(solution, options, g),
-        "left_out": [
+        "between_recordings": _turn_on(solution, options, g),
+        "left_out_temperature": [
             {"temperature": e.temperature, "holds": e.holds, "rms": g * e.rms, "chi_square": e.chi_square}
             for e in left_out
         ],
@@ -203,25 +203,14 @@ def _findings(
     return found
 
 
-def no_tables(record: Calibration) -> tuple[DeviceTable, ...]:
-    """Say that the C core does not take laws over temperature yet.
-
-    Raises
-    ------
-    OptionError
-        Always.
-    """
-    raise OptionError(f"a {record.procedure} record is not in the C core yet: show and report read it")
-
-
-def predicted(record: Calibration, degrees: Sequence[int], temperature: Array) -> tuple[Array, Array]:
+def predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the nine parameters over temperature and their standard uncertainties, SI, shapes (9, n)."""
     low, high = record.model["range"]
-    offset = np.clip(temperature, low, high) - float(record.model["reference"]["value"])
+    offset = np.clip(temperature, low, high) - float(record.model["reference_temperature"]["value"])
     values, spread, at = [], [], 0
     names = record.covariance.names
     matrix = record.covariance.array()
-    for degree in np.repeat(degrees, 3).tolist():
+    for degree in np.repeat(thermal_of(record).model.degrees.each, 3).tolist():
         powers = offset[:, None] ** np.arange(degree + 1)
         own = slice(at, at + degree + 1)
         values.append(powers @ np.array([record.value(name) for name in names[own]]))

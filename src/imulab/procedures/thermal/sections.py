@@ -20,19 +20,32 @@ class Gravity(Part):
     unit: str
 
 
+class Kinds(Part):
+    """``model.degrees``: of the laws of each kind of parameter."""
+
+    bias: int
+    scale_factor: int
+    misalignment: int
+
+    @property
+    def each(self) -> tuple[int, int, int]:
+        """In the order of the kinds."""
+        return self.bias, self.scale_factor, self.misalignment
+
+
 class Model(Part):
     """``model``; the range of temperature in degC."""
 
     order: int
-    degrees: Three[int]
+    degrees: Kinds
     range: Annotated[list[float], 2]
-    reference: Quantity
+    reference_temperature: Quantity
     gravity: Gravity
     output_unit: str
 
 
 class LeftOut(Part):
-    """One row of ``fit.left_out``: degC, and rms in m/s^2."""
+    """One row of ``fit.left_out_temperature``: degC, and rms in m/s^2."""
 
     temperature: float
     holds: int
@@ -50,7 +63,7 @@ class Degrees(Part):
 
 
 class TurnOn(Part):
-    """``fit.turn_on``: what biases and scale factors move by from one power cycle to the next."""
+    """``fit.between_recordings``: what biases and scale factors move by from one power cycle to the next."""
 
     bias: Length
     scale_factor: Length
@@ -66,8 +79,8 @@ class Fit(Part):
     temperatures: int
     rms: Length
     excess: Length
-    turn_on: TurnOn
-    left_out: list[LeftOut]
+    between_recordings: TurnOn
+    left_out_temperature: list[LeftOut]
     degrees: list[Degrees]
 
 
