@@ -34,7 +34,8 @@ def apply_thermal(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recor
         factor = conversion_factor(given, needed)
     except UnitError:
         raise UnitError(
-            f"{recording.name}: columns {' '.join(_ACCEL)} are in {given}, but the record calibrates outputs in {needed}"
+            f"{recording.name}: columns {' '.join(_ACCEL)} are in {given}, but the record calibrates "
+            f"outputs in {needed}"
         ) from None
     outputs = list((recording.triad("accel") * factor).T)
     force, _ = unit.thermal(_temperature(columns, recording), outputs)
@@ -57,7 +58,7 @@ def _temperature(columns: Mapping[str, Any], recording: Recording) -> Array:
 
 
 def remarks(columns: Mapping[str, Any], recording: Recording) -> list[str]:
-    """Return what a user should know about correcting a recording: how much of it lies outside the range, or has none."""
+    """Return what is to be known of correcting a recording: rows outside the range or without a temperature."""
     if not set(_ACCEL) <= set(recording.columns):
         return []
     low, high = columns["range"]

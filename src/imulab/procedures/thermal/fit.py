@@ -48,7 +48,7 @@ class ThermalFit(Result):
     --------
     >>> import imulab as il
     >>> fit = il.fit_thermal(il.simulate_thermal(attitudes=12), degrees="2,1,1")
-    >>> fit.calibration.parameters["bias_x_1"].unit
+    >>> fit.calibration.parameters["bias_x_t1"].unit
     'm/s^2/K'
     """
 
