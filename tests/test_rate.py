@@ -146,6 +146,14 @@ def test_hysteresis_is_seldom_found_where_there_is_none():
     assert sum(loop < 0.01 for loop in loops) <= 2  # 24 tests at 1 %: more than 2 happens once in 500
 
 
+def test_a_loop_of_ten_ppm_is_found_by_three_cycles():
+    """0.3 deg/sqrt(h), 8 s, three cycles: 5 standard deviations of the loop, of which 2.6 are needed."""
+    how = {"noise": "0.025 deg/s", "rate": "25 Hz", "hold": "8 s", "cycles": 3, "loop": "10 ppm"}
+    found = [il.fit_rate(il.simulate_rate(seed=seed, **how)).calibration for seed in range(4)]
+    loops = [axis["loop"] for record in found for axis in record.fit["axes"].values()]
+    assert sum(loop < 0.01 for loop in loops) >= 11  # of 12 that are found with 99.4 % each
+
+
 def test_a_record_corrects_recordings_and_goes_through_the_core(tmp_path):
     record = il.fit_rate(whole()).calibration
     rng = np.random.default_rng(3)

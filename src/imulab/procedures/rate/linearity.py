@@ -17,6 +17,7 @@ from imulab.procedures.rate.solve import Problem
 from imulab.recording import Array
 
 _EXACT = 1e-10
+_CHANCE = 0.01
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ def _hysteresis(
     left: Array, variance: Array, key: NDArray[Any], runs: NDArray[Any], direction: NDArray[np.int64], rate: Array
 ) -> tuple[float | None, tuple[float, float] | None]:
     """Return the probability of a loop by noise, and the largest rising less falling over the largest rate."""
-    from imulab.estimation.special import stdtr
+    from imulab.estimation.special import ndtr, stdtr
 
     largest = float(np.abs(rate).max())
     rows = []
@@ -152,9 +153,11 @@ def _hysteresis(
         return None, size
     slope = weight @ (loop * table[:, 1]) / spread
     residual = table[:, 1] - slope * loop
-    ratio = max(1.0, float(weight @ residual**2) / (len(rows) - 1))
-    t = abs(slope) * np.sqrt(spread / ratio)
-    return 2 * float(stdtr(len(rows) - 1 if ratio > 1 else 1e6, -t)), size
+    chi_square, freedom = float(weight @ residual**2), len(rows) - 1
+    t = float(abs(slope) * np.sqrt(spread))
+    if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
+        return 2 * float(stdtr(freedom, -t / np.sqrt(chi_square / freedom))), size
+    return 2 * float(ndtr(-t)), size
 
 
 def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:

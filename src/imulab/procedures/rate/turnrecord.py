@@ -129,6 +129,13 @@ def turns_exhibits(record: Calibration) -> Exhibits:
             error_y={"type": "data", "array": rounded(degrees[2]), "thickness": 1, "width": 2},
         )
     ]  # fmt: skip
+    several = len(table) > len(set(seen.axis))  # of one turn about each axis nothing is left
+    figure = Figure(
+        title="What is left of each turn",
+        caption="Bars: one standard uncertainty, of both stops and of the zero.",
+        traces=traces,
+        layout={"xaxis": axis("turn", dtick=1), "yaxis": axis("left, deg")},
+    )
     fence = float(np.degrees(found.fit.fence.value))
     return Exhibits(
         f"{found.fit.turns} turns against a fence of {plain_number(fence, 2)} deg: scale factors are known to "
@@ -143,11 +150,6 @@ def turns_exhibits(record: Calibration) -> Exhibits:
                 ["gyro", "from, s", "to, s", "turns", "angle, deg", "left, deg", "u, deg"],
                 table,
             ),
-            Figure(
-                title="What is left of each turn",
-                caption="Bars: one standard uncertainty, of both stops and of the zero.",
-                traces=traces,
-                layout={"xaxis": axis("turn", dtick=1), "yaxis": axis("left, deg")},
-            ),
+            *([figure] if several else []),
         ],
     )  # fmt: skip
