@@ -122,3 +122,19 @@ def test_what_cannot_be_corrected_is_refused_in_one_line(record, tmp_path, capsy
     assert main(["apply", "thermal.json", "full.csv", "-o", "out.csv"], project=False) == 0
     with pytest.raises(il.ImulabError, match="already"):
         il.apply(record, il.apply(record, given))
+
+
+def test_what_would_correct_twice_or_out_of_turn_is_refused(record, made, tmp_path):
+    tumble = il.fit_tumble(il.simulate_tumble(gravity=G), order=1, gravity=G).calibration
+    warmup = il.fit_warmup(il.simulate_warmup([0, 20, 40], rate=1.0), temperatures="0,20,40").calibration
+    for records, said in (
+        ([tumble, record], "a tumble and a thermal record together"),
+        ([record, tumble], "a tumble and a thermal record together"),
+        ([warmup, record], "a warm-up record before a thermal one"),
+    ):
+        with pytest.raises(il.ImulabError, match=said):
+            next(apply_blocks(records, [wandering()]))
+        with pytest.raises(il.ImulabError, match=said):
+            il.export("c", records, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+    assert il.export("blob", [record, warmup], tmp_path / "out")

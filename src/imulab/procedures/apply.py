@@ -19,7 +19,7 @@ from imulab.procedures.inputs import Data, Reading, Record, as_record, as_record
 from imulab.procedures.loading import load_any
 from imulab.procedures.procedure import Section
 from imulab.procedures.registry import procedure_of, section
-from imulab.procedures.unit_tables import tables_of
+from imulab.procedures.unit_tables import check_order, tables_of
 from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
@@ -218,6 +218,7 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
         None of the records corrects anything in it; and what `apply` raises.
     """
     chain = [record if isinstance(record, Loaded) else loaded(record) for record in records]
+    check_order([part.kind for ready in chain for part, _ in ready.sections])
     since_power_on = any(part.since_power_on for ready in chain for part, _ in ready.sections)
     end = -math.inf
     for number, given in enumerate(blocks):

@@ -41,4 +41,27 @@ def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) 
     twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
     if twice:
         raise RecordError(f"two records give a {twice[0]} table; a unit has one")
+    check_order(kinds)
     return tables
+
+
+def check_order(kinds: Sequence[str]) -> None:
+    """Refuse sections, by kind in the order of application, that would correct one error twice or out of turn.
+
+    Raises
+    ------
+    RecordError
+        A tumble is beside a thermal record, which contains it; or a warm-up table comes before the thermal record.
+    """
+    if "thermal" not in kinds:
+        return
+    if "tumble" in kinds:
+        raise RecordError(
+            "a tumble and a thermal record together: both take off bias, scale factor and misalignment; expected the "
+            "thermal record alone (thermal fit --prior takes the tumble's knowledge in)"
+        )
+    if "warmup" in kinds[: list(kinds).index("thermal")]:
+        raise RecordError(
+            "a warm-up record before a thermal one: expected the thermal record first, since the warm-up is what is "
+            "left after the laws over temperature"
+        )
