@@ -194,7 +194,8 @@ def test_the_noise_of_a_unit_that_moves_is_warned_of(imulab, tmp_path, recording
         said = imulab("allan", "still.csv").stderr
         assert "did the unit move?" not in said
         assert ("the noise is not that of the model" in said) == (drift > 0)
-        assert said.count("\n") == (drift > 0)
+        assert ("is more than that of any gyroscope in use" in said) == (noise > 1)
+        assert said.count("\n") == 1
 
 
 def test_show_puts_the_columns_before_what_else_the_head_says(imulab, tmp_path, recording):
