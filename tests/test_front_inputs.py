@@ -308,3 +308,10 @@ def test_five_lines_lead_from_a_data_frame_to_a_record_and_a_picture(library, tm
     off = il.load("sn42.json").value("bias_x") - float(made.metadata["truth_bias_x"])
     assert abs(off) < 1e-3
     assert "Residual" in (tmp_path / "residuals.html").read_text(encoding="utf-8")
+
+
+def test_the_only_figure_is_saved_as_a_picture_without_being_chosen(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr("imulab.report.plots.Plot.save", lambda plot, path: saved.append((plot.name, path)))
+    il.allan_deviation(np.arange(64.0) % 3, rate=10.0).plot().save(tmp_path / "one.png")
+    assert saved == [("Allan deviation, samples", tmp_path / "one.png")]

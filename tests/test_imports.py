@@ -172,3 +172,12 @@ def test_public_names_are_those_that_type_checkers_see():
     assert ast.unparse(block.test) == "TYPE_CHECKING"
     seen = {name.asname: node.module for node in block.body for name in node.names}
     assert seen == {name: f"imulab.{home}" for name, home in imulab._HOME.items()}
+
+
+def test_a_misspelt_name_is_answered_with_the_one_that_was_meant():
+    import imulab
+
+    with pytest.raises(AttributeError, match=r"no attribute 'fit_tumbel'; did you mean 'fit_tumble'\?"):
+        imulab.fit_tumbel  # noqa: B018
+    with pytest.raises(AttributeError, match=r"no attribute '__spc__'$"):
+        imulab.__spc__  # noqa: B018

@@ -162,7 +162,10 @@ __all__ = ["__version__", *_HOME]
 def __getattr__(name: str) -> Any:
     """Import public names when they are first used, so that ``import imulab`` costs nothing."""
     if name not in _HOME:
-        raise AttributeError(f"module 'imulab' has no attribute {name!r}")
+        from imulab.errors import meant
+
+        hint = "" if name.startswith("_") else meant(_HOME, name)
+        raise AttributeError(f"module 'imulab' has no attribute {name!r}{hint}")
     value = getattr(import_module(f"imulab.{_HOME[name]}"), name)
     if not isinstance(value, type):
         from imulab.arguments import checked

@@ -142,12 +142,14 @@ class Plots(Sequence[Plot]):
         return "\n".join([f"{len(self)} figures of {self.subject}", *shown, *more])
 
     def save(self, path: str | Path) -> None:
-        """Write all figures as one page, ``.html``; errors as for `Plot.save`."""
+        """Write all figures as one page, ``.html``, or the only one as a picture; errors as for `Plot.save`."""
+        if _kind(path) != "html" and len(self) == 1:
+            return self[0].save(path)
         if _kind(path) != "html":
             raise OptionError(
                 f"{path}: a picture holds one figure: expected one of them, as in plots[0].save({str(path)!r})"
             )
-        _write_page(path, self.subject, self._plots)
+        return _write_page(path, self.subject, self._plots)
 
     def _ipython_display_(self) -> None:
         from IPython.display import display
