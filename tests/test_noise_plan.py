@@ -102,7 +102,7 @@ def test_lengths_of_time_are_said_as_people_do(seconds, text):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "no noise is given: expected one of white"),
+        ({}, "no noise is given: expected one of --white"),
         ({"white": 1.0, "for_": "walk=10%"}, "for_ walk: not among the terms; expected white"),
         ({"white": 1.0, "for_": "much"}, "for_ 'much': expected a fraction such as 0.01 or 1 %"),
         ({"white": 1.0, "for_": "white=1%,white=2%"}, "for_ 'white=1%,white=2%': white twice; expected each term once"),

@@ -92,7 +92,7 @@ def test_blocks_are_the_log_and_no_more_than_one_is_made_at_a_time(tmp_path, cap
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "no noise is given: expected one of white flicker walk quantisation gm"),
+        ({}, "no noise is given: expected one of --white --flicker --walk --quantisation --gm"),
         ({"white": "0.3 degs"}, "white '0.3 degs': expected a number with a unit such as 0.3 deg/sqrt(h)"),
         ({"white": "0.3 deg/h"}, "white '0.3 deg/h': expected a number with a unit such as"),
         ({"white": "0,3 deg/sqrt(h)"}, "white '0,3 deg/sqrt(h)': expected a number with"),

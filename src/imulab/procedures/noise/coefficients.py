@@ -96,7 +96,8 @@ def given_terms(
         if level != found:
             raise OptionError(f"{name}: noise of an output in {level}; expected that of one in {found}")
     if not values.any():
-        raise OptionError(f"no noise is given: expected one of {' '.join(EXAMPLES)}, such as white {EXAMPLES['white']}")
+        options = " ".join(f"--{name}" for name in EXAMPLES)
+        raise OptionError(f'no noise is given: expected one of {options}, such as --white "{EXAMPLES["white"]}"')
     return GivenTerms(values, found)
 
 
