@@ -70,6 +70,24 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         raise
 
 
+def check_no_paper(path: str | Path) -> None:
+    """Check that no file is asked for that promises a picture or a printed page.
+
+    Raises
+    ------
+    OptionError
+        It is.
+    """
+    if Path(path).suffix.lower() in (".pdf", ".png", ".svg", ".docx"):
+        raise OptionError(f"{path}: no such file is written; reports are HTML (.html), which any browser prints")
+
+
+def write_page(path: str | Path, page: str) -> None:
+    """Write an HTML page; errors as for `write_text` and `check_no_paper`."""
+    check_no_paper(path)
+    write_text(path, page)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file whole or not at all, UTF-8."""
     with replacing(path) as stream:

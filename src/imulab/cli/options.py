@@ -29,7 +29,6 @@ RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="Recording; -
 RecordFile = Annotated[str, typer.Argument(metavar="RECORD", help="Calibration record.")]
 OutputFile = Annotated[str | None, typer.Option("-o", "--output", metavar="OUT", help="File to write.")]
 ReportFile = Annotated[str | None, typer.Option("--report", metavar="R.html", help="Report to write.")]
-_PAPER = (".pdf", ".png", ".svg", ".docx")
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
@@ -103,7 +102,7 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
     OptionError
         An output cannot be written, or would overwrite another file of this command.
     """
-    from imulab.atomic_write import real_path
+    from imulab.atomic_write import check_no_paper, real_path
 
     taken = {Path(os.path.realpath(name)): name for name in inputs if name != "-"}
     for name in outputs:
@@ -111,8 +110,7 @@ def check_outputs(outputs: list[str | None], inputs: list[str]) -> None:
             continue
         if name in ("", "-"):
             raise OptionError(f"output {name!r}: expected the name of a file to write")
-        if Path(name).suffix.lower() in _PAPER:
-            raise OptionError(f"{name}: no such file is written; reports are HTML (.html), which any browser prints")
+        check_no_paper(name)
         target = real_path(name)
         if target in taken:
             raise OptionError(f"{name}: would overwrite {taken[target]}; expected another name")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from imulab import report
-from imulab.atomic_write import write_text
+from imulab.atomic_write import write_page
 from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.procedure import Row
 from imulab.procedures.registry import procedure_of
@@ -83,4 +83,4 @@ def write_report(record: Record, path: str | Path) -> None:
     >>> fit = il.fit_tumble(il.simulate_tumble(gravity=9.81), order=1, gravity=9.81)
     >>> il.write_report(fit.calibration, "sn42.html")
     """
-    write_text(path, rendered(as_record(record, "write_report")))
+    write_page(path, rendered(as_record(record, "write_report")))

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from imulab.errors import OptionError
-from imulab.recording import Array
 from imulab.units import to_si
+
+if TYPE_CHECKING:
+    from imulab.recording import Array
 
 AXES = "xyz"
 MOUNTINGS = tuple(sign + axis for axis in AXES for sign in "+-")

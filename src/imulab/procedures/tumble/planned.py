@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from imulab.atomic_write import write_text
+from imulab.atomic_write import write_page
 from imulab.procedures.tumble.engineering import predicted_rows
 from imulab.procedures.tumble.findings import freedom_finding
 from imulab.procedures.tumble.mag.headings import Headings
@@ -105,7 +105,7 @@ class TumblePlan(Shown, Plan):
 
     def report(self, path: str | Path) -> None:
         """Write the sheet to print as an HTML file; errors as for `save`."""
-        write_text(path, self.sheet())
+        write_page(path, self.sheet())
 
     def plot(self) -> Plot:
         """Return roll and pitch of the attitudes, numbered in their order."""
