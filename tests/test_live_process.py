@@ -135,6 +135,22 @@ def test_the_gyroscopes_follow_the_accelerometers(tmp_path):
     assert "gyro_scale_factor_x" in content(tmp_path / "live.json")["parameters"]
 
 
+@pytest.mark.parametrize("dead", [False, True])
+def test_the_magnetometers_follow_too_or_are_left_out_with_the_reason(tmp_path, dead):
+    recording = tumble(20, gyro=True, field="48 uT")
+    if dead:
+        recording = recording.with_columns({"mag_x": np.full(len(recording), 12.0)}, {})
+    il.write_csv(recording, tmp_path / "given.csv")
+    words = ["replay:given.csv@20", "--plain", "--attitudes", "14", *FIT, "--save", "rec.csv", "-o", "live.json"]
+    with live(words, tmp_path) as process:
+        assert process.ended(60) == 0, process.text
+    assert "a quarter turn about the vertical from the last" in process.text
+    further = "gyro" if dead else "gyro,mag"
+    assert content(tmp_path / "live.json") == fitted(tmp_path, *FIT, "--with", further)
+    assert f"imulab tumble fit rec.csv --with {further} makes the same record" in process.text
+    assert ("the magnetometers are not calibrated: rec.csv: column mag_x" in process.text) == dead
+
+
 def test_the_view_has_the_gyroscopes_while_the_session_lasts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recording = tumble(14, gyro=True)

@@ -13,7 +13,7 @@ import typer
 from imulab.cli.fit_options import with_options
 from imulab.cli.live_page import NoBrowser, PageHost, PagePort, again, checked_page, on_page
 from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, whole_number
-from imulab.errors import OptionError
+from imulab.errors import ImulabError, OptionError
 from imulab.procedures.options import FLAG, LAYOUT
 from imulab.procedures.tumble.task import GRAVITY, ORDER, TASK
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _WAIT = 0.05
 _EVERY = 0.1
+_FURTHER = {"gyro": "gyroscopes", "mag": "magnetometers"}
 
 
 @with_options((ORDER, *GRAVITY, LAYOUT))
@@ -94,15 +95,38 @@ def live(
 
 
 def _make_record(save: str, fitted: dict[str, str | None], output: str | None, report: str | None) -> Calibration:
-    """Fit the recording, with its gyroscopes where it has them, write and show the record, and say how to make it."""
+    """Fit the recording with all triads that it has, write and show the record, and say how to make it."""
     from imulab.cli.result import finish
-    from imulab.live.gyros import with_gyroscopes
-    from imulab.procedures.run import run_task
 
-    record, why = with_gyroscopes(run_task("tumble", [save], fitted, GivenFiles()), save)
+    record, further, why = _all_triads(save, fitted)
     finish(record, output, report, json=False)
-    _say_how(record, save, output, why)
+    _say_how(save, further, why)
     return record
+
+
+def _all_triads(save: str, fitted: dict[str, str | None]) -> tuple[Calibration, list[str], list[str]]:
+    """Fit a recording; a further triad that is refused is left out, so that no session is in vain. Return why, too."""
+    from imulab.columns import triad
+    from imulab.procedures.run import run_task
+    from imulab.readers import read
+
+    def fit(further: list[str]) -> Calibration:
+        return run_task("tumble", [save], {**fitted, "with": ",".join(further) or None}, GivenFiles())
+
+    recording = read(save)
+    there = [name for name in _FURTHER if all(column in recording for column in triad(name))]
+    try:
+        return fit(there), there, []
+    except ImulabError:
+        if not there:
+            raise
+    record, further, why = fit([]), list[str](), list[str]()
+    for name in there:
+        try:
+            record, further = fit([*further, name]), [*further, name]
+        except ImulabError as error:
+            why.append(f"the {_FURTHER[name]} are not calibrated: {error}")
+    return record, further, why
 
 
 def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool, typed: bool) -> None:
@@ -123,15 +147,12 @@ def _number_of_attitudes(text: str | None, target: str | None) -> int | None:
     return number
 
 
-def _say_how(record: Calibration, save: str, output: str | None, why: str) -> None:
-    """Say which commands make the same record, and why it has no gyroscopes where it should."""
-    gyros = any(name.startswith("gyro_") for name in record.parameters)
-    same = f"imulab tumble fit {save} makes the same record"
-    if gyros:
-        same = f"imulab tumble fit {save} -o accel.json and imulab tumble gyro {save} --accel accel.json make the same"
-    note(f"the recording is {save}; {same}")
-    if why:
-        note(why)
+def _say_how(save: str, further: list[str], why: list[str]) -> None:
+    """Say which command makes the same record, and why it has no gyroscopes or magnetometers where it should."""
+    others = f" --with {','.join(further)}" if further else ""
+    note(f"the recording is {save}; imulab tumble fit {save}{others} makes the same record")
+    for each in why:
+        note(each)
 
 
 def _replayed(source: str) -> str:

@@ -76,6 +76,7 @@ class Session:
     _enough: str = ""
     _aside: frozenset[int] = frozenset()
     _gyros: tuple[Known, ...] = ()
+    _magnetometers: bool = False
 
     def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
         """Take samples, with what was wrong with the stream so far, and return what happened.
@@ -202,7 +203,7 @@ class Session:
             parameters=known + (self._gyros if known else ()),
             targets=tuple(zip((f"{t.stem} {t.text}" for t in self.targets), guide.shares(), strict=True)),
             next=None if self._next is None else tuple(self._next.tolist()),
-            next_words="" if self._next is None else in_words(self._next),
+            next_words="" if self._next is None else self._in_words(self._next),
             enough=self._enough,
             why_not=guide.why_not,
             warnings=tuple(self._watch.said.values()),
@@ -212,6 +213,7 @@ class Session:
         guide = self.guide
         guide.unit, guide.metadata = block.triad_unit("accel"), block.metadata
         self._format = block.metadata.get("format", "")
+        self._magnetometers = all(name in block for name in triad("mag"))
         rate = f", {self._format}" if self._format else ""
         self._say("format", f"{self.source or block.name}{rate}: {' '.join(block.columns)}")
         self._plan()
@@ -288,7 +290,12 @@ class Session:
         self._next = guide.next_direction()
         if self._next is not None:
             left = guide.wanted() - len(guide.kept)
-            self._say("next", f"next: {in_words(self._next)} ({'over ' if guide.beyond else ''}{max(left, 1)} to go)")
+            to_go = f"{'over ' if guide.beyond else ''}{max(left, 1)} to go"
+            self._say("next", f"next: {self._in_words(self._next)} ({to_go})")
+
+    def _in_words(self, up: Array) -> str:
+        """The attitude to take; magnetometers want another heading each time."""
+        return in_words(up) + (", a quarter turn about the vertical from the last" if self._magnetometers else "")
 
     def _advice(self) -> str:
         if self._dropping:
@@ -296,9 +303,9 @@ class Session:
         if self.state == "accepted":
             if self._enough or self._next is None:
                 return self._enough or "accepted"
-            return f"accepted; turn it: {in_words(self._next)}"
+            return f"accepted; turn it: {self._in_words(self._next)}"
         if self.state == "moving" and self._next is not None:
-            return f"turn it: {in_words(self._next)}, and put it down"
+            return f"turn it: {self._in_words(self._next)}, and put it down"
         return _ADVICE[self.state]
 
     def _warn(self, texts: Sequence[str]) -> None:
