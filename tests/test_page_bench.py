@@ -340,7 +340,8 @@ def test_from_the_recording_to_the_firmware(bench, tmp_path):
     job = run(bench, "export", records=["session/rec.json"], to="c", output=True)
     packed = bench.ask(f"zip/{quote(job.outputs[0], safe='')}")
     names = zipfile.ZipFile(BytesIO(packed.body)).namelist()
-    assert sorted(names) == sorted(f"rec-c/{path.name}" for path in (tmp_path / "session" / "rec-c").iterdir())
+    there = [path for path in (tmp_path / "session" / "rec-c").rglob("*") if path.is_file()]
+    assert sorted(names) == sorted(str(path.relative_to(tmp_path / "session")) for path in there)
     kinds = {entry["short"]: entry["kind"] for entry in bench.ask("files").json()["files"]}
     assert kinds == {
         "rec-2.csv": "recording",

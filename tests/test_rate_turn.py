@@ -1,6 +1,5 @@
 """Whole turns by hand: a real recording, a simulator apart, the number of turns, and every refusal."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +38,9 @@ def turned(counts, scale=1.0, stops=None, axis=2, wobble=0.0, noise=0.02, seed=1
     )
 
 
-IMUCAL = Path(os.environ.get("IMULAB_DATA", "")) / "imucal" / "example_ferraris_session.csv"
-
-
 @pytest.fixture(scope="module")
-def session():
-    if not IMUCAL.is_file():
-        pytest.skip("the recording of imucal is not here (IMULAB_DATA)")
-    return np.loadtxt(IMUCAL, delimiter=",", skiprows=1)
+def session(real_data):
+    return np.loadtxt(real_data / "imucal" / "example_ferraris_session.csv", delimiter=",", skiprows=1)
 
 
 def of(session, rate):

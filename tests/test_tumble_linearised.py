@@ -78,7 +78,7 @@ def test_a_threshold_below_rounding_is_refused_with_what_the_last_pass_changed()
     [
         ((1e-6, 1e-6), "expected three changes above 0"),
         ((1e-6, 0.0, 1e-6), "expected three changes above 0"),
-        ((1e-6, np.nan, 1e-6), "threshold: expected numbers, found"),
+        ((1e-6, np.nan, 1e-6), "threshold: expected numbers or a text, found"),
         ((1e-6, np.inf, 1e-6), "expected three changes above 0"),
     ],
 )

@@ -139,6 +139,8 @@ def _field(parameter: Any, shared: bool, *, drawn: bool) -> Field:
         return Field(
             kind="file", default=_text(parameter.default), choices=choices, other=other, shared=shared, **common
         )
+    if parameter.multiple and shows.startswith("FILE"):  # from a form, each in its own layout
+        return Field(kind="files", default="", other=False, shared=shared, **common)
     closed = bool(choices) and {*alternatives} == {*choices}
     kind = "texts" if parameter.multiple else "text"
     return Field(
@@ -179,7 +181,7 @@ def _words(field: Field, value: Any, file: Callable[[str], str], output: Callabl
             raise OptionError(f"{called}: expected {'a file' if 'file' in field.kind else 'a value'}")
         return []
     if field.kind == "files":
-        return [file(text) for text in texts]
+        return [word for text in texts for word in (_option(field.flag, file(text)) if field.flag else [file(text)])]
     if field.kind == "texts":
         return [word for text in texts for word in _option(field.flag, text.strip())]
     (text,) = texts[:1]
