@@ -437,3 +437,16 @@ def test_ten_million_rows_are_drawn_in_two_seconds_with_their_spikes():
     assert (y.max(), y.min()) == (40.0, -55.0)
     assert x[np.argmax(y)] == pytest.approx(1234.567, abs=10_000 / 2000)  # a column of pixels
     assert x[np.argmin(y)] == pytest.approx(7654.321, abs=10_000 / 2000)
+
+
+def test_plans_of_chamber_and_centrifuge_are_drawn():
+    chamber, on = il.plan_warmup(cycles=3).plot().figure.traces
+    lengths = np.diff([[x for x in on["x"] if x is not None][k::2] for k in (0, 1)], axis=0)
+    assert lengths == pytest.approx(np.full((1, 24), 600 / 3600))
+    assert set(on["y"]) - {None} == {-40, -30, -20, -10, 0, 40, 50, 60}
+    assert (np.diff(chamber["x"]) > 0).all()
+    plan = il.plan_centrifuge("1,2,5", net_rate="40 deg/s")
+    predicted, wanted = plan.plot().figure.traces
+    assert predicted["x"] == pytest.approx([1, 2, 5])
+    assert predicted["y"] == [100 * level.relative for level in plan.levels]
+    assert wanted["y"] == [100 * plan.wanted] * 2

@@ -16,6 +16,8 @@ from imulab.errors import OptionError, quoted
 from imulab.procedures.centrifuge.budget import FLEXURE
 from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manifest_text
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
+from imulab.report.elements import BAD, GOOD, LEGEND, Figure
+from imulab.report.plots import Plot
 from imulab.shown import Shown
 from imulab.units import from_si, to_si
 
@@ -112,6 +114,23 @@ class Plan(Shown):
                 f"{from_si(run.table_rate, 'deg/s'):.4f},{from_si(test.force(run), 'g'):.6g}"
             )
         write_text(path, "\n".join(lines) + "\n")
+
+    def plot(self) -> Plot:
+        """Return the predicted uncertainty of K at each level, beside the wanted one."""
+        force = [from_si(level.force, "g") for level in self.levels]
+        reached = [100 * level.relative for level in self.levels]
+        traces = [
+            {"type": "scatter", "mode": "lines+markers", "name": "predicted", "x": force, "y": reached,
+             "line": {"color": GOOD, "width": 2}, "marker": {"size": 8}},
+            {"type": "scatter", "mode": "lines", "name": "wanted", "x": [force[0], force[-1]],
+             "y": [100 * self.wanted] * 2, "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
+        ]  # fmt: skip
+        layout = {
+            "xaxis": {"title": {"text": "specific force, g"}, "type": "log", "tickvals": force},
+            "yaxis": {"title": {"text": "u(K) / K, %"}, "type": "log", "dtick": 1},
+            "legend": LEGEND,
+        }
+        return Plot(Figure("What the test will give", f"{self.shown()[0]}.", traces, layout), "Centrifuge plan")
 
 
 def plan_centrifuge(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from imulab.errors import OptionError
 from imulab.procedures.warmup.choices import TEMPERATURES
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, temperature_list, whole
 from imulab.recording import Recording
+from imulab.report.elements import GOOD, LEGEND, QUIET, Figure
+from imulab.report.plots import Plot
 from imulab.shown import Shown
 from imulab.writers import write_csv
 
@@ -104,6 +107,25 @@ class WarmupPlan(Shown):
             The file cannot be written.
         """
         write_csv(programme(self), path)
+
+    def plot(self) -> Plot:
+        """Return the chamber's set point over the time of the programme, with the recordings marked."""
+        ends = [(step, step.start / 3600, (step.start + step.duration) / 3600) for step in self.steps]
+        chamber = [(end, step.set_point) for step, _, end in ends]
+        on = [(step.set_point, start, end) for step, start, end in ends if step.action.startswith("power on")]
+        traces: list[dict[str, Any]] = [
+            {"type": "scatter", "mode": "lines", "name": "chamber", "line": {"color": QUIET, "width": 2},
+             "x": [end for end, _ in chamber], "y": [at for _, at in chamber]},
+            {"type": "scatter", "mode": "lines", "name": "unit on, recorded", "line": {"color": GOOD, "width": 8},
+             "x": [x for _, start, end in on for x in (start, end, None)],
+             "y": [y for at, _, _ in on for y in (at, at, None)]},
+        ]  # fmt: skip
+        layout = {
+            "xaxis": {"title": {"text": "time from the start, h"}},
+            "yaxis": {"title": {"text": "set point, °C"}, "zeroline": False},
+            "legend": LEGEND,
+        }
+        return Plot(Figure("Chamber programme", f"{self.shown()[0]}.", traces, layout), "Warm-up plan")
 
 
 def plan_warmup(
