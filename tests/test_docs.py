@@ -71,6 +71,13 @@ def test_the_page_on_python_describes_every_public_name():
     assert sorted(described) == PUBLIC
 
 
+@pytest.mark.parametrize("name", PUBLIC)
+def test_magnitudes_in_docstrings_are_literals(name):
+    """Between bars and outside backquotes, reStructuredText looks for a substitution, and the pages are not built."""
+    text = re.sub(r"``.*?``|`.*?`|^ *(>>>|\.\.\.) .*$", "", getattr(imulab, name).__doc__ or "", flags=re.DOTALL)
+    assert not re.search(r"\|\w[^|\n]*\|", text)
+
+
 @pytest.mark.parametrize(("language", "compiler"), [("c", "cc"), ("cpp", "c++")])
 def test_the_code_for_firmware_compiles(language, compiler, tmp_path):
     if shutil.which(compiler) is None:

@@ -152,7 +152,7 @@ def apply(
     heading
         Whether to add columns ``heading`` (of the body's x axis, clockwise from magnetic north), ``std_heading``,
         ``dip`` and ``std_dip``, deg, of a unit at rest, with standard uncertainties by the record's covariance, the
-        scatter of its attitudes, and the acceleration that shows where |f| is off g by more than 1 %.
+        scatter of its attitudes, and the acceleration that shows where ``|f|`` is off g by more than 1 %.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.

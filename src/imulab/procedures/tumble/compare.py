@@ -125,7 +125,7 @@ def check_tumble(
 
     ``r' (J V J' + C)^-1 r`` against chi-square, with r the residuals ``|f| - g`` under the record, J their derivatives
     by its parameters, V its covariance and C the attitudes' noise. Of magnetometers, where record and attitudes have
-    them, |m| and dip are tested likewise, but for what all have in common: the attitudes may be of another place. A
+    them, ``|m|`` and dip are tested likewise, but for what all have in common: the attitudes may be of another place. A
     record that holds fails once in twenty tests.
 
     Parameters
