@@ -19,10 +19,7 @@ from imulab.procedures.tumble.checks import check_attitudes
 from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
 from imulab.procedures.tumble.findings import Estimate
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
-from imulab.procedures.tumble.gyro import fit_gyro
-from imulab.procedures.tumble.gyrorecord import with_gyro
 from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold
-from imulab.procedures.tumble.mag.fit import fit_mag
 from imulab.procedures.tumble.model import parameter_count
 from imulab.procedures.tumble.montecarlo import MonteCarlo, propagate
 from imulab.procedures.tumble.options import check_options, further_triads
@@ -230,8 +227,13 @@ def _with_further(
 ) -> Calibration:
     """Return the record with further triads, each fitted on the record of those before it."""
     if "mag" in further:
+        from imulab.procedures.tumble.mag.fit import fit_mag
+
         record = fit_mag(attitudes, accel=record, gravity=gravity, loss=loss, field=field).calibration
     if "gyro" in further:
+        from imulab.procedures.tumble.gyro import fit_gyro
+        from imulab.procedures.tumble.gyrorecord import with_gyro
+
         recording = attitudes.recording
         record = with_gyro(record, fit_gyro(record, attitudes, recording), recording, recording)
     return record
