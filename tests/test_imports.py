@@ -43,6 +43,8 @@ def _imported(node: ast.AST) -> set[str]:
     """What a module imports anywhere, in functions too, but for what only type checkers see; C modules left out."""
     if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
         return set().union(*map(_imported, node.orelse))
+    if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("imulab."):
+        return {node.value.partition(":")[0]} & MODULES.keys()  # deferred("imulab.module:name")
     if isinstance(node, ast.Import):
         return {each.name for each in node.names if each.name in MODULES}
     if isinstance(node, ast.ImportFrom):

@@ -9,13 +9,13 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.cli.options import GivenFiles
+from imulab.device.golden import golden_gyroscopes
 from imulab.device.tables import DeviceTable, Field, whole
 from imulab.procedures.options import LAYOUT, measure, read_options
 from imulab.procedures.procedure import Procedure, Section, Task, source_of
 from imulab.procedures.registry import PROCEDURES
 from imulab.procedures.run import run_task
 from imulab.procedures.tumble.apply import apply_gyro
-from imulab.procedures.tumble.device import golden_gyroscopes
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.triads import Accelerometers, Triads
 from imulab.report import elements

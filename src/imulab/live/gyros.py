@@ -8,45 +8,18 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from time import monotonic
 
-from imulab.columns import triad
 from imulab.errors import ImulabError
 from imulab.gravity import Gravity
 from imulab.live.view import Known
 from imulab.procedures.reports import parameter_rows
 from imulab.procedures.tumble.fit import fit_tumble
 from imulab.procedures.tumble.segment import find_attitudes
-from imulab.quantities import quantity
 from imulab.readers import read
-from imulab.records.calibration import Calibration
 
-_CLOCK = "50 ppm"
-"""What `imulab tumble gyro` supposes where nothing is stated."""
 _REST = 5.0
 """The next fit waits for so many times as long as the last took, so that it stays beside the session."""
 Found = tuple[tuple[Known, ...], str]
 """Parameters of the gyroscopes, and why there are none."""
-
-
-def with_gyroscopes(record: Calibration, path: str) -> tuple[Calibration, str]:
-    """Return the record with the gyroscopes of its recording, as `imulab tumble gyro` makes it, or itself and why.
-
-    Raises
-    ------
-    ReadError
-        The recording cannot be read.
-    """
-    from imulab.procedures.tumble.gyro import fit_gyro
-    from imulab.procedures.tumble.gyrorecord import with_gyro
-
-    recording = read(path)
-    if not all(name in recording for name in triad("gyro")):
-        return record, ""
-    try:
-        clock = quantity(_CLOCK, "clock", "number", "ppm")
-        found = fit_gyro(record, find_attitudes(recording), recording, clock=clock)
-    except ImulabError as error:
-        return record, f"the gyroscopes are not calibrated: {error}"
-    return with_gyro(record, found, recording, recording), ""
 
 
 class GyroFits:
@@ -96,10 +69,9 @@ class GyroFits:
 def _fit(answer: Connection, path: str, order: int | str, gravity: Gravity | None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the session, which ends this process too
     try:
-        record = fit_tumble(find_attitudes(read(path)), order=order, gravity=gravity).calibration
-        record, why = with_gyroscopes(record, path)
+        record = fit_tumble(find_attitudes(read(path)), order=order, gravity=gravity, with_=("gyro",)).calibration
     except ImulabError as error:
         answer.send(((), f"the gyroscopes are not calibrated: {error}"))
         return
     rows = [row for row in parameter_rows(record) if row.name.startswith("gyro_")]
-    answer.send((tuple(Known(row.name, row.value, row.standard_uncertainty, row.unit) for row in rows), why))
+    answer.send((tuple(Known(row.name, row.value, row.standard_uncertainty, row.unit) for row in rows), ""))

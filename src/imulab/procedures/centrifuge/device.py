@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
@@ -14,7 +15,6 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
 _CURVE_UNITS = {"K0": "rad/s/(m/s^2)", "c1": "1/(m/s^2)", "c2": "1/(m/s^2)^2", "direction": "rad"}
-_VECTORS = 64
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -61,10 +61,10 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
 
 def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return rates under specific forces up to the highest level, and what is left of them."""
-    force = rng.uniform(-1, 1, (_VECTORS, 2)) * float(field_of(table, "highest")) / np.sqrt(2)
-    rate = rng.uniform(-1, 1, (_VECTORS, 2)) * 0.01  # rad/s
+    force = rng.uniform(-1, 1, (VECTORS, 2)) * float(field_of(table, "highest")) / np.sqrt(2)
+    rate = rng.uniform(-1, 1, (VECTORS, 2)) * 0.01  # rad/s
     rate[1, 0] = np.nan
     out, _ = DeviceUnit.of(table).centrifuge(list(force.T), list(rate.T))
     expected = np.column_stack([column for column in out if column is not None])
     scale = float(np.nanmax(np.abs(np.concatenate([rate, expected]))))
-    return {"": _VECTORS, "scale": scale, "force": force, "rate": rate, "expected": expected}
+    return {"": VECTORS, "scale": scale, "force": force, "rate": rate, "expected": expected}

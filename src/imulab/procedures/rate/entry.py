@@ -19,7 +19,7 @@ ENTRY = Procedure(
     sections=(
         Section(
             "gyro",
-            golden=deferred("imulab.procedures.tumble.device:golden_gyroscopes"),
+            golden=deferred("imulab.device.golden:golden_gyroscopes"),
             apply=deferred(f"{_HERE}.device:apply_rate"),
             triad="gyro",
         ),

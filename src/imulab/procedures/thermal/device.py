@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import Polynomial
 
+from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
@@ -16,7 +17,6 @@ from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.units import STANDARD_GRAVITY
 
-_VECTORS = 64
 _NODES = np.linspace(-1.0, 1.0, 65)
 
 
@@ -66,14 +66,14 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
 def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return outputs within 2 g at temperatures within the range and beyond it, and their specific forces."""
     low, high = field_of(table, "knot")[[0, -1]]
-    temperature = np.repeat(rng.uniform(low - 5.0, high + 5.0, _VECTORS // 2), 2)
-    force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (_VECTORS, 3))
+    temperature = np.repeat(rng.uniform(low - 5.0, high + 5.0, VECTORS // 2), 2)
+    force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (VECTORS, 3))
     laws = field_of(table, "coefficient").reshape(-1, 9, int(field_of(table, "terms")))
     output = (force + laws[0, :3, 0]) * laws[0, 3:6, 0]
     temperature[5], output[1, 1] = np.nan, np.nan
     found, _ = DeviceUnit.of(table).thermal(temperature, list(output.T))
     return {
-        "": _VECTORS,
+        "": VECTORS,
         "scale": 2 * STANDARD_GRAVITY,
         "temperature": temperature,
         "output": output,

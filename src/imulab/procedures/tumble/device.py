@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of, nonzero, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
@@ -19,7 +20,6 @@ from imulab.units import STANDARD_GRAVITY
 _AXES = "xyz"
 _CROSSED = 256
 """Added to the order of a table that has cross terms."""
-_VECTORS = 64
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -140,26 +140,16 @@ def monotone_range(nonlinearity: Array) -> tuple[float, float]:
 def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return outputs within 2 g, or as far as the polynomials rise, and their specific forces."""
     reach = 0.9 * np.minimum(2 * STANDARD_GRAVITY, np.minimum(-field_of(table, "low"), field_of(table, "high")))
-    output = (rng.uniform(-1, 1, (_VECTORS, 3)) * reach + field_of(table, "bias")) / field_of(table, "gain")
+    output = (rng.uniform(-1, 1, (VECTORS, 3)) * reach + field_of(table, "bias")) / field_of(table, "gain")
     output[1, 1] = np.nan
     force, _ = DeviceUnit.of(table).tumble(list(output.T))
-    return {"": _VECTORS, "scale": 2 * STANDARD_GRAVITY, "output": output, "force": np.column_stack(force)}
-
-
-def golden_gyroscopes(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
-    """Return outputs under a specific force, and their rates."""
-    rates = rng.uniform(-5, 5, (_VECTORS, 3))  # rad/s, about 300 deg/s
-    force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (_VECTORS, 3))
-    output = (rates + field_of(table, "bias")) / field_of(table, "gain")
-    output[1, 2] = np.nan
-    rate, _ = DeviceUnit.of(table).gyro(list(output.T), list(force.T))
-    return {"": _VECTORS, "scale": 5.0, "output": output, "force": force, "rate": np.column_stack(rate)}
+    return {"": VECTORS, "scale": 2 * STANDARD_GRAVITY, "output": output, "force": np.column_stack(force)}
 
 
 def golden_magnetometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
     """Return outputs of fields up to twice the local one, and those fields."""
     size = 1e-4 if table.columns["field_unit"] == "T" else 2.0
-    output = (rng.uniform(-size, size, (_VECTORS, 3)) + field_of(table, "bias")) / field_of(table, "gain")
+    output = (rng.uniform(-size, size, (VECTORS, 3)) + field_of(table, "bias")) / field_of(table, "gain")
     output[1, 0] = np.nan
     field, _ = DeviceUnit.of(table).mag(list(output.T))
-    return {"": _VECTORS, "scale": size, "output": output, "field": np.column_stack(field)}
+    return {"": VECTORS, "scale": size, "output": output, "field": np.column_stack(field)}

@@ -25,7 +25,7 @@ ENTRY = Procedure(
         ),
         Section(
             "gyro",
-            golden=deferred(f"{_HERE}.device:golden_gyroscopes"),
+            golden=deferred("imulab.device.golden:golden_gyroscopes"),
             apply=deferred(f"{_HERE}.apply:apply_gyro"),
             triad="gyro",
         ),
