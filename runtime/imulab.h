@@ -22,7 +22,7 @@ extern "C" {
 #endif
 typedef IMULAB_REAL il_real;
 
-#define IL_VERSION 1 /* of the table format */
+#define IL_VERSION 2 /* of the table format; 2 where gyroscopes have powers of the rate, else 1 */
 
 /* Elements of a gyro array per axis; each costs 16 words of state per axis. */
 #ifndef IL_ARRAY_ELEMENTS
@@ -84,7 +84,7 @@ unsigned il_tumble_block(const il_tumble *settings, size_t n, const il_real *con
  * number where there is none. k[0] holds k2 of the axes, k[1] k3. Order 2 in closed form, 2 a / (1 + sqrt(1 + 4 k2 a)). */
 void il_tumble_solve(int32_t order, const il_real (*k)[3], const il_real a[3], il_real s[3], il_real slope[3]);
 
-/* ---- gyroscope triad: w = T^-1 (M / S - b - G f) ------------------------------------------------------------------ */
+/* ---- gyroscope triad: w = T^-1 s, s + k2 s^2 + ... = M / S - b - G f ---------------------------------------------- */
 
 typedef struct {
     int32_t has_sensitivity;   /* 0: G is zero and no specific force is needed */
@@ -92,6 +92,9 @@ typedef struct {
     il_real bias[3];           /* b, rad/s */
     il_real turn[3][3];        /* T^-1, 1 */
     il_real sensitivity[3][3]; /* G, (rad/s)/(m/s^2) */
+    int32_t order;             /* of the polynomial, 1 to 5; 0 is 1 */
+    il_real low[3], high[3];   /* s + k2 s^2 + ... between its turning points, rad/s */
+    il_real nonlinearity[IL_TUMBLE_ORDER - 1][3]; /* k2 .. k5, 1/(rad/s)^(power - 1) */
 } il_gyro;
 
 /* Outputs, and specific force [m/s^2] (may be NULL without G), to angular rate [rad/s]; rate may be output. */

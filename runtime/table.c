@@ -1,7 +1,7 @@
 /* Tables: the numbers of one unit as bytes ("blob"), checked to the last bit before any of them is believed.
  *
  *   offset 0   8 bytes  89 49 4D 55 4C 41 42 0A
- *          8   u16      version (1)           10  u16  bytes per number: 4 (float) or 8 (double)
+ *          8   u16      version (1 or 2)      10  u16  bytes per number: 4 (float) or 8 (double)
  *         12   u32      size of the whole table, CRC included
  *         16   sections: u32 kind, u32 size of what follows, then u32 counts and IEEE 754 numbers
  *   size - 4   u32      CRC-32 of everything before
@@ -45,7 +45,7 @@ const char *il_status_text(il_status status) {
 /* Bytes being read, and where numbers that need an address go. The first fault stays. */
 typedef struct {
     const uint8_t *at, *end;
-    uint32_t width;
+    uint32_t width, version;
     il_real *memory;
     size_t capacity;
     il_status status;
@@ -151,10 +151,15 @@ static void read_tumble(cursor *c, il_tumble *t) {
 
 static void read_gyro(cursor *c, il_gyro *g) {
     g->has_sensitivity = count(c, 0, 1);
+    g->order = c->version > 1 ? count(c, 1, IL_TUMBLE_ORDER) : 1;
     numbers(c, g->gain, 3);
     numbers(c, g->bias, 3);
     for (int i = 0; i < 3; i++) numbers(c, g->turn[i], 3);
     for (int i = 0; i < 3 && g->has_sensitivity; i++) numbers(c, g->sensitivity[i], 3);
+    if (g->order < 2) return;
+    numbers(c, g->low, 3);
+    numbers(c, g->high, 3);
+    for (int p = 0; p < g->order - 1; p++) numbers(c, g->nonlinearity[p], 3);
 }
 
 static void read_mag(cursor *c, il_mag *m) {
@@ -272,7 +277,7 @@ static il_status load(il_unit *unit, const uint8_t *bytes, size_t size, il_real 
     if (il_crc32(bytes, size - TAIL) != u32(bytes + size - TAIL)) return IL_TABLE_CORRUPT;
     if (version < 1) return IL_TABLE_CONTENT;
     if (width != 4 && !(width == 8 && !IL_FLOAT)) return IL_TABLE_WIDTH;
-    cursor c = {bytes + HEAD, NULL, width, memory, capacity, IL_OK};
+    cursor c = {bytes + HEAD, NULL, width, version, memory, capacity, IL_OK};
     const uint8_t *end = bytes + size - TAIL;
     while (c.at < end && c.status == IL_OK) {
         if (end - c.at < SECTION_HEAD) return IL_TABLE_CONTENT;

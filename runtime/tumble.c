@@ -39,12 +39,13 @@ void il_tumble_solve(int32_t order, const il_real (*k)[3], const il_real a[3], i
 }
 
 /* The same for a unit, whose polynomials have limits. */
-static unsigned within_range(const il_tumble *t, const il_real a[3], il_real s[3]) {
+static unsigned within_range(int32_t order, const il_real (*k)[3], const il_real low[3], const il_real high[3],
+                             const il_real a[3], il_real s[3]) {
     il_real slope[3];
     unsigned flags = 0;
-    il_tumble_solve(t->order, t->nonlinearity, a, s, slope);
+    il_tumble_solve(order, k, a, s, slope);
     for (int i = 0; i < 3; i++) {
-        if (!(a[i] >= t->low[i] && a[i] <= t->high[i])) s[i] = il_nan();
+        if (!(a[i] >= low[i] && a[i] <= high[i])) s[i] = il_nan();
         if (s[i] != s[i]) flags |= il_finite(a[i]) ? (unsigned)IL_BEYOND : (unsigned)IL_NOT_FINITE;
     }
     return flags;
@@ -60,7 +61,7 @@ static unsigned crossed(const il_tumble *t, const il_real a[3], il_real s[3]) {
     for (int k = 0; k < CROSS_STEPS && flags == 0; k++) {
         const il_real last[3] = {s[0], s[1], s[2]};
         for (int i = 0; i < 3; i++) rest[i] = a[i] - t->cross[i] * last[i] * last[(i + 1) % 3];
-        flags = within_range(t, rest, s);
+        flags = within_range(t->order, t->nonlinearity, t->low, t->high, rest, s);
         step = size = IL_C(0.0);
         for (int i = 0; i < 3; i++) {
             step += il_fabs(s[i] - last[i]);
@@ -81,7 +82,7 @@ static inline unsigned tumble_sample(const il_tumble *t, il_real mx, il_real my,
     if (t->has_cross || t->order > 1) {
         const il_real a[3] = {x, y, z};
         il_real s[3];
-        flags |= t->has_cross ? crossed(t, a, s) : within_range(t, a, s);
+        flags |= t->has_cross ? crossed(t, a, s) : within_range(t->order, t->nonlinearity, t->low, t->high, a, s);
         x = s[0];
         y = s[1];
         z = s[2];
@@ -123,10 +124,19 @@ static inline unsigned gyro_sample(const il_gyro *g, il_real mx, il_real my, il_
         y -= g->sensitivity[1][0] * ax + g->sensitivity[1][1] * ay + g->sensitivity[1][2] * az;
         z -= g->sensitivity[2][0] * ax + g->sensitivity[2][1] * ay + g->sensitivity[2][2] * az;
     }
+    unsigned flags = il_finite(x + y + z) ? 0u : (unsigned)IL_NOT_FINITE;
+    if (g->order > 1) {
+        const il_real a[3] = {x, y, z};
+        il_real s[3];
+        flags |= within_range(g->order, g->nonlinearity, g->low, g->high, a, s);
+        x = s[0];
+        y = s[1];
+        z = s[2];
+    }
     *rx = g->turn[0][0] * x + g->turn[0][1] * y + g->turn[0][2] * z;
     *ry = g->turn[1][0] * x + g->turn[1][1] * y + g->turn[1][2] * z;
     *rz = g->turn[2][0] * x + g->turn[2][1] * y + g->turn[2][2] * z;
-    return il_finite(x + y + z) ? 0u : (unsigned)IL_NOT_FINITE;
+    return flags;
 }
 
 unsigned il_gyro_apply(const il_gyro *settings, const il_real output[3], const il_real force[3], il_real rate[3]) {

@@ -13,7 +13,7 @@ EDGES = [-40.0, -30.0, -20.0, -10.0, 0.0, 40.0, 50.0, 60.0]
 SETTLED, TICK = 300.0, 0.005
 
 
-def tumble(order=2, gyro=False, sensitive=False, seed=1) -> Calibration:
+def tumble(order=2, gyro=False, sensitive=False, seed=1, powers=1) -> Calibration:
     rng = np.random.default_rng(seed)
     units = {"b": "m/s^2", "s": "count/(m/s^2)", "m": "rad", "2": "1/(m/s^2)"}
     units |= {str(power): f"1/(m/s^2)^{power - 1}" for power in (3, 4, 5)}
@@ -25,6 +25,9 @@ def tumble(order=2, gyro=False, sensitive=False, seed=1) -> Calibration:
         for i in "xyz":
             parameters[f"gyro_bias_{i}"] = Parameter(rng.uniform(-0.02, 0.02), None, "rad/s")
             parameters[f"gyro_scale_factor_{i}"] = Parameter(rng.uniform(900, 1000), None, "count/(rad/s)")
+            for p in range(2, powers + 1):
+                unit = "1/(rad/s)" + (f"^{p - 1}" if p > 2 else "")
+                parameters[f"gyro_k{p}_{i}"] = Parameter(rng.uniform(-3e-3, 3e-3) / 5 ** (p - 1), None, unit)
             for j in "xyz":
                 if i != j:
                     parameters[f"gyro_misalignment_{i}{j}"] = Parameter(rng.uniform(-0.02, 0.02), None, "rad")

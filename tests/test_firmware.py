@@ -135,10 +135,10 @@ def test_tumble_to_the_last_bit(order, c_core, records):
     assert_near(c_core("float", tables, "tumble", rows), np.column_stack(force), 2e-6 * 2 * G)
 
 
-@pytest.mark.parametrize("sensitive", [False, True])
-def test_gyro_to_the_last_bit(sensitive, c_core):
+@pytest.mark.parametrize(("sensitive", "powers"), [(False, 1), (True, 1), (False, 3), (True, 5)])
+def test_gyro_to_the_last_bit(sensitive, powers, c_core):
     rng = np.random.default_rng(3)
-    table = tables_of(madeup.tumble(1, gyro=True, sensitive=sensitive))[1]
+    table = tables_of(madeup.tumble(1, gyro=True, sensitive=sensitive, powers=powers))[1]
     rows = outputs_of(table, 5.0, rng)  # rad/s, about 300 deg/s
     force = rng.uniform(-2 * G, 2 * G, (MANY, 3))
     force[7, 1] = np.nan

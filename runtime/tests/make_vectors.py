@@ -169,6 +169,25 @@ def gyro():
             ]
             rates.append([sum(d(turn[i][j]) * s[j] for j in range(3)) for i in range(3)])
         emit(f"v_gyro_{name}", rates)
+    settings, bent = [], []
+    for order in range(2, 6):
+        k = [[rng.uniform(-3e-3, 3e-3) / 5 ** (p - 1) for _ in range(3)] for p in range(2, order + 1)]
+        low, high = ([turning([c[i] for c in k], sign) for i in range(3)] for sign in (-1, 1))
+        settings.append([low, high, k + [[0.0] * 3] * (4 - len(k))])
+        rates = []
+        for m, f in zip(output, force):
+            s = [
+                solve(
+                    d(m[i]) * d(gain[i]) - d(bias[i]) - sum(d(g[i][j]) * d(f[j]) for j in range(3)),
+                    [c[i] for c in k],
+                )
+                for i in range(3)
+            ]
+            rates.append([sum(d(turn[i][j]) * s[j] for j in range(3)) for i in range(3)])
+        bent.append(rates)
+    for name, column in zip(("low", "high", "nonlinearity"), zip(*settings)):
+        emit(f"v_gyro_{name}", list(column))
+    emit("v_gyro_bent", bent)
 
 
 def mag():
@@ -502,7 +521,9 @@ def make_blobs(w):
         section(7, words(pieces, terms), counted(w, pieces + 1, -20), counted(w, 9 * pieces * terms, 30))
         for pieces, terms in ((1, 4), (3, 2))
     ]
-    return made + [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field, *laws)]
+    bent = section(2, words(1, 3), counted(w, 24, 1), counted(w, 12, 60))  # of order 3: version 2
+    made += [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field, *laws)]
+    return [*made, blob(w, bent, version=2)]
 
 
 def blobs():
@@ -516,7 +537,7 @@ def blobs():
     LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
     LINES.append(
         "enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16, V_BLOB_MAG = 23,"
-        " V_BLOB_THERMAL = 25 };"
+        " V_BLOB_THERMAL = 25, V_BLOB_BENT = 27 };"
     )
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)

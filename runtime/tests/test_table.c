@@ -46,7 +46,7 @@ static void crc_is_that_of_ieee_802_3(void) {
 }
 
 static void whole_tables_load(void) {
-    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32, 64, 64};
+    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32, 64, 64, 2};
     for (int b = 0; b < V_BLOBS; b++) {
         uint32_t found = 99;
         CHECK(load_exactly(v_blob4[b], v_blob4_size[b], &found) == IL_OK && found == has[b]);
@@ -94,6 +94,12 @@ static void contents_arrive(void) {
             if (sensitive) counted(&unit.gyro.sensitivity[0][0], 9, REAL(1), 15);
             else CHECK(unit.gyro.sensitivity[2][2] == REAL(0));
         }
+        CHECK(il_table_load(&unit, blobs[V_BLOB_BENT], sizes[V_BLOB_BENT], NULL, 0) == IL_OK);
+        CHECK(unit.gyro.order == 3 && unit.gyro.has_sensitivity == 1);
+        counted(&unit.gyro.sensitivity[0][0], 9, REAL(1), 15);
+        counted(unit.gyro.low, 3, REAL(60), 0);
+        counted(unit.gyro.high, 3, REAL(60), 3);
+        counted(&unit.gyro.nonlinearity[0][0], 6, REAL(60), 6);
         for (int order = 1; order <= 2; order++) {
             const int b = V_BLOB_MAG + order - 1;
             CHECK(il_table_load(&unit, blobs[b], sizes[b], NULL, 0) == IL_OK);
@@ -168,7 +174,7 @@ static void every_corruption_is_refused(void) {
                     const il_status status = il_table_load(&unit, bytes, size, NULL, 0);
                     CHECK(status != IL_OK && unit.has == 0);
                     if (at < 8) CHECK(status == IL_TABLE_NOT_TABLE);
-                    if (at == 8 || at == 9) CHECK(status == (at == 8 && bytes[8] == 0 ? IL_TABLE_CORRUPT : IL_TABLE_NEWER));
+                    if (at == 8 || at == 9) CHECK(status == (at == 8 && bytes[8] <= IL_VERSION ? IL_TABLE_CORRUPT : IL_TABLE_NEWER));
                     if (at >= 12 && at < HEAD) CHECK(status == (get_u32(bytes + 12) > size ? IL_TABLE_SHORT : IL_TABLE_LONG));
                     if (at == 10 || at == 11 || at >= HEAD) CHECK(status == IL_TABLE_CORRUPT);
                 }
@@ -229,7 +235,7 @@ static void contents_that_cannot_be_are_refused(void) {
     enum { KIND = 4, LENGTH_WORD = 5, BODY = 6 }; /* words from the start of the blob */
     const uint32_t nan_bits = 0x7FC00000u, inf_bits = 0x7F800000u, minus = 0xBF800000u /* -1 */, zero = 0;
     EXPECT(0, 2, 0x00040000u, IL_TABLE_CONTENT); /* version 0 */
-    EXPECT(0, 2, 0x00040002u, IL_TABLE_NEWER);
+    EXPECT(0, 2, 0x00040003u, IL_TABLE_NEWER);
     EXPECT(0, 2, 0x00020001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00000001u, IL_TABLE_WIDTH);
     EXPECT(0, 2, 0x00080001u, IS_FLOAT ? IL_TABLE_WIDTH : IL_OK); /* no numbers in it */
@@ -253,7 +259,11 @@ static void contents_that_cannot_be_are_refused(void) {
     EXPECT(V_BLOB_MAG, BODY, 3, IL_TABLE_CONTENT); /* order */
     EXPECT(V_BLOB_MAG, BODY, 0, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_MAG + 1, BODY + 18, nan_bits, IL_TABLE_NOT_FINITE);
-    for (int b = V_BLOB_THERMAL; b < V_BLOBS; b++) {
+    EXPECT(V_BLOB_BENT, BODY + 1, 0, IL_TABLE_CONTENT); /* order */
+    EXPECT(V_BLOB_BENT, BODY + 1, 2, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_BENT, BODY + 1, 6, IL_TABLE_CONTENT);
+    EXPECT(V_BLOB_BENT, BODY + 30, nan_bits, IL_TABLE_NOT_FINITE);
+    for (int b = V_BLOB_THERMAL; b < V_BLOB_BENT; b++) {
         EXPECT(b, BODY, 0, IL_TABLE_CONTENT); /* pieces */
         EXPECT(b, BODY, 2, IL_TABLE_CONTENT);
         EXPECT(b, BODY, 65536, IL_TABLE_CONTENT);

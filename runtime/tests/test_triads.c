@@ -198,6 +198,7 @@ static void second_order_is_solved_in_closed_form(void) {
 
 static il_gyro golden_gyro(int sensitive) {
     il_gyro g;
+    memset(&g, 0, sizeof g);
     g.has_sensitivity = sensitive;
     memcpy(g.gain, v_gyro_gain, sizeof g.gain);
     memcpy(g.bias, v_gyro_bias, sizeof g.bias);
@@ -240,6 +241,25 @@ static void gyro_equals_the_equations(void) {
     CHECK_CLOSE(out[1][4], v_gyro_plain[4][1], ROUNDING_LIMIT * REAL(6));
     CHECK(il_gyro_block(&plain, RATES, from, with, 1, to, 1) == 0);
     CHECK_CLOSE(out[1][4], v_gyro_plain[4][1], ROUNDING_LIMIT * REAL(6));
+}
+
+static void gyro_powers_equal_the_equations(void) {
+    for (int order = 2; order <= ORDERS; order++) {
+        il_gyro g = golden_gyro(1);
+        il_real rate[3];
+        const il_real far[3] = {REAL(1e30), REAL(1), REAL(1)}, under[3] = {REAL(0), REAL(0), REAL(0)};
+        g.order = order;
+        memcpy(g.low, v_gyro_low[order - 2], sizeof g.low);
+        memcpy(g.high, v_gyro_high[order - 2], sizeof g.high);
+        memcpy(g.nonlinearity, v_gyro_nonlinearity[order - 2], sizeof g.nonlinearity);
+        for (int k = 0; k < RATES; k++) {
+            CHECK(il_gyro_apply(&g, v_gyro_output[k], v_gyro_force[k], rate) == 0);
+            for (int i = 0; i < 3; i++) CHECK_CLOSE(rate[i], v_gyro_bent[order - 2][k][i], ROUNDING_LIMIT * REAL(20));
+        }
+        g.high[0] = REAL(3);
+        CHECK(il_gyro_apply(&g, far, under, rate) == (unsigned)IL_BEYOND && isnan(rate[0]));
+        CHECK(il_gyro_apply(&g, v_gyro_output[0], NULL, rate) == IL_NOT_FINITE);
+    }
 }
 
 static void gyro_corners(void) {
@@ -372,6 +392,7 @@ void test_triads(void) {
     outputs_beyond_a_turning_point_have_no_force();
     second_order_is_solved_in_closed_form();
     gyro_equals_the_equations();
+    gyro_powers_equal_the_equations();
     gyro_corners();
     mag_equals_the_equations();
     mag_corners();

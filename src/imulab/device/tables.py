@@ -20,7 +20,8 @@ from imulab.errors import RecordError
 from imulab.recording import Array
 from imulab.records.calibration import BLOB_MAGIC, Calibration
 
-VERSION = 1
+VERSION, WITH_POWERS = 1, 2
+"""Of the format; the second where gyroscopes have powers of the rate, which older cores then refuse as newer."""
 TEXT = 0
 KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7}
 
@@ -81,7 +82,10 @@ def pack(tables: Sequence[DeviceTable], width: int, text: Mapping[str, Any] | No
                     raise RecordError(f"{table.kind} {field.name}: {field.values} is beyond what {width} bytes hold")
     sections += [(KINDS[table.kind], table.payload(width)) for table in tables]
     body = b"".join(struct.pack("<II", kind, len(payload)) + payload for kind, payload in sections)
-    head = BLOB_MAGIC + struct.pack("<HHI", VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4)
+    bent = any(table.kind == "gyro" and any(field.name == "order" for field in table.fields) for table in tables)
+    head = BLOB_MAGIC + struct.pack(
+        "<HHI", WITH_POWERS if bent else VERSION, width, len(BLOB_MAGIC) + 8 + len(body) + 4
+    )
     return head + body + struct.pack("<I", zlib.crc32(head + body))
 
 

@@ -53,7 +53,7 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     lost = settle_losses(
         "fusion",
         (accel_terms(unit.accel, misalignment=False), error),
-        ([name for name in names if name == "gyro_g_sensitivity"], drift),
+        ([name for name in names if name.startswith(("gyro_g_sensitivity", "gyro_k"))], drift),
         how=how,
         options=options,
     )

@@ -169,10 +169,20 @@ def gyro_terms(gyro: Gyroscopes, *, bias: bool) -> tuple[list[str], list[str]]:
     if drift > 0:
         names.append("gyro_g_sensitivity")
         costs.append(f"up to {np.degrees(drift):.3g} deg/s within +-1 g")
+    bent, cost = gyro_powers_lost(gyro)
+    names, costs = names + bent, costs + cost
     if bias and np.abs(gyro.bias).max() > 0:
         names.append("gyro_bias")
         costs.append(f"up to {np.degrees(np.abs(gyro.bias).max()):.3g} deg/s of bias")
     return names, costs
+
+
+def gyro_powers_lost(gyro: Gyroscopes) -> tuple[list[str], list[str]]:
+    """Name the powers of the rate, which no target holds, and the largest error that they leave within +-300 deg/s."""
+    rate = np.radians(300.0) * np.array([[-1.0], [1.0]])
+    left = sum((k * rate ** (power + 2) for power, k in enumerate(gyro.nonlinearity)), start=np.zeros((2, 3)))
+    names = [f"gyro_k{power + 2}" for power, k in enumerate(gyro.nonlinearity) if k.any()]
+    return names, [f"up to {np.degrees(np.abs(left).max()):.3g} deg/s within +-300 deg/s"] if names else []
 
 
 def settle_losses(

@@ -13,6 +13,7 @@ from imulab.exporters import ExportOptions
 from imulab.exporters.model import (
     UnitModel,
     accel_terms,
+    gyro_powers_lost,
     held_accelerometers,
     inverse_gain,
     settle_losses,
@@ -108,7 +109,8 @@ def unit_lines(unit: UnitModel) -> list[str]:
 def without_nonlinearity(unit: UnitModel, target: str, options: ExportOptions) -> tuple[UnitModel, list[str]]:
     """Return the unit as a target with a full matrix and a bias holds it, and the comment on what is left out."""
     accel, error, how = held_accelerometers(unit, inverse_gain, misalignment=True)
-    lost = settle_losses(target, (accel_terms(unit.accel, misalignment=False), error), how=how, options=options)
+    bent = ([], []) if unit.gyro is None else gyro_powers_lost(unit.gyro)
+    lost = settle_losses(target, (accel_terms(unit.accel, misalignment=False), error), bent, how=how, options=options)
     if unit.mag is not None:
         comment = "its file has no place for magnetometers: theirs are left out"
         options.tell(f"{target}: {comment}")

@@ -296,13 +296,13 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
 
 
 def beyond_test_of(record: Calibration | Blob, recording: Recording) -> tuple[int, float]:
-    """Return how many samples lie far beyond what the record was made at, and the largest, m/s^2."""
+    """Return how many samples lie far beyond what the record was made at, and the largest, SI."""
     beyond = None if isinstance(record, Blob) else procedure_of(record).beyond
     return (0, 0.0) if beyond is None or isinstance(record, Blob) else beyond(record, recording)
 
 
 def beyond_message(record: Calibration | Blob, count: int, largest: float) -> str:
-    """Say that `count` samples, up to `largest`, m/s^2, lie beyond what the record was made at."""
+    """Say that `count` samples, up to `largest`, SI, lie beyond what the record was made at."""
     assert not isinstance(record, Blob)
     message = procedure_of(record).beyond_message
     assert message is not None

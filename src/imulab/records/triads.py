@@ -1,12 +1,13 @@
 """The triads of a unit as matrices, as other programs hold them: what a procedure makes of its record for exporters.
 
-Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyroscopes: ``M = S (T w + G f + b)``.
-Outputs M are in SI, or in counts or volts. Magnetometers: ``s = T m``, ``A = s + k2 s^2``, ``P M = S (A + b)``.
+Accelerometers: ``s = T f``, ``A = s + k2 s^2 + ...``, ``M = S (A + b)``. Gyroscopes: ``s = T w``,
+``M = S (A + b + G f)``. Outputs M are in SI, or in counts or volts. Magnetometers: ``s = T m``, ``A = s + k2 s^2``,
+``P M = S (A + b)``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,13 +20,17 @@ CROSS_TERMS = ("k_xy", "k_yz", "k_zx")
 
 @dataclass(frozen=True)
 class Gyroscopes:
-    """``M = S (T w + G f + b)``: scale factor (3,), matrix T (3, 3), g-sensitivity G (3, 3), bias (3,), unit of M."""
+    """``M = S (A + G f + b)``, ``A = s + k2 s^2 + ...``, ``s = T w``.
+
+    Scale factor S (3,), matrix T (3, 3), g-sensitivity G (3, 3), bias (3,), unit of M, k2 .. ke (e - 1, 3).
+    """
 
     scale: Array
     matrix: Array
     sensitivity: Array
     bias: Array
     unit: str
+    nonlinearity: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def gain(self) -> Array:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 AXES = "xyz"
 MOUNTINGS = tuple(sign + axis for axis in AXES for sign in "+-")
-ORDERS = ("1", "2", "3", "4", "5")
+ORDERS = ("auto", "1", "2", "3", "4", "5")
 RATES = "0,10,50,100,200,300"
 FENCE = "0.5 deg"
 EARTH = 7.292115e-5

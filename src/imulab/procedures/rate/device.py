@@ -7,14 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from imulab.device.tables import DeviceTable, Field, nonzero, whole
+from imulab.device.gyroscopes import gyro_powers, gyro_table
+from imulab.device.tables import DeviceTable
 from imulab.device.unit import DeviceUnit
-from imulab.errors import DataError, RecordError, UnitError
+from imulab.errors import DataError, UnitError
 from imulab.procedures.rate.choices import AXES
 from imulab.procedures.rate.sections import model_of
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
+
+_BEYOND = 1.05
+"""Noise, bias and the Earth's rate do not exceed the largest rate by more."""
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -23,14 +27,9 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     Raises
     ------
     RecordError
-        The record lacks a parameter, or holds powers of the rate, which the C core does not.
+        The record lacks a parameter, or has one in another unit.
     """
     model = model_of(record)
-    if model.gyro_order != 1:
-        raise RecordError(
-            f"the record describes gyroscopes of order {model.gyro_order}, which the C core does not hold yet; "
-            "expected one made with --order 1"
-        )
     nominal = parse_unit(model.gyro_output_unit)
     usual = from_si(1.0, nominal.symbol) if nominal.quantity == "rate" else 1.0
     scale, bias, misalignment = np.full(3, usual), np.zeros(3), np.eye(3)
@@ -41,13 +40,8 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
             name = f"gyro_misalignment_{axis}{other}"
             if name in record.parameters or model.from_ != "turns":  # turns by hand do not show it
                 misalignment[i, AXES.index(other)] = record.value(name)
-    fields = (
-        Field("has_sensitivity", whole(False)),
-        Field("gain", 1.0 / nonzero(scale)),
-        Field("bias", bias),
-        Field("turn", np.linalg.inv(misalignment)),
-    )
-    return (DeviceTable("gyro", fields, {"output_unit": model.gyro_output_unit, "axes": model.axes}),)
+    columns = {"output_unit": model.gyro_output_unit, "axes": model.axes}
+    return (gyro_table(scale, bias, misalignment, gyro_powers(record), columns),)
 
 
 def apply_rate(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
@@ -77,3 +71,28 @@ def apply_rate(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recordin
         kept[name] = known.symbol if known.quantity == "rate" else "rad/s"
     rate, _ = unit.gyro(outputs, None)
     return recording.with_columns({n: from_si(rate[AXES.index(n[-1])], of) for n, of in kept.items()}, kept)
+
+
+def beyond_rates(record: Calibration, recording: Recording) -> tuple[int, float]:
+    """Return how many samples lie beyond the largest rate tested by more than 5 %, and the largest rate, rad/s."""
+    if "largest_rate" not in record.model:
+        return 0, 0.0
+    model, sizes = model_of(record), [np.zeros(len(recording))]
+    for axis in model.axes:
+        if (name := f"gyro_{axis}") in recording:
+            factor = conversion_factor(recording.units[name], model.gyro_output_unit)
+            rate = recording.column(name) * (factor / record.value(f"gyro_scale_factor_{axis}"))
+            sizes.append(np.abs(rate - record.value(f"gyro_bias_{axis}")))
+    size = np.fmax.reduce(sizes)
+    return int(np.count_nonzero(size > _BEYOND * model.largest_rate.value)), float(size.max(initial=0.0))
+
+
+def beyond_message(record: Calibration, count: int, largest: float) -> str:
+    """Say that so many samples, the largest in rad/s, lie beyond the rates of the test."""
+    model = model_of(record)
+    held = "line" if model.gyro_order == 1 else "polynomial"
+    return (
+        f"{count} samples beyond {from_si(model.largest_rate.value, 'deg/s'):.4g} deg/s (up to "
+        f"{from_si(largest, 'deg/s'):.4g} deg/s), the largest rate of the record's test: its {held} is extrapolated "
+        "there"
+    )

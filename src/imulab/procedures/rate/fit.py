@@ -16,6 +16,7 @@ from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, gyros
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
 from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
+from imulab.procedures.rate.orders import choose_orders
 from imulab.procedures.rate.record import make_record
 from imulab.procedures.rate.simulate import RateRecordings
 from imulab.procedures.rate.solve import Problem, Solution, solve
@@ -56,7 +57,7 @@ def fit_rate(
     *,
     rates: str | Sequence[float] | None = None,
     axis: str = "+z",
-    order: int | str = "1",
+    order: int | str = "auto",
     latitude: float | str | None = None,
     table_uncertainty: float | str | None = None,
     **reading: Unpack[Reading],
@@ -76,7 +77,7 @@ def fit_rate(
     axis
         Of one recording: the body axis along the table axis, about which positive rates turn.
     order
-        Highest power of the rate, 1 to 5.
+        Highest power of the rate, 1 to 5; or, of each gyroscope, as many as its dwells support.
     latitude
         For the Earth's rate, rad; without it that stays in the bias.
     table_uncertainty
@@ -129,23 +130,24 @@ def fit_rate(
         test = replace(test, latitude=place)
     if common is not None:
         test = replace(test, relative_uncertainty=common)
-    return fit_test(test, recordings, int(highest))
+    return fit_test(test, recordings, highest)
 
 
-def fit_test(test: RateTest, recordings: Sequence[Recording], order: int) -> RateFit:
+def fit_test(test: RateTest, recordings: Sequence[Recording], order: str) -> RateFit:
     """Calibrate the gyroscopes of a test from the recordings of its runs; what is raised is as for `fit_rate`."""
     names, unit = _alike(test, recordings)
     dwells = [find_dwells(recording, test, index) for index, recording in enumerate(recordings)]
     problem = _problem(test, dwells, names)
-    _check_rates(test, problem, order)
-    solution = solve(problem, order)
+    _check_rates(test, problem, 1 if order == "auto" else int(order))
+    orders = choose_orders(problem) if order == "auto" else (int(order),) * len(names)
+    solution = solve(problem, orders)
     measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
     _check_signs(test, problem, solution, measured)
     linearity = {}
     for i in measured:
         scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
         linearity[AXES[problem.gyros[i]]] = linearity_of(problem, i, scale)
-    record = make_record(test, recordings, dwells, problem, solution, linearity, order, unit)
+    record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order)
     return RateFit(record, tuple(dwells), linearity)
 
 

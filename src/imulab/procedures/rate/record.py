@@ -31,11 +31,11 @@ def make_record(
     problem: Problem,
     solution: Solution,
     linearity: Mapping[str, Linearity],
-    order: int,
     unit: str,
+    order: str,
 ) -> Calibration:
     """Turn a solution into the record."""
-    names, values, matrix, units = _model_parameters(test, problem, solution, order, unit)
+    names, values, matrix, units = _model_parameters(test, problem, solution, unit)
     nu = solution.cycle_freedom
     parameters = {}
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
@@ -49,7 +49,7 @@ def make_record(
     sensor = {key: text for head in heads for key in ("serial", "model", "element") if (text := head.get(key))}
     temperatures = [t for recording in recordings if (t := recording.mean_temperature()) is not None]
     model: dict[str, Any] = {
-        "gyro_order": order,
+        "gyro_order": max(solution.orders),
         "gyro_output_unit": unit,
         "axes": "".join(linearity),
         "from": "steps",
@@ -64,11 +64,11 @@ def make_record(
         covariance=Covariance((*names, *figures), tuple(map(tuple, joined.tolist()))),
         model=model,
         fit=_fit(test, problem, solution, linearity, dwells),
-        options={"order": order},
+        options={"order": order if order == "auto" else int(order)},
         data={"dwells": _dwells(linearity)},
         sensor={**sensor, **test.sensor},
         sources=tuple(recording.source for recording in recordings if recording.source is not None),
-        warnings=tuple(_findings(test, problem, solution, linearity, parameters, unit, order)),
+        warnings=tuple(_findings(test, problem, solution, linearity, parameters, unit)),
     )
 
 
@@ -84,9 +84,9 @@ class _Entry:
     mounted: float = 0.0
 
 
-def _entries(problem: Problem, solution: Solution, i: int, order: int, unit: str) -> list[_Entry]:
+def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_Entry]:
     """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
-    faces, size, found = problem.faces, len(problem.faces), solution.coefficients[i]
+    faces, size, found, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
     axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
     own, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
     scale = float(found[own])
@@ -116,11 +116,11 @@ def _entries(problem: Problem, solution: Solution, i: int, order: int, unit: str
 
 
 def _model_parameters(
-    test: RateTest, problem: Problem, solution: Solution, order: int, unit: str
+    test: RateTest, problem: Problem, solution: Solution, unit: str
 ) -> tuple[list[str], Array, Array, list[str]]:
     """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate."""
     measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
-    found = [entry for i in measured for entry in _entries(problem, solution, i, order, unit)]
+    found = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
     found.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
     jacobian = np.array([entry.line for entry in found])
     shared = np.array([entry.common for entry in found]) * (test.relative_uncertainty or 0.0)
@@ -203,6 +203,7 @@ def _fit(
                 "loop": found.loop,
                 "repeatability": None if found.repeatability is None else found.repeatability[0],
                 "repeatability_by_noise": None if found.repeatability is None else found.repeatability[1],
+                "order": solution.orders[problem.gyros.index(AXES.index(axis))],
                 "scatter": float(solution.scatter[problem.gyros.index(AXES.index(axis))]),
             }
             for axis, found in linearity.items()
@@ -229,12 +230,11 @@ def _findings(
     linearity: Mapping[str, Linearity],
     parameters: Mapping[str, Parameter],
     unit: str,
-    order: int,
 ) -> list[str]:
     return [
         *_of_unit(parameters, unit),
         *_of_table(test, parameters),
-        *_of_line(linearity, order),
+        *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True))),
         *_of_scatter(problem, solution),
     ]
 
@@ -272,14 +272,15 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter]) -> list[str]:
     return found
 
 
-def _of_line(linearity: Mapping[str, Linearity], order: int) -> list[str]:
+def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int]) -> list[str]:
     found: list[str] = []
     for axis, of in linearity.items():
-        if of.probability < _CHANCE and order == 1:
+        if of.probability < _CHANCE and orders[axis] == 1:
             found.append(
                 Note(
                     f"gyro_{axis}: the output bends by {1e6 * of.nonlinearity[0]:.3g} ppm of the largest rate, beyond "
-                    "the noise of its dwells: --order 2 to 5 describes it"
+                    "the noise of its dwells, and no power of the rate predicts single rates better: may some of the "
+                    "table's be off? (--order 2 to 5 fits powers all the same)"
                 )
             )
         if of.loop is not None and of.loop < _CHANCE and of.hysteresis is not None:

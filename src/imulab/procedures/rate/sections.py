@@ -38,6 +38,7 @@ class OfAxis(Part):
     loop: Size | None
     repeatability: Size | None
     repeatability_by_noise: Size | None
+    order: int
     scatter: Size
 
 

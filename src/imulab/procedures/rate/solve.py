@@ -11,7 +11,7 @@ Chem. 42 (1970) 1194.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -82,6 +82,8 @@ class Solution:
         Gyroscope to slopes over the rates about each face, powers of the rate about its own axis, zeros of the runs.
     covariance
         Of all of them, one gyroscope after the other.
+    orders
+        Highest power of the rate of each gyroscope.
     scatter
         Standard deviation that was added to each dwell, of each gyroscope, output.
     cycle
@@ -94,6 +96,7 @@ class Solution:
 
     coefficients: list[Array]
     covariance: Array
+    orders: tuple[int, ...]
     scatter: Array
     cycle: float
     cycle_freedom: int | None
@@ -111,12 +114,14 @@ def design(problem: Problem, gyro: int, order: int) -> Array:
     return np.column_stack(columns)
 
 
-def solve(problem: Problem, order: int) -> Solution:
-    """Fit all gyroscopes together."""
+def solve(problem: Problem, orders: Sequence[int]) -> Solution:
+    """Fit all gyroscopes together, each with powers of the rate up to its order."""
     count = len(problem.gyros)
     rates = min(len(np.unique(np.round(problem.rate[problem.axis == face], 9))) for face in problem.faces)
-    most = max(order, min(_MOST_POWERS, rates - 2))
-    slopes = [_weighted(design(problem, i, order), problem.mean[:, i], problem.variance[:, i]) for i in range(count)]
+    most = max(*orders, min(_MOST_POWERS, rates - 2))
+    slopes = [
+        _weighted(design(problem, i, orders[i]), problem.mean[:, i], problem.variance[:, i]) for i in range(count)
+    ]
     gains = [found[: len(problem.faces)] for found in slopes]
     blocks = _shared_blocks(problem, gains)
     variance = problem.variance + (_EXACT * np.abs(problem.mean).max()) ** 2
@@ -133,11 +138,11 @@ def solve(problem: Problem, order: int) -> Solution:
         same = problem.run[:, None] == problem.run
         blocks[i, i] = blocks[i, i] + cycle**2 * same * np.outer(own_rate, own_rate) + np.diag(variance[:, i])
     whole = np.block([[blocks[i, k] for k in range(count)] for i in range(count)])
-    columns = _diagonal([design(problem, i, order) for i in range(count)])
+    columns = _diagonal([design(problem, i, orders[i]) for i in range(count)])
     found, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)
-    ends = np.cumsum([0, *(design(problem, i, order).shape[1] for i in range(count))])
+    ends = np.cumsum([0, *(design(problem, i, orders[i]).shape[1] for i in range(count))])
     coefficients = [found[a:b] for a, b in pairwise(ends)]
-    return Solution(coefficients, matrix, scatter, cycle, cycle_freedom, chi_square, freedom)
+    return Solution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
 
 
 def _own(problem: Problem, gains: list[Array], gyro: int) -> float:

@@ -28,7 +28,7 @@ OPTIONS = (
            None, "R,R,..."),
     choice("axis", "Body axis along the table axis, about which positive rates turn; for one recording.", MOUNTINGS,
            "+z"),
-    choice("order", "Highest power of the rate in the model.", ORDERS, "1"),
+    choice("order", "Highest power of the rate in the model.", ORDERS, "auto"),
     measure("latitude", "Of the place, deg, for the Earth's rate.", "angle", "deg", shows="DEG"),
     Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
            lambda text, called: fraction(text, called), None, "FRACTION"),
@@ -63,7 +63,7 @@ def _fit(
     if values["table_uncertainty"] is not None:
         test = replace(test, relative_uncertainty=values["table_uncertainty"])
     recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
-    record = fit_test(test, recordings, int(values["order"])).calibration
+    record = fit_test(test, recordings, str(values["order"])).calibration
     own = source_of(access, name)
     return record if own is None else replace(record, sources=(own, *record.sources))
 

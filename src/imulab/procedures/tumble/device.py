@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from imulab.device.golden import VECTORS
+from imulab.device.gyroscopes import gyro_powers, gyro_table, polynomial
 from imulab.device.tables import DeviceTable, Field, field_of, nonzero, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
@@ -41,8 +42,6 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
             for p in range(2, order + 1)
         ]
     ).reshape(-1, 3)
-    ends = np.array([monotone_range(nonlinearity[:, axis]) for axis in range(3)])
-    largest = float(np.finfo(np.float32).max)
     crossed = CROSS_TERMS[0] in record.parameters
     table = DeviceTable(
         "tumble",
@@ -51,9 +50,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
             Field("gain", 1.0 / nonzero(scale)),
             Field("bias", values_of(record, [f"bias_{axis}" for axis in _AXES], "m/s^2")),
             Field("misalignment", values_of(record, [f"misalignment_{pair}" for pair in ("yx", "zx", "zy")], "rad")),
-            Field("low", np.clip(ends[:, 0], -largest, largest)),
-            Field("high", np.clip(ends[:, 1], -largest, largest)),
-            Field("nonlinearity", nonlinearity),
+            *polynomial(nonlinearity),
             *([Field("cross", values_of(record, CROSS_TERMS, "1/(m/s^2)"))] if crossed else []),
         ),
         {"output_unit": output},
@@ -70,17 +67,12 @@ def _gyro(record: Calibration) -> tuple[DeviceTable, ...]:
     misalignment = np.eye(3)
     for i, j in ((i, j) for i in range(3) for j in range(3) if i != j):
         misalignment[i, j] = record.value(f"gyro_misalignment_{_AXES[i]}{_AXES[j]}")
-    sensitive = "gyro_g_sensitivity_xx" in record.parameters
-    fields = [
-        Field("has_sensitivity", whole(sensitive)),
-        Field("gain", 1.0 / nonzero(scale)),
-        Field("bias", np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES])),
-        Field("turn", np.linalg.inv(misalignment)),
-    ]
-    if sensitive:
-        g = [[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES]
-        fields.append(Field("sensitivity", np.array(g)))
-    return (DeviceTable("gyro", tuple(fields), {"output_unit": model_of(record).gyro_output_unit}),)
+    g = None
+    if "gyro_g_sensitivity_xx" in record.parameters:
+        g = np.array([[record.value(f"gyro_g_sensitivity_{i}{j}") for j in _AXES] for i in _AXES])
+    bias = np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES])
+    columns = {"output_unit": model_of(record).gyro_output_unit}
+    return (gyro_table(scale, bias, misalignment, gyro_powers(record), columns, sensitivity=g),)
 
 
 def _mag(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -121,20 +113,6 @@ def mag_axes(text: str) -> Array:
     if len(text.split()) != 3 or (np.abs(named).sum(axis=0) != 1).any() or (np.abs(named).sum(axis=1) != 1).any():
         raise RecordError(f"the record has mag_axes {text!r}, expected three such as '+y -x +z'")
     return named
-
-
-def monotone_range(nonlinearity: Array) -> tuple[float, float]:
-    """Return the readings between the turning points of ``s + k2 s^2 + ...`` next to zero, infinite without any."""
-    powers = np.concatenate([[0.0, 1.0], nonlinearity])
-    slope = np.polynomial.polynomial.polyder(powers)
-    try:
-        turns = np.polynomial.polynomial.polyroots(slope)
-    except np.linalg.LinAlgError:
-        raise RecordError("the record has a nonlinearity that cannot be: it has no turning points") from None
-    real = turns[np.abs(turns.imag) < 1e-12 * np.maximum(np.abs(turns), 1.0)].real
-    low, high = real[real < 0].max(initial=-np.inf), real[real > 0].min(initial=np.inf)
-    ends = [float(np.polynomial.polynomial.polyval(s, powers)) if np.isfinite(s) else s for s in (low, high)]
-    return ends[0], ends[1]
 
 
 def golden_accelerometers(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:

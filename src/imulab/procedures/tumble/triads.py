@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.device.gyroscopes import gyro_powers
 from imulab.procedures.tumble.device import mag_axes
 from imulab.procedures.tumble.refit import refit_linear
 from imulab.procedures.tumble.sections import data_of, fit_of, model_of
@@ -91,6 +92,7 @@ def _gyroscopes(record: Calibration) -> Gyroscopes | None:
         sensitivity=sensitivity,
         bias=np.array([record.value(f"gyro_bias_{axis}") for axis in _AXES]),
         unit=kept,
+        nonlinearity=gyro_powers(record),
     )
 
 
