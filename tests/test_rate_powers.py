@@ -105,3 +105,17 @@ def test_rates_beyond_the_test_are_told(tmp_path, monkeypatch, capsys):
         assert main(["apply", "r.json", "f.csv", "-o", "out.csv"], project=False) == 0
         error = capsys.readouterr().err
         assert ("50 samples beyond 200 deg/s (up to 3" in error) == said
+
+
+def test_the_threshold_is_the_least_rate_that_shows():
+    """A dead zone of 0.03 deg/s: rates of 0.05 deg/s or less come out at less than half."""
+    way = [0, 0.01, 0.02, 0.05, 0.1, 10, 100, 200, 100, 0, -0.01, -0.02, -0.05, -0.1, -10, -100, -200, -100, 0]
+    made = whole(way=way, faces=("+z",), noise=1e-6, rng=np.random.default_rng(1))
+    (one,) = made.recordings
+    true = (one.column("gyro_z") - SCALE[2] * BIAS[2]) / SCALE[2]
+    dead = np.sign(true) * np.maximum(np.abs(true) - 0.03 * DEGREE, 0)
+    cut = il.Recording({**one.columns, "gyro_z": SCALE[2] * (dead + BIAS[2])}, one.units, name="+z.csv")
+    found = il.fit_rate(type(made)(made.test, (cut,), {})).calibration.parameters["gyro_threshold_z"]
+    assert found.value == pytest.approx(0.1 * DEGREE, rel=1e-6)
+    assert found.standard_uncertainty == pytest.approx(0.05 * DEGREE / np.sqrt(12), rel=1e-6)
+    assert not any("threshold" in name for name in il.fit_rate(whole(faces=("+z",))).calibration.parameters)

@@ -14,7 +14,8 @@ from imulab.units import from_si, parse_unit, to_si
 
 _BLOCK, _SIDE, _SETTLING, _LEAST = 0.1, 5, 3, 10
 """s, and numbers of such blocks: compared on either side, left out at either end, and the shortest dwell."""
-_SIGMAS, _OF_STEP, _RIPPLE = 6.0, 1 / 20, 2e-3
+_SIGMAS, _OF_STEP, _OF_COLUMN, _RIPPLE = 6.0, 1 / 20, 2e-5, 2e-3
+"""Changes that count: of the noise, the smallest listed step, the largest recorded rate, and the rate itself."""
 _BATCHES = 8
 _NEXT_TO = 0.3
 _STANDS = 0.2
@@ -71,8 +72,8 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     recording.column(main)
     check_finite(recording, names)
     time = check_time(recording)
-    outputs = np.column_stack([recording.column(name) for name in names])
-    own = outputs[:, names.index(main)] * run.sign
+    outputs = [recording.column(name) for name in names]
+    own = outputs[names.index(main)] if run.sign > 0 else -outputs[names.index(main)]
     column = _recorded(recording, time)
     if column is None and run.rates is None:
         raise SegmentError(
@@ -81,28 +82,31 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
         )
     recorded = column is not None
     signal = own if column is None else column
-    stretches = _stretches(time, signal, None if column is not None else _smallest_step(run.rates or (), own))
+    size = _block_size(time)
+    blocks = _block_means(signal, size)
+    stretches = _stretches(blocks, size, None if recorded else _smallest_step(run.rates or (), own))
     if len(stretches) < 3:
         raise SegmentError(
             f"{place}: {len(stretches)} stretches of a steady rate found, expected 3 or more of 2 s or longer: are the "
             "steps too short?"
         )
-    reading = np.array([own[a:b].mean() for a, b in stretches])
+    mean = np.array([[values[a:b].mean() for values in outputs] for a, b in stretches])
+    reading = mean[:, names.index(main)] * run.sign
     _check_ends(recording, main, own, stretches, reading, place)
-    _check_axis(names, outputs, stretches, main, place)
+    _check_axis(names, mean, main, place)
     if column is None:
         rate, zero, scale = _listed_rates(reading, stretches, time, run.rates or (), recording, main, place)
-        column = (own - zero) / scale
+        blocks = (blocks - zero) / scale
     else:
         rate = np.array([column[a:b].mean() for a, b in stretches])
-    angle = np.concatenate([[0.0], np.cumsum(np.diff(time) * (column[1:] + column[:-1]) / 2)])
+    cosine, sine = _level(time, blocks, size)
     return Dwells(
         start=np.array([time[a] for a, _ in stretches]),
         stop=np.array([time[b - 1] for _, b in stretches]),
         rate=rate,
-        mean=np.array([outputs[a:b].mean(axis=0) for a, b in stretches]),
-        variance=np.array([_variance(outputs[a:b]) for a, b in stretches]),
-        level=np.array([[np.cos(angle[a:b]).mean(), np.sin(angle[a:b]).mean()] for a, b in stretches]),
+        mean=mean,
+        variance=np.array([[_variance(values[a:b]) for values in outputs] for a, b in stretches]),
+        level=np.array([[part[a // size : b // size].mean() for part in (cosine, sine)] for a, b in stretches]),
         recorded=recorded,
     )
 
@@ -126,15 +130,32 @@ def _smallest_step(rates: tuple[float, ...], own: Array) -> float:
     return float(np.diff(listed).min() / (listed[-1] - listed[0]) * np.ptp(own))
 
 
-def _stretches(time: Array, signal: Array, step: float | None) -> list[tuple[int, int]]:
-    """Return first sample and end of each stretch in which the means of 0.5 s do not change."""
-    size = max(1, round(_BLOCK / float(np.median(np.diff(time)))))
+def _block_size(time: Array) -> int:
+    """Return the number of samples in 0.1 s, by the median step of 10,000 samples over the recording."""
+    which = np.linspace(0, len(time) - 2, min(len(time) - 1, 10_000)).astype(np.int64)
+    return max(1, round(_BLOCK / float(np.median(time[which + 1] - time[which]))))
+
+
+def _block_means(signal: Array, size: int) -> Array:
     count = len(signal) // size
+    return np.asarray(signal[: count * size].reshape(count, size).mean(axis=1))
+
+
+def _level(time: Array, rate: Array, size: int) -> tuple[Array, Array]:
+    """Return the mean cosine and sine of the table's angle over each block, which turns at one rate, shape (n,)."""
+    edges = time[: (len(rate) + 1) * size : size]
+    step = rate * np.diff(edges, append=time[-1])[: len(rate)]
+    middle, part = np.cumsum(step) - step / 2, np.sinc(step / (2 * np.pi))
+    return np.cos(middle) * part, np.sin(middle) * part
+
+
+def _stretches(blocks: Array, size: int, step: float | None) -> list[tuple[int, int]]:
+    """Return first sample and end of each stretch in which the means of 0.5 s do not change."""
+    count = len(blocks)
     if count < 2 * _SIDE + 1:
         return []
-    blocks = signal[: count * size].reshape(count, size).mean(axis=1)
     sigma = float(np.median(np.abs(np.diff(blocks)))) / _ROBUST
-    least = _OF_STEP * (float(np.abs(blocks).max()) / 30 if step is None else step)
+    least = _OF_COLUMN * float(np.abs(blocks).max()) if step is None else _OF_STEP * step
     sums = np.concatenate([[0.0], np.cumsum(blocks)])
     k = np.arange(_SIDE, count - _SIDE + 1)
     change = np.abs(sums[k + _SIDE] - 2 * sums[k] + sums[k - _SIDE]) / _SIDE
@@ -160,11 +181,10 @@ def _stretches(time: Array, signal: Array, step: float | None) -> list[tuple[int
     return found
 
 
-def _variance(outputs: Array) -> Array:
-    """Return the variance of the mean of outputs by the means of its batches, shape (g,)."""
-    size = len(outputs) // _BATCHES
-    means = outputs[: size * _BATCHES].reshape(_BATCHES, size, -1).mean(axis=1)
-    return np.asarray(means.var(axis=0, ddof=1) / _BATCHES)
+def _variance(values: Array) -> float:
+    """Return the variance of the mean of an output by the means of its batches."""
+    size = len(values) // _BATCHES
+    return float(values[: size * _BATCHES].reshape(_BATCHES, size).mean(axis=1).var(ddof=1) / _BATCHES)
 
 
 def _check_ends(
@@ -184,9 +204,9 @@ def _check_ends(
             )
 
 
-def _check_axis(names: list[str], outputs: Array, stretches: list[tuple[int, int]], main: str, place: str) -> None:
+def _check_axis(names: list[str], mean: Array, main: str, place: str) -> None:
     """Refuse a run in which another gyroscope than that along the table axis follows the table."""
-    span = np.ptp(np.array([outputs[a:b].mean(axis=0) for a, b in stretches]), axis=0)
+    span = np.ptp(mean, axis=0)
     most = names[int(np.argmax(span))]
     if span[names.index(main)] < _WRONG * span.max():
         raise DataError(f"{place}: the table's rates are seen by {most}, not by {main}: expected mounting +{most[-1]}")

@@ -18,6 +18,8 @@ from imulab.recording import Array
 
 _EXACT = 1e-10
 _CHANCE = 0.01
+_ONE_SIDED = 1.645
+_SMALL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Linearity:
         both ways.
     repeatability
         Standard deviation of the scale factor over runs, and what noise makes of it; None with one run.
+    threshold
+        Least rate that shows, and its standard uncertainty by the rates below it, rad/s; None without small rates.
     """
 
     rate: Array
@@ -54,6 +58,7 @@ class Linearity:
     by_noise: float
     loop: float | None
     repeatability: tuple[float, float] | None
+    threshold: tuple[float, float] | None
 
 
 def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
@@ -90,6 +95,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
         by_noise=reach * float(spread.max()) / largest,
         loop=loop,
         repeatability=_repeatability(rate, values, variance, runs),
+        threshold=_threshold(rate, problem.table[own], left, variance, key),
     )
 
 
@@ -172,3 +178,27 @@ def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np
         return None
     table = np.array(found)
     return float(table[:, 0].std(ddof=1)), float(np.sqrt(table[:, 1].mean()))
+
+
+def _threshold(
+    rate: Array, table: Array, left: Array, variance: Array, key: NDArray[Any]
+) -> tuple[float, float] | None:
+    """Return the least rate from which on the output exceeds half of what the line says, by 95 %, and its uncertainty.
+
+    None where no rate of the table is below a thousandth of the largest and all of them show.
+    """
+    zero = 1 / float(np.sum(1 / variance))
+    rows = []
+    for k in np.unique(key[np.abs(table) > 1e-9 * np.abs(table).max()]):
+        which = key == k
+        size = abs(float(rate[which].mean()))
+        response = float(np.sign(rate[which].mean()) * (rate + left)[which].mean())
+        u = np.sqrt(variance[which].sum() / which.sum() ** 2 + zero)
+        rows.append((size, response - _ONE_SIDED * u > size / 2))
+    rows.sort()
+    sizes, shows = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+    if not shows[-1] or (shows.all() and sizes[0] > _SMALL * sizes[-1]):
+        return None
+    first = int(np.max(np.flatnonzero(~shows) + 1, initial=0))
+    below = float(sizes[first - 1]) if first else 0.0
+    return float(sizes[first]), float(sizes[first] - below) / np.sqrt(12)

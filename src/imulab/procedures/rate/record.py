@@ -170,11 +170,11 @@ def _between_faces(problem: Problem, solution: Solution, axis: int) -> float:
 
 def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
     found = {}
-    for kind in ("nonlinearity", "asymmetry", "hysteresis"):
+    for kind, unit in (("nonlinearity", "1"), ("asymmetry", "1"), ("hysteresis", "1"), ("threshold", "rad/s")):
         for axis, of in linearity.items():
             pair = getattr(of, kind)
             if pair is not None:
-                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], "1")
+                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], unit)
     return found
 
 
