@@ -9,6 +9,7 @@ import numpy as np
 from imulab.errors import DataError, SegmentError
 from imulab.procedures.rate.choices import AXES
 from imulab.procedures.rate.manifest import RateTest
+from imulab.procedures.rate.sweep import Sweep, is_smooth, rate_of_angle, reduce_sweep
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import from_si, parse_unit, to_si
 
@@ -17,6 +18,8 @@ _BLOCK, _SIDE, _SETTLING, _LEAST = 0.1, 5, 3, 10
 _SIGMAS, _OF_STEP, _OF_COLUMN, _RIPPLE = 6.0, 1 / 20, 2e-5, 2e-3
 """Changes that count: of the noise, the smallest listed step, the largest recorded rate, and the rate itself."""
 _BATCHES = 8
+_HELD, _OF_RANGE, _SWEEP, _FLAT = 0.3, 0.02, 500, 0.03
+"""Share of a run that makes it steps, of its rates that a step keeps to; samples of a sweep; rates at one output."""
 _NEXT_TO = 0.3
 _STANDS = 0.2
 _WRONG = 0.5
@@ -40,6 +43,9 @@ class Dwells:
         Mean cosine and sine of the table's angle, shape (n, 2).
     recorded
         Whether the rates are those of a column of the recording.
+    sweep
+        Delay and bandwidth of the gyroscope along the table axis where the rate changed all the time, and the dwells
+        are means by rate, rising ones first; else None.
     """
 
     start: Array
@@ -49,6 +55,7 @@ class Dwells:
     variance: Array
     level: Array
     recorded: bool
+    sweep: Sweep | None = None
 
 
 def gyro_columns(recording: Recording) -> list[str]:
@@ -85,6 +92,12 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     size = _block_size(time)
     blocks = _block_means(signal, size)
     stretches = _stretches(blocks, size, None if recorded else _smallest_step(run.rates or (), own))
+    if run.sweep and column is None:
+        raise SegmentError(
+            f"{place}: a sweep needs the table's rate at every sample: expected table_rate or table_angle"
+        )
+    if column is not None and (run.sweep or (_held(blocks, stretches, size) < _HELD and is_smooth(column, blocks))):
+        return _swept(recording, time, column, outputs, names, main, place)
     if len(stretches) < 3:
         raise SegmentError(
             f"{place}: {len(stretches)} stretches of a steady rate found, expected 3 or more of 2 s or longer: are the "
@@ -111,6 +124,42 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     )
 
 
+def _held(blocks: Array, stretches: list[tuple[int, int]], size: int) -> float:
+    """Return the share of a run in which its rate is that of a step."""
+    within = _OF_RANGE * float(np.ptp(blocks))
+    parts = [blocks[a // size : b // size] for a, b in stretches]
+    return sum(len(part) for part in parts if np.ptp(part) < within) / max(len(blocks), 1)
+
+
+def _swept(
+    recording: Recording, time: Array, rate: Array, outputs: list[Array], names: list[str], main: str, place: str
+) -> Dwells:
+    """Return the means by rate of a run whose rate changed all the time."""
+    if np.ptp(rate) <= 0 or len(time) < _SWEEP:
+        raise SegmentError(f"{place}: {len(time)} samples of a rate that does not change; expected a sweep, or steps")
+    own = names.index(main)
+    sweep, found = reduce_sweep(time, rate, outputs, own)
+    _check_axis(names, found.mean, main, place)
+    for end in (float(outputs[own].max()), float(outputs[own].min())):
+        still = outputs[own] == end
+        if still.sum() >= _LEAST and np.ptp(rate[still]) > _FLAT * np.ptp(rate):
+            raise DataError(
+                f"{place}: {main} stands still at {end:.6g} {recording.units[main]} while the rate changes: its output "
+                "is saturated; expected rates within its range"
+            )
+    half = found.duration / 2
+    return Dwells(
+        start=found.middle - half,
+        stop=found.middle + half,
+        rate=found.rate,
+        mean=found.mean,
+        variance=found.variance,
+        level=np.zeros((len(found.rate), 2)),
+        recorded=True,
+        sweep=sweep,
+    )
+
+
 def _recorded(recording: Recording, time: Array) -> Array | None:
     """Return the rate of the table that a recording holds, rad/s, shape (n,)."""
     for name, quantity in (("table_rate", "rate"), ("table_angle", "angle")):
@@ -120,7 +169,7 @@ def _recorded(recording: Recording, time: Array) -> Array | None:
         if parse_unit(recording.units[name]).quantity != quantity:
             raise DataError(f"{recording.name}: column {name}: expected a unit of {quantity}")
         values = recording.si(name)
-        return values if quantity == "rate" else np.gradient(np.unwrap(values), time)
+        return values if quantity == "rate" else rate_of_angle(np.unwrap(values), time)
     return None
 
 

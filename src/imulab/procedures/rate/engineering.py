@@ -14,6 +14,8 @@ def shown(name: str, unit: str) -> tuple[float, float, str]:
     """Return the factor and offset from SI and the unit in which a parameter is read."""
     if name.startswith("gyro_bias"):
         return from_si(1.0, "deg/h"), 0.0, "deg/h"
+    if name.startswith("gyro_delay"):
+        return 1e3, 0.0, "ms"
     if name.startswith("gyro_threshold"):
         return from_si(1.0, "deg/s"), 0.0, "deg/s"
     if name.startswith("gyro_misalignment"):

@@ -8,6 +8,7 @@ import numpy as np
 
 from imulab.procedures.rate.engineering import rows as engineering_rows
 from imulab.procedures.rate.sections import Rate, Seen, rate_of
+from imulab.procedures.rate.sweeprecord import sweep_table
 from imulab.procedures.rate.turnrecord import turns_exhibits
 from imulab.records.calibration import Calibration
 from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
@@ -41,6 +42,7 @@ def exhibits(record: Calibration) -> Exhibits:
         _parameters(record),
         *(_left(a, found.data.dwells) for a in axes),
         _of_line(record, found),
+        *([sweep_table(found.fit.sweeps)] if "sweeps" in record.fit else []),
         _budget(record, found),
     ]
     return Exhibits(headline, facts, items)

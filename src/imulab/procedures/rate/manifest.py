@@ -24,11 +24,15 @@ _MOUNTING = 'mounting = { standard_uncertainty = 0.3, unit = "mrad" }'
 
 @dataclass(frozen=True)
 class Run:
-    """One recording: the body axis along the table's (``+z``), and the rates of the table, rad/s, None if recorded."""
+    """One recording: the body axis along the table's (``+z``), the rates of the table, rad/s, None if recorded.
+
+    And whether the rate changes all the time, which is found out where it is not said.
+    """
 
     file: str
     mounting: str
     rates: tuple[float, ...] | None = None
+    sweep: bool = False
 
     @property
     def axis(self) -> int:
@@ -140,11 +144,16 @@ def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
     file, mounting, rates = entry.get("file"), entry.get("mounting"), entry.get("rates")
     if not isinstance(file, str) or not file:
         raise ReadError(f'{place}: expected file = "NAME.csv", found {quoted(file)}')
-    check_keys(entry, ("file", "mounting", "rates"), f"{place} ({file})")
+    check_keys(entry, ("file", "mounting", "rates", "sweep"), f"{place} ({file})")
     if mounting not in MOUNTINGS:
         raise ReadError(f"{place} ({file}): mounting: expected one of {' '.join(MOUNTINGS)}, found {quoted(mounting)}")
+    sweep = entry.get("sweep", False)
+    if not isinstance(sweep, bool) or (sweep and rates is not None):
+        raise ReadError(
+            f"{place} ({file}): sweep: expected true or false, and no rates beside true, found {quoted(sweep)}"
+        )
     if rates is None:
-        return Run(file, str(mounting))
+        return Run(file, str(mounting), sweep=sweep)
     if not isinstance(rates, list) or len(set(map(str, rates))) < 2:
         raise ReadError(f"{place} ({file}): rates: expected a list of two rates or more, found {quoted(rates)}")
     numbers = tuple(to_si(number_of(rate, f"{place} ({file}): rates"), unit) for rate in rates)
@@ -168,4 +177,6 @@ def manifest_text(test: RateTest) -> str:
         if run.rates is not None:
             listed_rates = ", ".join(f"{from_si(rate, 'deg/s'):.9g}" for rate in run.rates)
             lines.append(f"rates = [{listed_rates}]")
+        if run.sweep:
+            lines.append("sweep = true")
     return "\n".join(lines) + "\n"

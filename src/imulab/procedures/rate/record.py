@@ -14,6 +14,7 @@ from imulab.procedures.rate.dwells import Dwells
 from imulab.procedures.rate.linearity import Linearity
 from imulab.procedures.rate.manifest import RateTest
 from imulab.procedures.rate.solve import Problem, Solution
+from imulab.procedures.rate.sweeprecord import dynamics_of, of_sines, swept
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si, parse_unit
@@ -41,7 +42,7 @@ def make_record(
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
         wide = coverage_factor(float(nu)) * u if nu is not None and name.startswith("gyro_scale_factor") else None
         parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
-    figures = _figures(linearity)
+    figures = _figures(linearity) | dynamics_of(test, dwells)
     joined = np.zeros((len(matrix) + len(figures),) * 2)
     joined[: len(matrix), : len(matrix)] = matrix
     joined[len(matrix) :, len(matrix) :] = np.diag([(p.standard_uncertainty or 0.0) ** 2 for p in figures.values()])
@@ -52,7 +53,7 @@ def make_record(
         "gyro_order": max(solution.orders),
         "gyro_output_unit": unit,
         "axes": "".join(linearity),
-        "from": "steps",
+        "from": "steps" if all(found.sweep is None for found in dwells) else "a sweep",
         "frame": "the faces on which the unit was mounted",
         "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
     }
@@ -63,12 +64,15 @@ def make_record(
         parameters=parameters | figures,
         covariance=Covariance((*names, *figures), tuple(map(tuple, joined.tolist()))),
         model=model,
-        fit=_fit(test, problem, solution, linearity, dwells),
+        fit=_fit(test, problem, solution, linearity, dwells) | swept(test, dwells),
         options={"order": order if order == "auto" else int(order)},
         data={"dwells": _dwells(linearity)},
         sensor={**sensor, **test.sensor},
         sources=tuple(recording.source for recording in recordings if recording.source is not None),
-        warnings=tuple(_findings(test, problem, solution, linearity, parameters, unit)),
+        warnings=(
+            *_findings(test, problem, solution, linearity, parameters, unit),
+            *of_sines(test, dwells),
+        ),
     )
 
 

@@ -42,6 +42,19 @@ class OfAxis(Part):
     scatter: Size
 
 
+class Swept(Part):
+    """One of ``fit.sweeps``; s and Hz."""
+
+    file: str
+    axis: str
+    frequency: Size | None
+    delay: float
+    delay_uncertainty: Size
+    bandwidth: Size | None
+    bandwidth_uncertainty: Size | None
+    bandwidth_beyond: Size | None
+
+
 class Fit(Part):
     """``fit``."""
 
@@ -53,6 +66,7 @@ class Fit(Part):
     rate_uncertainty: Quantity
     mounting_uncertainty: Size | None
     axes: dict[str, OfAxis]
+    sweeps: list[Swept]
 
 
 class Seen(Part):

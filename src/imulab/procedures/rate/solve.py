@@ -48,6 +48,8 @@ class Problem:
         Mean cosine and sine of the table's angle, shape (n, 2).
     rate_uncertainty
         Of each commanded rate, rad/s.
+    scale_error
+        What each dwell's run adds to its scale factor, which delay and bandwidth share with it, shape (n,).
     """
 
     gyros: tuple[int, ...]
@@ -60,6 +62,7 @@ class Problem:
     variance: Array
     level: Array
     rate_uncertainty: float
+    scale_error: Array | None = None
 
     @property
     def runs(self) -> int:
@@ -136,7 +139,8 @@ def solve(problem: Problem, orders: Sequence[int]) -> Solution:
     for i in range(count):
         own_rate = np.where(problem.axis == problem.gyros[i], problem.rate * _own(problem, gains, i), 0.0)
         same = problem.run[:, None] == problem.run
-        blocks[i, i] = blocks[i, i] + cycle**2 * same * np.outer(own_rate, own_rate) + np.diag(variance[:, i])
+        of_run = cycle**2 if problem.scale_error is None else cycle**2 + problem.scale_error**2
+        blocks[i, i] = blocks[i, i] + of_run * same * np.outer(own_rate, own_rate) + np.diag(variance[:, i])
     whole = np.block([[blocks[i, k] for k in range(count)] for i in range(count)])
     columns = _diagonal([design(problem, i, orders[i]) for i in range(count)])
     found, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)

@@ -1,0 +1,152 @@
+"""Rates that change all the time: delay and bandwidth apart from the scale factor, by a simulator that steps finely."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from reference.rate import DEGREE
+
+FREQUENCY, OVER = 200, 20
+SCALE, LAG, DELAY = 1.004, 5e-3, 4e-3
+
+
+def swept(kind="chirp", duration=30.0, noise=0.0, k3=0.0, name="z.csv", angle=False, seed=1, sign=1):
+    """A unit behind a first-order lag and a delay, stepped 20 times a sample; rates of the table in deg/s."""
+    fine = FREQUENCY * OVER
+    t = np.arange(int(duration * fine)) / fine
+    phase = 2 * np.pi * (t if kind == "sine" else 0.05 * t + 1.95 * t**2 / (2 * duration))
+    table = 100 * np.sin(phase)
+    if kind == "ramp":
+        table = 100 * (np.abs(4 * ((t / 10 + 0.25) % 1) - 2) - 1)
+    if kind == "staircase":
+        table = 20.0 * np.floor(t / 0.4 % 10)
+    keep, felt, last = np.exp(-1 / fine / LAG), np.empty_like(table), table[0]
+    for k, value in enumerate(table):
+        last = keep * last + (1 - keep) * value
+        felt[k] = last
+    shift = round(DELAY * fine)
+    felt = np.concatenate([np.full(shift, felt[0]), felt[:-shift]])[::OVER] * DEGREE * sign
+    rng = np.random.default_rng(seed)
+    out = {"gyro_x": 2e-3 * felt, "gyro_y": -3e-3 * felt, "gyro_z": SCALE * (felt + k3 * felt**3 + 3e-3)}
+    columns = {n: v / DEGREE + noise * rng.standard_normal(len(v)) for n, v in out.items()}
+    at = {"time": np.arange(len(felt)) / FREQUENCY}
+    turned = {"table_rate": table[::OVER]}
+    if angle:
+        turned = {"table_angle": np.degrees(np.cumsum(table * DEGREE) / fine)[::OVER]}
+    units = {n: "s" if n == "time" else "deg" if "angle" in n else "deg/s" for n in (*at, *columns, *turned)}
+    return il.Recording({**at, **columns, **turned}, units, name=name)
+
+
+TRUE_DELAY = LAG + DELAY - 0.5 / FREQUENCY / OVER  # the lag takes the rate at the end of each fine step
+
+
+@pytest.mark.parametrize("angle", [False, True])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_sweep_tells_delay_and_bandwidth_from_the_scale_factor(angle, sign):
+    fit = il.fit_rate(swept(angle=angle, sign=sign), axis="+z" if sign > 0 else "-z")
+    found = fit.calibration.parameters
+    assert found["gyro_scale_factor_z"].value * DEGREE == pytest.approx(SCALE, rel=3e-6)
+    assert found["gyro_delay_z"].value == pytest.approx(TRUE_DELAY + angle * 0.5 / FREQUENCY / OVER, abs=3e-5)
+    assert found["gyro_bandwidth_z"].value == pytest.approx(1 / (2 * np.pi * LAG), rel=2e-3)
+    assert found["gyro_bandwidth_z"].unit == "Hz"
+    assert fit.calibration.model["from"] == "a sweep"
+
+
+def test_a_sweep_shows_powers_of_the_rate():
+    found = il.fit_rate(swept(k3=1e-4, noise=2e-3)).calibration
+    assert found.fit["axes"]["z"]["order"] == 3
+    k3 = found.parameters["gyro_k3_z"]
+    assert abs(k3.value - 1e-4) < 4 * k3.standard_uncertainty
+    assert k3.standard_uncertainty < 1e-5
+
+
+def test_of_one_sine_the_amplitude_at_its_frequency_is_found_and_said():
+    record = il.fit_rate(swept("sine")).calibration
+    omega = 2 * np.pi
+    fine = 1 / (FREQUENCY * OVER)
+    keep = np.exp(-fine / LAG)
+    response = (1 - keep) / (1 - keep * np.exp(-1j * omega * fine))  # of the lag as it is stepped
+    expected = SCALE * abs(response)
+    assert record.value("gyro_scale_factor_z") * DEGREE == pytest.approx(expected, rel=2e-6)
+    delay = DELAY - np.angle(response) / omega
+    assert record.value("gyro_delay_z") == pytest.approx(delay, abs=1e-6)
+    assert "gyro_bandwidth_z" not in record.parameters
+    assert any("one sine of 1 Hz: the scale factor is the amplitude at that frequency" in w for w in record.warnings)
+
+
+def test_a_slow_triangle_serves_as_a_sweep():
+    found = il.fit_rate(swept("ramp", noise=0.02)).calibration
+    scale = found.parameters["gyro_scale_factor_z"]
+    assert abs(scale.value * DEGREE - SCALE) < 4 * scale.standard_uncertainty * DEGREE
+    assert scale.standard_uncertainty < 50e-6 * scale.value
+    assert found.value("gyro_delay_z") == pytest.approx(TRUE_DELAY, abs=2e-4)
+
+
+def test_the_errors_of_a_sweep_are_those_that_the_record_states():
+    clean, scores = swept(), []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        noisy = {n: v + 0.05 * rng.standard_normal(len(v)) for n, v in clean.columns.items() if n.startswith("gyro")}
+        made = dataclasses.replace(clean, columns={**clean.columns, **noisy})
+        found = il.fit_rate(made).calibration.parameters
+        true = {"scale_factor": SCALE / DEGREE, "delay": TRUE_DELAY, "bandwidth": 1 / (2 * np.pi * LAG)}
+        scores.append(
+            [(found[f"gyro_{n}_z"].value - v) / found[f"gyro_{n}_z"].standard_uncertainty for n, v in true.items()]
+        )
+    # 12 squares scatter by 0.41 about 1; the scale factor's uncertainty is known to be a quarter too large
+    squares = np.square(scores).mean(axis=0)
+    assert (squares > 0.1).all()
+    assert (squares < 1 + 3 * 0.41).all()
+
+
+def test_a_manifest_says_that_a_run_is_a_sweep(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    il.write(swept(), "z.csv")
+    text = '[[run]]\nfile = "z.csv"\nmounting = "+z"\n'
+    for more, status, said in (
+        ("sweep = true", 0, ""),
+        ("", 0, ""),
+        ("sweep = 1", 2, "sweep: expected true or false"),
+        ("sweep = true\nrates = [0, 10, -10]", 2, "no rates beside true"),
+    ):
+        Path("t.toml").write_text(text + more, encoding="utf-8")
+        assert main(["rate", "fit", "t.toml", "-o", "r.json", "--report", "r.html"], project=False) == status
+        assert said in capsys.readouterr().err
+    page = Path("r.html").read_text(encoding="utf-8")
+    assert "Sweeps" in page
+    assert "delay, ms" in page
+    sweeps = json.loads(Path("r.json").read_text())["fit"]["sweeps"]
+    assert sweeps[0]["file"] == "z.csv"
+    assert main(["show", "r.json"], project=False) == 0
+    assert "gyro_delay_z" in capsys.readouterr().out
+
+
+def _clipped():
+    made = swept()
+    return dataclasses.replace(made, columns={**made.columns, "gyro_z": np.clip(made.column("gyro_z"), -80, 80)})
+
+
+def _without_table():
+    made = swept()
+    return dataclasses.replace(made, columns={n: v for n, v in made.columns.items() if n != "table_rate"})
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (_clipped, "while the rate changes: its output is saturated"),
+        (lambda: swept("staircase"), "are the steps too short"),
+        (_without_table, "no column table_rate or table_angle"),
+        (lambda: dataclasses.replace(swept(), columns={**(s := swept()).columns, "gyro_x": s.column("gyro_z"),
+                                                       "gyro_z": s.column("gyro_x")}), "are seen by gyro_x"),
+    ],
+)  # fmt: skip
+def test_what_is_no_sweep_is_refused_in_a_line(made, said):
+    with pytest.raises(il.ImulabError, match=said) as refused:
+        il.fit_rate(made())
+    assert "\n" not in str(refused.value)
