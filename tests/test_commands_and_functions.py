@@ -48,6 +48,7 @@ FUNCTIONS = {
     "noise simulate": il.simulate_noise,
     "thermal simulate": il.simulate_thermal,
     "thermal fit": il.fit_thermal,
+    "rate plan": il.plan_rate,
     "rate simulate": il.simulate_rate,
     "rate fit": il.fit_rate,
     "rate turn": il.fit_turns,
@@ -242,6 +243,21 @@ MADE = {
     "noise plan": (
         ["--white", "0.3 deg/sqrt(h)", "--walk", "1e-6", "--for", "walk=20%", "--rate", "50", "-o", "one.csv"],
         lambda out: il.plan_noise(white=DEGREE * 0.3 / 60, walk=1e-6, for_={"walk": 0.2}, rate=50.0).save(out),
+    ),
+    "rate plan": (
+        [
+            "--rates",
+            "0,90,300",
+            "--noise",
+            "noise.json",
+            "--of",
+            "reading",
+            "--uncertainty",
+            "50ppm",
+            "-o",
+            "one.toml",
+        ],
+        lambda out: il.plan_rate("0,90,300", noise="noise.json", of="reading", uncertainty=5e-5).save(out),
     ),
     "noise simulate": (
         [
@@ -477,12 +493,13 @@ def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
         lambda: il.plan_warmup(),
         lambda: il.plan_centrifuge(),
         lambda: il.plan_noise(white="0.3 deg/sqrt(h)", walk="10 deg/h/sqrt(h)", gm="5 deg/h:100 s"),
+        lambda: il.plan_rate(arw="0.3 deg/sqrt(h)"),
         lambda: il.simulate_centrifuge(),
         lambda: il.simulate_warmup(),
         lambda: il.simulate_thermal(attitudes=2),
         lambda: il.simulate_rate(hold=1.0),
     ],
-    ids=["tumble", "warmup", "centrifuge", "noise", "rig", "cycles", "chamber", "table"],
+    ids=["tumble", "warmup", "centrifuge", "noise", "rates", "rig", "cycles", "chamber", "table"],
 )
 def test_results_show_themselves_in_twelve_lines_at_most(made):
     result = made()

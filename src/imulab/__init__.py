@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from imulab.procedures.noise.simulate import simulate_noise as simulate_noise
     from imulab.procedures.rate.fit import RateFit as RateFit
     from imulab.procedures.rate.fit import fit_rate as fit_rate
+    from imulab.procedures.rate.plan import plan_rate as plan_rate
     from imulab.procedures.rate.simulate import simulate_rate as simulate_rate
     from imulab.procedures.rate.turns import TurnsFit as TurnsFit
     from imulab.procedures.rate.turns import fit_turns as fit_turns
@@ -137,6 +138,7 @@ _HOME = {
     "normal_gravity": "gravity",
     "plan_centrifuge": "procedures.centrifuge.plan",
     "plan_noise": "procedures.noise.plan",
+    "plan_rate": "procedures.rate.plan",
     "plan_tumble": "procedures.tumble.planning",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",

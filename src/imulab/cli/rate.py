@@ -1,24 +1,100 @@
-"""``imulab rate``: simulate, fit and turn."""
+"""``imulab rate``: plan, simulate, fit and turn."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from imulab.cli.fit_options import READ, reading, with_options
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, read_recording
+from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs, read_recording, warn
+from imulab.errors import OptionError
 from imulab.procedures.rate.choices import FENCE, RATES
 from imulab.procedures.rate.task import OPTIONS
+
+if TYPE_CHECKING:
+    from imulab.procedures.rate.plan import RatePlan
+    from imulab.procedures.rate.turnplan import TurnPlan
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
+    group.command("plan")(plan)
     group.command("simulate")(simulate)
     group.command("fit")(fit)
     group.command("turn")(turn)
     return group
+
+
+def plan(
+    rates: Annotated[str, typer.Option(metavar="R,R,...", help="Sizes of the rates, deg/s.")] = RATES,
+    arw: Annotated[str | None, typer.Option(metavar="N", help="Angle random walk, deg/sqrt(h).")] = None,
+    bias_instability: Annotated[str | None, typer.Option(metavar="B", help="Bias instability, deg/h.")] = None,
+    noise: Annotated[str | None, typer.Option(metavar="RECORD", help="Both, from a record of noise fit.")] = None,
+    uncertainty: Annotated[str, typer.Option(help="Wanted of the mean of a stay, a fraction.")] = "20 ppm",
+    of: Annotated[str, typer.Option(help="Fraction of what: the largest rate (full) or each (reading).")] = "full",
+    faces: Annotated[str, typer.Option(help="Body axes up along the table axis, one after the other.")] = "+x,+y,+z",
+    cycles: Annotated[str, typer.Option(help="Runs of each face; 5 for repeatability.")] = "3",
+    order: Annotated[str, typer.Option(help="Highest power of the rate that the fit is to have.")] = "1",
+    latitude: Annotated[str | None, typer.Option(help="Of the place, deg, for the manifest.")] = None,
+    table_uncertainty: Annotated[
+        str | None, typer.Option(metavar="FRACTION", help="That all rates have in common, such as 20ppm.")
+    ] = None,
+    turn: Annotated[
+        str | None, typer.Option(metavar="FRACTION", help="Turns by hand in place of a table, such as 0.02%.")
+    ] = None,
+    fence: Annotated[str, typer.Option(help="Of those turns: of the difference of two stops, deg.")] = FENCE,
+    output: Annotated[
+        str | None, typer.Option("-o", "--output", metavar="TEST.toml", help="Manifest, or .csv list of stays.")
+    ] = None,
+    json: AsJson = False,
+) -> None:
+    """Say how long to stay at each rate and what the test will give, and write the manifest that rate fit takes."""
+    from imulab.procedures.rate.plan import RatePlan, plan_rate
+    from imulab.shown import aligned
+
+    check_outputs([output], [noise] if noise else [])
+    if output is not None and not output.lower().endswith((".toml", ".csv")):
+        raise OptionError(f"{output}: expected a name that ends in .toml (the manifest) or .csv (the list of stays)")
+    result = call(
+        plan_rate, rates=rates, arw=arw, bias_instability=bias_instability, noise=noise, uncertainty=uncertainty,
+        of=of, faces=faces, cycles=cycles, order=order, latitude=latitude, table_uncertainty=table_uncertainty,
+        turn=turn, fence=fence,
+    )  # fmt: skip
+    if output is not None:
+        if not isinstance(result, RatePlan):
+            raise OptionError(f"{output}: turns by hand have no manifest; expected --turn without -o")
+        result.save(output)
+    head, titles, rows = result.shown()
+    print(_plan_json(result) if json else "\n".join([head, *aligned(titles, rows)]))
+    if output is not None and not json:
+        print(f"{'plan' if output.lower().endswith('.csv') else 'manifest'}: {output}")
+    for message in result.warnings if isinstance(result, RatePlan) else ():
+        warn(message)
+
+
+def _plan_json(result: RatePlan | TurnPlan) -> str:
+    from imulab.procedures.rate.plan import RatePlan
+    from imulab.records.json_text import json_text
+
+    if not isinstance(result, RatePlan):
+        reached = [{"turns": n, "relative_uncertainty": u} for n, u in enumerate(result.reached.tolist(), 1)]
+        said: dict[str, Any] = {"turns": result.turns, "stops": result.stops, "wanted": result.wanted}
+        return json_text({**said, "reached": reached}).rstrip()
+    quantity = {"rate": "rad/s", "duration": "s", "uncertainty": "rad/s", "wanted": "rad/s"}
+    return json_text(
+        {
+            "runs": len(result.test.runs),
+            "duration": {"value": result.duration, "unit": "s"},
+            "rates": [
+                {name: {"value": getattr(each, name), "unit": unit} for name, unit in quantity.items()}
+                for each in result.rates
+            ],
+            "predicted": result.predicted,
+            "warnings": list(result.warnings),
+        }
+    ).rstrip()
 
 
 def simulate(

@@ -6,7 +6,7 @@ TOML; the keys are those of docs/rate.md. An unknown key is refused by name, so 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -160,14 +160,14 @@ def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
     return Run(file, str(mounting), numbers)
 
 
-def manifest_text(test: RateTest) -> str:
-    """Return the manifest of a test as TOML, rates in deg/s."""
+def manifest_text(test: RateTest, comments: Sequence[str] = ()) -> str:
+    """Return the manifest of a test as TOML, rates in deg/s, under lines of comment."""
     parts = ['unit = "deg/s"']
     if test.relative_uncertainty is not None:
         parts.append(f"relative_standard_uncertainty = {test.relative_uncertainty!r}")
     if test.rate_uncertainty:
         parts.append(f"standard_uncertainty = {from_si(test.rate_uncertainty, 'deg/s'):.9g}")
-    lines = [f"rates = {{ {', '.join(parts)} }}"]
+    lines = [*(f"# {comment}" for comment in comments), f"rates = {{ {', '.join(parts)} }}"]
     if test.mounting_uncertainty is not None:
         lines.append(f'mounting = {{ standard_uncertainty = {1e3 * test.mounting_uncertainty:.9g}, unit = "mrad" }}')
     if test.latitude is not None:

@@ -36,7 +36,7 @@ def make_record(
     order: str,
 ) -> Calibration:
     """Turn a solution into the record."""
-    names, values, matrix, units = _model_parameters(test, problem, solution, unit)
+    names, values, matrix, units = model_parameters(test, problem, solution, unit)
     nu = solution.cycle_freedom
     parameters = {}
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
@@ -119,7 +119,7 @@ def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_E
     ]
 
 
-def _model_parameters(
+def model_parameters(
     test: RateTest, problem: Problem, solution: Solution, unit: str
 ) -> tuple[list[str], Array, Array, list[str]]:
     """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate."""

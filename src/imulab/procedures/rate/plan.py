@@ -1,0 +1,343 @@
+"""How long a rate table must stay at each rate, and what the test will then give.
+
+The mean of a dwell of length T has the variance ``N^2 / T + (0.664 B)^2``, N the angle random walk and B the bias
+instability (IEEE Std 952). What the test gives is the covariance of its fit, `solve`, at dwells of that variance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from imulab.atomic_write import write_text
+from imulab.errors import ObservabilityError, OptionError, RecordError, listed
+from imulab.procedures.inputs import Record, as_record
+from imulab.procedures.rate.choices import EARTH, FENCE, MOUNTINGS, ORDERS, RATES, rates_of
+from imulab.procedures.rate.engineering import shown as as_read
+from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
+from imulab.procedures.rate.record import model_parameters
+from imulab.procedures.rate.solve import Problem, solve
+from imulab.procedures.rate.turnplan import TurnPlan, plan_turns
+from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
+from imulab.recording import Array
+from imulab.report.elements import BAD, GOOD, LEGEND, Figure, plain_number
+from imulab.report.plots import Plot
+from imulab.shown import Shown
+from imulab.units import from_si
+
+_OF = ("full", "reading")
+_FLOOR = 0.664
+"""Allan deviation of flicker noise over B (IEEE Std 952)."""
+_LEAST, _SETTLING = 5.0, 0.6
+"""s: the shortest dwell, and what `find_dwells` leaves out of a dwell at its ends."""
+_LONGEST, _LONGEST_TURN = 600.0, 60.0
+
+
+@dataclass(frozen=True)
+class PlannedRate:
+    """One size of rate.
+
+    Attributes
+    ----------
+    rate
+        rad/s.
+    duration
+        Of each stay, s, what settles at its ends included.
+    uncertainty, wanted
+        Standard uncertainty of the mean of a stay, rad/s.
+    """
+
+    rate: float
+    duration: float
+    uncertainty: float
+    wanted: float
+
+    @property
+    def turns(self) -> float:
+        """Turns of the table in a stay, without what settles at its ends."""
+        return self.rate * (self.duration - _SETTLING) / (2 * math.pi)
+
+
+@dataclass(frozen=True, repr=False)
+class RatePlan(Shown):
+    """A planned rate test.
+
+    Attributes
+    ----------
+    test
+        Its manifest.
+    rates
+        By size, ascending.
+    duration
+        Of one run, s, without what the table takes between rates.
+    predicted
+        Standard uncertainty of each parameter, SI, under the names of the record.
+    warnings
+        What is out of reach, with what to do.
+    """
+
+    test: RateTest
+    rates: tuple[PlannedRate, ...]
+    duration: float
+    predicted: dict[str, float]
+    warnings: tuple[str, ...]
+
+    def shown(self) -> tuple[str, list[str], list[list[str]]]:
+        """Return how long the test takes and what it will give, and the stay at each rate."""
+        largest = self.rates[-1].rate
+        rows = [
+            [
+                f"{from_si(each.rate, 'deg/s'):.6g}",
+                f"{each.duration:.1f}",
+                f"{each.turns:.1f}",
+                f"{1e6 * each.uncertainty / largest:.3g}",
+                f"{1e6 * each.wanted / largest:.3g}",
+            ]
+            for each in self.rates
+        ]
+        total = len(self.test.runs) * self.duration
+        head = (
+            f"{len(self.test.runs)} runs of {self.duration / 60:.1f} min, {total / 3600:.1f} h at the table's rates; "
+            f"predicted: {self._predicted()}"
+        )
+        return head, ["rate, deg/s", "stay, s", "turns", "u, ppm of full", "wanted"], rows
+
+    def _predicted(self) -> str:
+        words = {"gyro_scale_factor": "u(S) {} ppm", "gyro_misalignment": "u(T) {} mrad", "gyro_bias": "u(b) {} deg/h"}
+        said = []
+        for stem, words_ in words.items():
+            most = max((u for name, u in self.predicted.items() if name.startswith(stem)), default=None)
+            if most is not None:
+                factor = 1e6 if stem == "gyro_scale_factor" else as_read(stem, "")[0]
+                said.append(words_.format(plain_number(most * factor, 2)))
+        return ", ".join(said)
+
+    def save(self, path: str | Path) -> None:
+        """Write the list of stays, run by run, where the name ends in .csv, else the manifest.
+
+        Raises
+        ------
+        OptionError
+            The file cannot be written.
+        """
+        stay = {each.rate: each.duration for each in self.rates}
+        if not str(path).lower().endswith(".csv"):
+            stays = ", ".join(f"{from_si(rate, 'deg/s'):.6g}: {time:.1f} s" for rate, time in stay.items())
+            comments = [f"Stay at each rate, deg/s, either way round: {stays}.", f"Predicted: {self._predicted()}."]
+            write_text(path, manifest_text(self.test, comments))
+            return
+        lines = ["run,file,mounting,rate [deg/s],stay [s]"]
+        for number, run in enumerate(self.test.runs, 1):
+            lines += [
+                f"{number},{run.file},{run.mounting},{from_si(rate, 'deg/s'):.9g},{stay[abs(rate)]:.1f}"
+                for rate in run.rates or ()
+            ]
+        write_text(path, "\n".join(lines) + "\n")
+
+    def plot(self) -> Plot:
+        """Return the uncertainty of one stay at each rate, beside the wanted one."""
+        sizes = [from_si(each.rate, "deg/s") for each in self.rates]
+        largest = self.rates[-1].rate
+        traces: list[dict[str, Any]] = [
+            {"type": "scatter", "mode": "lines+markers", "name": "predicted", "x": sizes,
+             "y": [1e6 * each.uncertainty / largest for each in self.rates], "line": {"color": GOOD, "width": 2}},
+            {"type": "scatter", "mode": "lines", "name": "wanted", "x": sizes,
+             "y": [1e6 * each.wanted / largest for each in self.rates],
+             "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
+        ]  # fmt: skip
+        layout = {
+            "xaxis": {"title": {"text": "rate, deg/s"}},
+            "yaxis": {"title": {"text": "u of the mean of a stay, ppm of full scale"}, "type": "log", "dtick": 1},
+            "legend": LEGEND,
+        }
+        return Plot(Figure("What each stay will give", f"{self.shown()[0]}.", traces, layout), "Rate plan")
+
+
+def plan_rate(
+    rates: Sequence[float] | str = RATES,
+    *,
+    arw: float | str | None = None,
+    bias_instability: float | str | None = None,
+    noise: Record | None = None,
+    uncertainty: float | str = "20 ppm",
+    of: str = "full",
+    faces: str = "+x,+y,+z",
+    cycles: int | str = 3,
+    order: int | str = "1",
+    latitude: float | str | None = None,
+    table_uncertainty: float | str | None = None,
+    turn: float | str | None = None,
+    fence: float | str = FENCE,
+) -> RatePlan | TurnPlan:
+    """Plan a test on a rate table: how long to stay at each rate, and what the test will then give.
+
+    ``T = N^2 / (u^2 - (0.664 B)^2)``, 5 s or more and whole turns; u is the standard uncertainty of the mean of a stay.
+
+    Parameters
+    ----------
+    rates
+        Sizes of the rates, rad/s, or deg/s in a text; each is visited up and down, either way round.
+    arw, bias_instability
+        Angle random walk N, rad/sqrt(s), and bias instability B, rad/s, of the worst gyroscope.
+    noise
+        In their place: a record of `fit_noise` or its file.
+    uncertainty
+        Wanted of the mean of each stay, a fraction.
+    of
+        Fraction of what: the largest rate (``"full"``) or each rate (``"reading"``).
+    faces
+        Body axes up along the table axis, one after the other.
+    cycles
+        Runs of each face; 5 for the repeatability of scale factors.
+    order
+        Highest power of the rate that the fit is to have, 1 to 5.
+    latitude
+        rad, for the manifest.
+    table_uncertainty
+        Standard uncertainty that all rates have in common, a fraction, for the manifest and for what is predicted.
+    turn
+        In place of a table: wanted relative standard uncertainty of scale factors by whole turns by hand.
+    fence
+        Of those turns, the standard uncertainty of the difference of two stops, rad.
+
+    Raises
+    ------
+    OptionError
+        An option cannot be used; the message says which.
+    RecordError
+        The record holds no noise of gyroscopes.
+    ObservabilityError
+        There are too few rates for the order.
+
+    Source: IEEE Std 952 (noise of a mean); GUM (JCGM 100:2008).
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> il.plan_rate("0,100,300", arw="0.3 deg/sqrt(h)", uncertainty="10 ppm").save("plan.toml")
+    >>> il.plan_rate(turn="0.02 %").turns
+    5
+    """
+    if turn is not None:
+        return plan_turns(fraction(turn, "turn"), in_si(fence, "fence", "angle", "deg"))
+    given = np.asarray(rates_of(rates, "rates") if isinstance(rates, str) else rates, dtype=np.float64)
+    sizes = np.unique(np.abs(given))
+    if sizes.size < 2:
+        raise OptionError(f"rates {rates!r}: expected two sizes of rates or more")
+    words, count = faces.split(","), whole(cycles, "cycles")
+    if not words or not set(words) <= {*MOUNTINGS}:
+        raise OptionError(f"faces {faces!r}: expected body axes such as +x,+y,+z")
+    if not 1 <= count <= 100:
+        raise OptionError(f"cycles {count}: expected 1 to 100")
+    if str(order) not in ORDERS[1:]:
+        raise OptionError(f"order {order!r}: expected one of {listed(ORDERS[1:], str(order))}")
+    if of not in _OF:
+        raise OptionError(f"of {of!r}: expected one of {listed(_OF, of)}")
+    wanted = fraction(uncertainty, "uncertainty")
+    if not 0 < wanted < 1:
+        raise OptionError(f"uncertainty {wanted:g}: expected more than 0 and less than 1, such as 20 ppm")
+    walk, floor = _noise(arw, bias_instability, noise)
+    planned = tuple(_stay(float(rate), sizes, wanted, of, walk, floor) for rate in sizes)
+    way = np.concatenate([sizes, sizes[-2::-1], -sizes[sizes > 0], -sizes[-2::-1]])
+    runs = tuple(
+        Run(f"{'p' if word[0] == '+' else 'n'}{word[1]}_{cycle}.csv", word, tuple((way + 0.0).tolist()))
+        for word in words
+        for cycle in range(1, count + 1)
+    )
+    common = None if table_uncertainty is None else fraction(table_uncertainty, "table_uncertainty")
+    place = None if latitude is None else in_si(latitude, "latitude", "angle", "deg")
+    test = RateTest(runs, common, latitude=place, name="plan")
+    stay = {each.rate: each.duration for each in planned}
+    return RatePlan(
+        test=test,
+        rates=planned,
+        duration=float(sum(stay[abs(rate)] for rate in way.tolist())),
+        predicted=_predicted(test, {each.rate: each for each in planned}, int(order)),
+        warnings=tuple(_warnings(planned, floor, common, wanted)),
+    )
+
+
+def _noise(arw: float | str | None, instability: float | str | None, noise: Record | None) -> tuple[float, float]:
+    """Return angle random walk, rad/sqrt(s), and the floor that bias instability sets to a mean, rad/s."""
+    if noise is None:
+        if arw is None:
+            raise OptionError("arw: expected the angle random walk, such as 0.3 deg/sqrt(h), or a record of noise fit")
+        walk = of_units(arw, "arw", RANDOM_WALK)
+        level = 0.0 if instability is None else in_si(instability, "bias_instability", "rate", "deg/h")
+    else:
+        for name, value in (("arw", arw), ("bias_instability", instability)):
+            if value is not None:
+                raise OptionError(f"{name}: the record of noise says that already; expected one or the other")
+        held = as_record(noise, "plan_rate").parameters
+        columns = [name.removesuffix("_white") for name in held if name.startswith("gyro") and name.endswith("_white")]
+        if not columns:
+            raise RecordError("noise: the record holds no noise of gyroscopes; expected a record of noise fit")
+        worst = {kind: [held[f"{c}_{kind}"].value for c in columns if f"{c}_{kind}" in held]
+                 for kind in ("white", "flicker")}  # fmt: skip
+        walk, level = max(worst["white"]), max(worst["flicker"], default=0.0)
+    if not (0 < walk < math.inf and 0 <= level < math.inf):
+        raise OptionError("arw, bias_instability: expected more than 0, and 0 or more")
+    return walk, _FLOOR * level
+
+
+def _stay(rate: float, sizes: Array, share: float, of: str, walk: float, floor: float) -> PlannedRate:
+    """Return how long to stay at a rate, s."""
+    reading = rate if rate > 0 else float(sizes[sizes > 0][0])  # a part of no rate cannot be reached
+    wanted = share * (float(sizes[-1]) if of == "full" else reading)
+    room = wanted**2 - floor**2
+    length = min(max(_LEAST, walk**2 / room if room > 0 else _LONGEST), _LONGEST)
+    turn = 2 * math.pi / rate if rate else math.inf
+    if turn <= _LONGEST_TURN:
+        length = math.ceil(length / turn - 1e-9) * turn
+    return PlannedRate(rate, length + _SETTLING, math.hypot(walk / math.sqrt(length), floor), wanted)
+
+
+def _predicted(test: RateTest, planned: dict[float, PlannedRate], order: int) -> dict[str, float]:
+    """Return the standard uncertainties that the fit of such a test states."""
+    rows: dict[str, list[Any]] = {name: [] for name in ("run", "axis", "sign", "table", "variance", "level")}
+    for number, run in enumerate(test.runs):
+        for rate in run.rates or ():
+            angle = rate * (planned[abs(rate)].duration - _SETTLING)
+            level = (math.sin(angle) / angle, (1 - math.cos(angle)) / angle) if angle else (1.0, 0.0)
+            of_dwell = (number, run.axis, run.sign, rate, planned[abs(rate)].uncertainty ** 2, level)
+            for name, value in zip(rows, of_dwell, strict=True):
+                rows[name].append(value)
+    axis, sign, table = (np.array(rows[name]) for name in ("axis", "sign", "table"))
+    sizes = len(np.unique(table))
+    if sizes < order + 2:
+        raise ObservabilityError(f"{sizes} different rates, expected {order + 2} or more for order {order}")
+    body = sign * (table + (0.0 if test.latitude is None else EARTH * math.sin(test.latitude)))
+    gyros = tuple(sorted({run.axis for run in test.runs}))
+    mean = np.column_stack([np.where(axis == gyro, body, 0.0) for gyro in gyros])
+    variance = np.repeat(np.array(rows["variance"])[:, None], len(gyros), axis=1)
+    problem = Problem(
+        gyros=gyros, run=np.array(rows["run"]), axis=axis, sign=sign, rate=body, table=table, mean=mean,
+        variance=variance, level=np.array(rows["level"]), rate_uncertainty=test.rate_uncertainty,
+    )  # fmt: skip
+    names, _, matrix, _ = model_parameters(test, problem, solve(problem, (order,) * len(gyros)), "rad/s")
+    return dict(zip(names, np.sqrt(np.diag(matrix)).tolist(), strict=True))
+
+
+def _warnings(planned: Sequence[PlannedRate], floor: float, common: float | None, wanted: float) -> list[str]:
+    found, largest = [], planned[-1].rate
+    short = [each for each in planned if each.uncertainty > 1.001 * each.wanted]
+    if short:
+        at = ", ".join(f"{from_si(each.rate, 'deg/s'):.6g}" for each in short)
+        worst = max(short, key=lambda each: each.uncertainty / each.wanted)
+        why = (
+            f"bias instability alone makes {1e6 * floor / largest:.3g} ppm of full scale"
+            if floor >= worst.wanted
+            else f"it takes more than {_LONGEST / 60:.0f} min at a rate"
+        )
+        found.append(f"out of reach at {at} deg/s: {why}; expected a larger --uncertainty, larger rates or --of full")
+    if common is not None and common > wanted:
+        found.append(
+            f"every scale factor keeps the {1e6 * common:.3g} ppm that all rates of the table have in common, more "
+            "than what is wanted; nonlinearity does not"
+        )
+    return found
