@@ -161,3 +161,64 @@ def test_what_cannot_be_is_refused_in_a_line(name):
     with pytest.raises(il.ImulabError, match=said) as refused:
         call()
     assert "\n" not in str(refused.value)
+
+
+def _with(recording, **columns):
+    units = {**recording.units}
+    return il.Recording({**recording.columns, **columns}, units, name="turns.csv")
+
+
+def test_a_first_motion_is_whole_within_a_fifth_of_a_turn():
+    """Three turns that miss by 0.3 turn are 3.3 turns, or 3 with a scale factor of 1.1: neither is taken."""
+    with pytest.raises(
+        il.ImulabError, match=r"3 turns with a scale factor of 1\.100, or 3\.30 turns, which are not whole"
+    ):
+        il.fit_turns(turned([3.3, -3.3]))
+    assert il.fit_turns(turned([3, -3], 1.05)).turns["z"].scale == pytest.approx(1.05, rel=1e-3)
+    assert il.fit_turns(turned([3, -3], 1.1), turns="3,-3").turns["z"].scale == pytest.approx(1.1, rel=1e-3)
+    assert il.fit_turns(turned([1, 3, -3, -1], 1.08)).turns["z"].count.tolist() == [1, 3, -3, -1]
+
+
+@pytest.mark.parametrize("size", [4, 10])
+def test_stamps_in_bursts_are_evened_and_said(size):
+    """Samples taken evenly, stamped as blocks of them arrive: 0.2 ms apart, then a pause."""
+    made = turned([1, -1, 3, -3], 1.02, noise=1e-3)
+    count = np.arange(len(made))
+    stamps = (count // size) * size / FREQUENCY + (count % size) * 2e-4
+    found = il.fit_turns(_with(made, time=stamps))
+    assert found.turns["z"].scale == pytest.approx(1.02, abs=100e-6)
+    assert any("time stamps come in bursts" in w and "taken as even" in w for w in found.calibration.warnings)
+    assert not any("bursts" in w for w in il.fit_turns(made).calibration.warnings)
+
+
+def test_stamps_that_jitter_as_the_samples_do_are_kept():
+    made = turned([1, -1], 1.02, noise=1e-3)
+    rng = np.random.default_rng(2)
+    moved = made.column("time") + rng.uniform(-2e-3, 2e-3, len(made))
+    found = il.fit_turns(_with(made, time=moved))
+    assert not any("bursts" in w for w in found.calibration.warnings)
+    assert found.turns["z"].scale == pytest.approx(1.02, abs=2e-3)
+
+
+def test_a_gap_inside_a_turn_is_refused_and_a_short_one_or_one_at_rest_is_not():
+    made = turned([1, -1], noise=1e-3, speed=200)
+    keep = np.ones(len(made), dtype=bool)
+
+    def without(a, b):
+        mask = keep.copy()
+        mask[a:b] = False
+        return il.Recording({n: v[mask] for n, v in made.columns.items()}, made.units, name="turns.csv")
+
+    with pytest.raises(il.ImulabError, match=r"samples are missing from 3\.\d+ to 4\.\d+ s, while the unit turned at"):
+        il.fit_turns(without(380, 410))
+    for gap in ((390, 393), (640, 700)):
+        assert il.fit_turns(without(*gap)).turns["z"].scale == pytest.approx(1, abs=1e-3)
+
+
+def test_a_turn_faster_than_the_range_is_refused():
+    made = turned([1, -1], noise=0.02, speed=200)
+    clipped = _with(made, gyro_z=np.clip(made.column("gyro_z"), -250, 250))
+    with pytest.raises(il.ImulabError, match=r"gyro_z stands still at 250 deg/s .* saturated; turn more slowly"):
+        il.fit_turns(clipped)
+    coarse = _with(made, **{n: np.round(made.column(n) / 0.5) * 0.5 for n in ("gyro_x", "gyro_y", "gyro_z")})
+    assert il.fit_turns(coarse).turns["z"].scale == pytest.approx(1, abs=3e-3)

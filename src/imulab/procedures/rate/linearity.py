@@ -89,7 +89,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
         uncertainty=np.sqrt(variance) / largest,
         direction=direction,
         nonlinearity=(float(abs(means[worst, 0])) / largest, float(spread[worst]) / largest),
-        asymmetry=_asymmetry(rate, values, variance, zeros, variance_of_rate),
+        asymmetry=_asymmetry(rate, values, variance, zeros, direction, variance_of_rate),
         hysteresis=hysteresis,
         probability=probability,
         by_noise=reach * float(spread.max()) / largest,
@@ -119,12 +119,18 @@ def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-def _asymmetry(rate: Array, values: Array, variance: Array, zeros: Array, of_rate: float) -> tuple[float, float] | None:
-    """Return (S+ - S-)/S by two slopes and one zero; None where the rates are of one sign."""
+def _asymmetry(
+    rate: Array, values: Array, variance: Array, zeros: Array, direction: NDArray[np.int64], of_rate: float
+) -> tuple[float, float] | None:
+    """Return (S+ - S-)/S by two slopes and one zero, beside the loop of hysteresis; None for rates of one sign."""
     if not (rate > 0).any() or not (rate < 0).any():
         return None
-    columns = np.column_stack([np.maximum(rate, 0), np.minimum(rate, 0), zeros])
-    found = _fitted(columns, values, variance + of_rate)[1]
+    columns = [np.maximum(rate, 0), np.minimum(rate, 0), zeros]
+    first = np.concatenate([[True], (zeros[1:] != zeros[:-1]).any(axis=1)])
+    came = np.where(first, 0.0, np.sign(np.round(np.diff(rate, prepend=0.0), 6)))
+    if direction.any():  # the branch of a loop that the first dwell of a run is on is not known
+        columns += [came * (1 - (rate / np.abs(rate).max()) ** 2), first.astype(np.float64)]
+    found = _fitted(np.column_stack(columns), values, variance + of_rate)[1]
     u = np.sqrt(max(found[0, 1] + found[1, 2] - 2 * found[0, 2], 0.0))
     return float(found[0, 0] - found[1, 0]), float(u)
 

@@ -76,7 +76,7 @@ def turns_record(
         },
         sensor={key: text for key in ("serial", "model", "element") if (text := recording.metadata.get(key))},
         sources=() if recording.source is None else (recording.source,),
-        warnings=tuple(_findings(found, clock)),
+        warnings=(*motions.notes, *_findings(found, clock)),
     )
 
 

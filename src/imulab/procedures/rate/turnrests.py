@@ -8,6 +8,7 @@ import numpy as np
 
 from imulab.errors import DataError, SegmentError
 from imulab.procedures.rate.choices import AXES
+from imulab.procedures.rate.turnchecks import check_motions, even_stamps
 from imulab.recording import Array, Recording, check_finite, check_time
 from imulab.units import parse_unit, to_si
 
@@ -37,6 +38,8 @@ class Motions:
         Turns of each sample of a motion, rad, one array of shape (n, 3) each.
     bias
         Mean output at rest, rad/s, shape (3,), and its standard uncertainty.
+    notes
+        What was done to the recording.
     """
 
     start: Array
@@ -49,9 +52,10 @@ class Motions:
     steps: tuple[Array, ...]
     bias: Array
     bias_uncertainty: Array
+    notes: tuple[str, ...] = ()
 
 
-def find_motions(recording: Recording) -> Motions:
+def find_motions(recording: Recording, fence: float) -> Motions:
     """Find rests, and what the gyroscopes say of the motion between each two.
 
     Raises
@@ -59,11 +63,11 @@ def find_motions(recording: Recording) -> Motions:
     SegmentError
         There are fewer than two rests.
     DataError
-        The gyroscopes are not in a unit of rate.
+        The gyroscopes are not in a unit of rate, or a turn lacks samples or is saturated.
     """
     names = [f"gyro_{axis}" for axis in AXES]
     check_finite(recording, [name for name in names if name in recording])
-    time = check_time(recording)
+    time, notes = even_stamps(check_time(recording), recording.name)
     unit = recording.triad_unit("gyro")
     if parse_unit(unit).quantity != "rate":
         raise DataError(f"{recording.name}: gyroscopes in {unit}; turns are counted in a unit of rate, such as deg/s")
@@ -75,6 +79,7 @@ def find_motions(recording: Recording) -> Motions:
             f"{recording.name}: {len(rests)} rests of 0.5 s found, expected one before and one after each turn: lay "
             "the unit against its fence, and wait 2 s"
         )
+    check_motions(time, rate, rests, fence, recording.name)
     zero = np.array([rate[a:b].mean(axis=0) for a, b in rests])
     spread = np.array([_of_mean(rate[a:b]) for a, b in rests])
     middle = np.array([(time[a] + time[b - 1]) / 2 for a, b in rests])
@@ -98,6 +103,7 @@ def find_motions(recording: Recording) -> Motions:
         steps=tuple(row[2] for row in rows),
         bias=zero.mean(axis=0),
         bias_uncertainty=zero.std(axis=0, ddof=1) / np.sqrt(len(zero)),
+        notes=tuple(notes),
     )
 
 

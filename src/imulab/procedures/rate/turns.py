@@ -26,7 +26,8 @@ from imulab.records.calibration import Calibration
 
 _TURN = 2 * np.pi
 _SAME, _OTHER = np.radians(10), np.radians(30)
-_PART, _WHOLE, _OFF = 0.4, 0.12, 0.1
+_PART, _WHOLE, _FIRST, _OFF = 0.4, 0.12, 0.2, 0.1
+"""Parts of a turn: less is none; what whole turns miss by at most, and the first that tell the scale; of the scale."""
 _CHANCE = 0.01
 _FACTORS = np.geomspace(0.4, 2.5, 41)
 _CARRIES = np.radians(15)
@@ -137,7 +138,7 @@ def fit_turns(
     of_clock = None if clock is None else fraction(clock, "clock")
     stated = None if turns is None else _counts(turns)
     recording = as_recording(data, reading, fit_turns, gyros_of)
-    motions = find_motions(recording)
+    motions = find_motions(recording, width)
     _check_sample_rate(motions, recording.name)
     which = _turning(motions, recording.name)
     if stated is not None and len(stated) != len(which):
@@ -235,7 +236,14 @@ def _numbered(angle: Array, motions: Motions, own: list[int], name: str) -> Arra
                 "turn, or say how many there were (--turns)"
             )
         number = abs(ratio[k]) / scale
-        if round(number) == 0 or abs(number - round(number)) > (_WHOLE if done else max(_WHOLE, _OFF * number)):
+        missing, whole = abs(number - round(number)), round(number)
+        if not done and whole > 1 and _FIRST < missing < 1.5 * _OFF * whole:
+            raise DataError(
+                f"{where} is of {360 * number:.0f} deg by the gyroscopes: {whole} turns with a scale factor of "
+                f"{number / whole:.3f}, or {number:.2f} turns, which are not whole; begin with one turn, or say "
+                "how many there were (--turns)"
+            )
+        if whole == 0 or missing > (_WHOLE if done or whole == 1 else _FIRST):
             raise DataError(
                 f"{where} is of {360 * number:.0f} deg: {number:.2f} turns; expected a whole number, back to the same "
                 "place at the fence"
