@@ -243,6 +243,9 @@ def _check_ends(
     spread = np.array([own[a:b].std() for a, b in stretches])
     usual = float(np.median(spread))
     noisy = usual > _ROUNDING * float(np.abs(reading).max())
+    if noisy:  # where a count is larger than the noise, outputs stand still at any rate
+        first, last = stretches[int(np.argmin(np.abs(spread - usual)))]
+        noisy = usual > float(np.diff(np.unique(own[first:last])).min(initial=np.inf))
     for end in (int(np.argmax(reading)), int(np.argmin(reading))):
         if noisy and spread[end] < _STANDS * usual:
             a, b = stretches[end]
