@@ -36,3 +36,19 @@ def outputs(table, frequency, axis, sign, scale, turn, bias, powers=(), latitude
     a = s + sum(np.asarray(k) * s ** (p + 2) for p, k in enumerate(powers))
     out = np.asarray(scale) * (a + np.asarray(bias))
     return out if rng is None else out + noise * rng.standard_normal(out.shape)
+
+
+def mounted(table, frequency, axis, arm, tilt=0.0):
+    """Body rate and specific force of a unit on a table about `axis` (3,), which is off level by `tilt` rad, at `arm`.
+
+    ``f = g u + w x (w x r)``: the upward direction u goes round the table axis as the table turns under it.
+    """
+    axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    one = np.cross(axis, [0.3, 0.5, 0.8])
+    one /= np.linalg.norm(one)
+    two = np.cross(axis, one)
+    angle = np.cumsum(table) / frequency
+    up = axis + tilt * (np.cos(angle)[:, None] * one - np.sin(angle)[:, None] * two)
+    rate = np.asarray(table)[:, None] * axis
+    force = 9.80665 * up / np.linalg.norm(up, axis=1)[:, None] + np.cross(rate, np.cross(rate, arm))
+    return rate, force

@@ -137,7 +137,7 @@ def fit(
     from imulab.cli.result import finish
     from imulab.procedures.run import run_task
 
-    check_outputs([output, report], [file, *([options["layout"]] if options["layout"] else [])])
+    check_outputs([output, report], [name for name in (file, options["layout"], options["accel"]) if name])
     finish(run_task("rate", [file], options, GivenFiles()), output, report, json=json)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from imulab.procedures.procedure import Row
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
-from imulab.units import from_si, parse_unit
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 _FIGURES = ("gyro_nonlinearity", "gyro_asymmetry", "gyro_hysteresis")
 
@@ -18,6 +18,8 @@ def shown(name: str, unit: str) -> tuple[float, float, str]:
         return 1e3, 0.0, "ms"
     if name.startswith("gyro_threshold"):
         return from_si(1.0, "deg/s"), 0.0, "deg/s"
+    if name.startswith("gyro_g_sensitivity"):
+        return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
     if name.startswith("gyro_misalignment"):
         return 1e3, 0.0, "mrad"
     if name.startswith(_FIGURES):

@@ -11,15 +11,17 @@ from typing import Any, Unpack
 import numpy as np
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
-from imulab.procedures.inputs import Data, Reading, as_recording
+from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.rate.axes import TableAxes, find_axes, with_accelerometers
 from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, gyros_of, rates_of
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
 from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
 from imulab.procedures.rate.orders import choose_orders
+from imulab.procedures.rate.parameters import g_sensitivity
 from imulab.procedures.rate.record import make_record
 from imulab.procedures.rate.simulate import RateRecordings
-from imulab.procedures.rate.solve import Problem, Solution, solve
+from imulab.procedures.rate.solve import Problem, Solution, solve, without_lean
 from imulab.procedures.result import Result
 from imulab.quantities import fraction, in_si
 from imulab.recording import Recording
@@ -60,6 +62,7 @@ def fit_rate(
     order: int | str = "auto",
     latitude: float | str | None = None,
     table_uncertainty: float | str | None = None,
+    accel: Record | None = None,
     **reading: Unpack[Reading],
 ) -> RateFit:
     """Calibrate gyroscopes from recordings on a rate table.
@@ -82,6 +85,9 @@ def fit_rate(
         For the Earth's rate, rad; without it that stays in the bias.
     table_uncertainty
         Standard uncertainty that all rates of the table have in common, a fraction.
+    accel
+        Record of `fit_tumble` of the same unit or its file, whose ``accel_*`` are in each recording: they tell the
+        table axis in the body, and the result is a record of both triads.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 
@@ -130,25 +136,55 @@ def fit_rate(
         test = replace(test, latitude=place)
     if common is not None:
         test = replace(test, relative_uncertainty=common)
-    return fit_test(test, recordings, highest)
+    return fit_test(test, recordings, highest, None if accel is None else as_record(accel, "fit_rate: accel"))
 
 
-def fit_test(test: RateTest, recordings: Sequence[Recording], order: str) -> RateFit:
+def fit_test(test: RateTest, recordings: Sequence[Recording], order: str, accel: Calibration | None = None) -> RateFit:
     """Calibrate the gyroscopes of a test from the recordings of its runs; what is raised is as for `fit_rate`."""
     names, unit = _alike(test, recordings)
     dwells = [find_dwells(recording, test, index) for index, recording in enumerate(recordings)]
-    problem = _problem(test, dwells, names)
+    problem, axes = _problem(test, dwells, names), None
+    if accel is not None:
+        axes = find_axes(test, recordings, dwells, accel)
+        problem = _leaning(test, problem, axes)
     _check_rates(test, problem, 1 if order == "auto" else int(order))
-    orders = choose_orders(problem) if order == "auto" else (int(order),) * len(names)
+    first = solve(problem, (1,) * len(names)) if order == "auto" and axes is not None else None
+    orders = (int(order) if order != "auto" else 1,) * len(names)
+    if order == "auto":
+        orders = choose_orders(problem if first is None else _upright(problem, first))
     solution = solve(problem, orders)
+    felt = None if axes is None else g_sensitivity(problem, solution)
+    if axes is not None and felt is not None:  # what the lever arm adds with the rate squared is no power of the rate
+        pull = problem.table[:, None] ** 2 * axes.arm[problem.run]
+        problem = replace(problem, mean=problem.mean - pull @ felt.T)
+        solution = solve(problem, orders)
     measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
     _check_signs(test, problem, solution, measured)
     linearity = {}
     for i in measured:
         scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
-        linearity[AXES[problem.gyros[i]]] = linearity_of(problem, i, scale)
-    record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order)
+        linearity[AXES[problem.gyros[i]]] = linearity_of(_upright(problem, solution), i, scale)
+    record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
+    if accel is not None:
+        record = with_accelerometers(accel, record)
     return RateFit(record, tuple(dwells), linearity)
+
+
+def _upright(problem: Problem, solution: Solution) -> Problem:
+    """Return the problem without what the lean of the table axis adds about other axes."""
+    gains = [found[: len(problem.faces)] for found in solution.coefficients]
+    return replace(problem, mean=without_lean(problem, gains))
+
+
+def _leaning(test: RateTest, problem: Problem, axes: TableAxes) -> Problem:
+    """Return the problem with the table axes as the accelerometers see them."""
+    if len(problem.faces) < 3 or len(problem.gyros) < 3:
+        raise ObservabilityError(f"{test.name}: accel needs runs about x, y and z, and three gyroscopes")
+    direction = axes.direction[problem.run]
+    along = direction[np.arange(len(direction)), problem.axis]
+    return replace(
+        problem, rate=problem.rate * along * problem.sign, lean=direction / along[:, None], force=axes.force
+    )  # fmt: skip
 
 
 def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], str]:

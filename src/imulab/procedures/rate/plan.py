@@ -20,7 +20,7 @@ from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.rate.choices import EARTH, FENCE, MOUNTINGS, ORDERS, RATES, rates_of
 from imulab.procedures.rate.engineering import shown as as_read
 from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
-from imulab.procedures.rate.record import model_parameters
+from imulab.procedures.rate.parameters import model_parameters
 from imulab.procedures.rate.solve import Problem, solve
 from imulab.procedures.rate.turnplan import TurnPlan, plan_turns
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole

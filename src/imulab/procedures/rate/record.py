@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
+from imulab.procedures.rate.axes import TableAxes, faces_said, lean_said
 from imulab.procedures.rate.choices import AXES, EARTH
 from imulab.procedures.rate.dwells import Dwells
 from imulab.procedures.rate.linearity import Linearity
 from imulab.procedures.rate.manifest import RateTest
+from imulab.procedures.rate.parameters import model_parameters
 from imulab.procedures.rate.solve import Problem, Solution
 from imulab.procedures.rate.sweeprecord import dynamics_of, of_sines, swept
-from imulab.recording import Array, Recording
+from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si, parse_unit
 from imulab.verdict import Bad, Note
@@ -34,9 +35,10 @@ def make_record(
     linearity: Mapping[str, Linearity],
     unit: str,
     order: str,
+    axes: TableAxes | None = None,
 ) -> Calibration:
     """Turn a solution into the record."""
-    names, values, matrix, units = model_parameters(test, problem, solution, unit)
+    names, values, matrix, units = model_parameters(test, problem, solution, unit, axes)
     nu = solution.cycle_freedom
     parameters = {}
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
@@ -54,7 +56,7 @@ def make_record(
         "gyro_output_unit": unit,
         "axes": "".join(linearity),
         "from": "steps" if all(found.sweep is None for found in dwells) else "a sweep",
-        "frame": "the faces on which the unit was mounted",
+        "frame": "the faces on which the unit was mounted" if axes is None else "that of the accelerometers",
         "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
     }
     if temperatures:
@@ -71,105 +73,10 @@ def make_record(
         sources=tuple(recording.source for recording in recordings if recording.source is not None),
         warnings=(
             *_findings(test, problem, solution, linearity, parameters, unit),
+            *(faces_said(test, recordings, dwells) if axes is None else lean_said(axes, test)),
             *of_sines(test, dwells),
         ),
     )
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A parameter: its derivative by all coefficients, what the table's common error does to it, and the mounting's."""
-
-    name: str
-    unit: str
-    value: float
-    line: Array
-    common: float = 0.0
-    mounted: float = 0.0
-
-
-def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_Entry]:
-    """Return the parameters of gyroscope number `i`: quotients of its coefficients by its scale factor."""
-    faces, size, found, order = problem.faces, len(problem.faces), solution.coefficients[i], solution.orders[i]
-    axis, first = AXES[problem.gyros[i]], sum(map(len, solution.coefficients[:i]))
-    own, count = faces.index(problem.gyros[i]), sum(map(len, solution.coefficients))
-    scale = float(found[own])
-    unity = np.eye(len(found))
-    zero = np.concatenate([np.zeros(size + order - 1), _average_of_zeros(problem)])
-
-    def spread(part: Array) -> Array:
-        return np.concatenate([np.zeros(first), part, np.zeros(count - first - len(part))])
-
-    def quotient(name: str, of: str, at: Array, mounted: float = 0.0) -> _Entry:
-        value = float(at @ found) / scale
-        return _Entry(name, of, value, spread((at - value * unity[own]) / scale), mounted=mounted)
-
-    return [
-        quotient(f"gyro_bias_{axis}", "rad/s", zero),
-        _Entry(f"gyro_scale_factor_{axis}", f"{unit}/(rad/s)", scale, spread(unity[own]), common=scale),
-        *(
-            quotient(f"gyro_misalignment_{axis}{AXES[face]}", "rad", unity[k], 1.0)
-            for k, face in enumerate(faces)
-            if k != own
-        ),
-        *(
-            quotient(f"gyro_k{p}_{axis}", "1/(rad/s)" + (f"^{p - 1}" if p > 2 else ""), unity[size + p - 2])
-            for p in range(2, order + 1)
-        ),
-    ]
-
-
-def model_parameters(
-    test: RateTest, problem: Problem, solution: Solution, unit: str
-) -> tuple[list[str], Array, Array, list[str]]:
-    """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate."""
-    measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
-    found = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
-    found.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
-    jacobian = np.array([entry.line for entry in found])
-    shared = np.array([entry.common for entry in found]) * (test.relative_uncertainty or 0.0)
-    own = np.array([entry.mounted for entry in found]) * (test.mounting_uncertainty or 0.0) ** 2
-    for k, entry in enumerate(found):
-        if entry.name.startswith("gyro_bias"):
-            own[k] = _between_faces(problem, solution, AXES.index(entry.name[-1])) ** 2
-    matrix = np.asarray(jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(own))
-    values = np.array([entry.value for entry in found])
-    return [entry.name for entry in found], values, matrix, [entry.unit for entry in found]
-
-
-_ORDER = ["gyro_bias", "gyro_scale_factor", "gyro_misalignment", *(f"gyro_k{power}" for power in range(2, 6))]
-
-
-def _faces_of_runs(problem: Problem) -> dict[tuple[int, int], list[int]]:
-    """Return the runs of each face: body axis along the table's, and which way it points."""
-    found: dict[tuple[int, int], list[int]] = {}
-    for run in range(problem.runs):
-        first = int(np.argmax(problem.run == run))
-        found.setdefault((int(problem.axis[first]), int(problem.sign[first])), []).append(run)
-    return found
-
-
-def _average_of_zeros(problem: Problem) -> Array:
-    """Return the weight of each run's zero in the bias: every face counts alike, its runs alike, shape (runs,)."""
-    weights, groups = np.zeros(problem.runs), _faces_of_runs(problem)
-    axes = sorted({axis for axis, _ in groups})
-    for (axis, _), runs in groups.items():
-        ways = sum(1 for other, _ in groups if other == axis)
-        weights[runs] = 1 / len(axes) / ways / len(runs)
-    return weights
-
-
-def _between_faces(problem: Problem, solution: Solution, axis: int) -> float:
-    """Return what the zeros' scatter from face to face adds to the bias of a gyroscope, rad/s."""
-    i = problem.gyros.index(axis)
-    found = solution.coefficients[i]
-    scale = float(found[problem.faces.index(axis)])
-    zeros = found[len(found) - problem.runs :] / scale
-    groups = list(_faces_of_runs(problem).values())
-    if len(groups) < 2:
-        return 0.0
-    means = np.array([zeros[runs].mean() for runs in groups])
-    return float(means.std(ddof=1) / np.sqrt(len(groups)))
 
 
 def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
@@ -237,7 +144,7 @@ def _findings(
 ) -> list[str]:
     return [
         *_of_unit(parameters, unit),
-        *_of_table(test, parameters),
+        *_of_table(test, parameters, problem.lean is not None),
         *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True))),
         *_of_scatter(problem, solution),
     ]
@@ -254,7 +161,7 @@ def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
     return [Bad(f"the scale factors are off by {said}: is the unit ({unit}) right, or that of the table's rates?")]
 
 
-def _of_table(test: RateTest, parameters: Mapping[str, Parameter]) -> list[str]:
+def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool) -> list[str]:
     found: list[str] = []
     if test.relative_uncertainty is None:
         found.append(
@@ -264,7 +171,7 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter]) -> list[str]:
             )
         )
     triad = any(name.startswith("gyro_misalignment") for name in parameters)
-    if test.mounting_uncertainty is None and triad:
+    if test.mounting_uncertainty is None and triad and not by_axes:
         found.append(Note("the uncertainty of the mounting was not stated, and is in no uncertainty of a misalignment"))
     least = min(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_bias"))
     if test.latitude is None and _MATTERS * least < EARTH:

@@ -50,6 +50,10 @@ class Problem:
         Of each commanded rate, rad/s.
     scale_error
         What each dwell's run adds to its scale factor, which delay and bandwidth share with it, shape (n,).
+    lean
+        Of the table axis: its components over that along the body axis, shape (n, 3); None along the body axis.
+    force
+        Specific force at rate 0 in each run, m/s^2, shape (m, 3); None for g along the faces.
     """
 
     gyros: tuple[int, ...]
@@ -63,6 +67,8 @@ class Problem:
     level: Array
     rate_uncertainty: float
     scale_error: Array | None = None
+    lean: Array | None = None
+    force: Array | None = None
 
     @property
     def runs(self) -> int:
@@ -110,7 +116,10 @@ class Solution:
 def design(problem: Problem, gyro: int, order: int) -> Array:
     """Return the columns of gyroscope number `gyro`: slopes by face, powers of its own axis's rate, zeros of runs."""
     own = problem.axis == problem.gyros[gyro]
-    columns = [np.where(problem.axis == face, problem.rate, 0.0) for face in problem.faces]
+    if problem.lean is None:
+        columns = [np.where(problem.axis == face, problem.rate, 0.0) for face in problem.faces]
+    else:
+        columns = [problem.rate * problem.lean[:, face] for face in problem.faces]
     if own.any():
         columns += [np.where(own, problem.rate**power, 0.0) for power in range(2, order + 1)]
     columns += [(problem.run == run).astype(np.float64) for run in range(problem.runs)]
@@ -147,6 +156,19 @@ def solve(problem: Problem, orders: Sequence[int]) -> Solution:
     ends = np.cumsum([0, *(design(problem, i, orders[i]).shape[1] for i in range(count))])
     coefficients = [found[a:b] for a, b in pairwise(ends)]
     return Solution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
+
+
+def without_lean(problem: Problem, gains: Sequence[Array]) -> Array:
+    """Return the means of runs about a gyroscope's own axis without what their table's lean adds, shape (n, g)."""
+    if problem.lean is None:
+        return problem.mean
+    found = problem.mean.copy()
+    for i, axis in enumerate(problem.gyros):
+        own = problem.axis == axis
+        for k, face in enumerate(problem.faces):
+            if face != axis:
+                found[own, i] -= gains[i][k] * problem.rate[own] * problem.lean[own, face]
+    return found
 
 
 def _own(problem: Problem, gains: list[Array], gyro: int) -> float:
@@ -214,7 +236,7 @@ def _root(excess: Callable[[float], float], high: float) -> float:
 
 def _cycles(problem: Problem, order: int, variance: Array, gains: list[Array]) -> tuple[float, int | None]:
     """Return by how much scale factors differ from run to run of one axis, relative, all gyroscopes pooled."""
-    groups = []
+    groups, mean = [], without_lean(problem, gains)
     for i, axis in enumerate(problem.gyros):
         scale = _own(problem, gains, i)
         own = []
@@ -222,7 +244,7 @@ def _cycles(problem: Problem, order: int, variance: Array, gains: list[Array]) -
             which = problem.run == run
             part = Problem(
                 (axis,), np.zeros(int(which.sum()), dtype=np.int64), problem.axis[which], problem.sign[which],
-                problem.rate[which], problem.table[which], problem.mean[which, i : i + 1],
+                problem.rate[which], problem.table[which], mean[which, i : i + 1],
                 problem.variance[which, i : i + 1], problem.level[which], 0.0,
             )  # fmt: skip
             columns = design(part, 0, 1)

@@ -12,6 +12,7 @@ from imulab.procedures.options import (
     READING,
     Option,
     choice,
+    file_option,
     measure,
     part_of,
     read_options,
@@ -32,6 +33,7 @@ OPTIONS = (
     measure("latitude", "Of the place, deg, for the Earth's rate.", "angle", "deg", shows="DEG"),
     Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
            lambda text, called: fraction(text, called), None, "FRACTION"),
+    file_option("accel", "Tumble record of the unit, whose accelerometers tell the table axis.", "RECORD"),
     *READING,
     ELEMENT,
 )  # fmt: skip
@@ -49,10 +51,11 @@ def _fit(
 
     (name,) = files
     part = part_of(values)
+    accel = None if values["accel"] is None else access.record(values["accel"])
     if not name.lower().endswith(".toml"):
         recording = access.recording(name, values["layout"], **part)
         chosen = {key: values[key] for key in ("rates", "axis", "order", "latitude", "table_uncertainty")}
-        return fit_rate(recording, **chosen).calibration
+        return fit_rate(recording, accel=accel, **chosen).calibration
     if values["rates"] is not None or values["axis"] != "+z":
         raise OptionError(
             f"{name}: a manifest says the rates and axes of its runs; expected neither --rates nor --axis"
@@ -63,7 +66,7 @@ def _fit(
     if values["table_uncertainty"] is not None:
         test = replace(test, relative_uncertainty=values["table_uncertainty"])
     recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
-    record = fit_test(test, recordings, str(values["order"])).calibration
+    record = fit_test(test, recordings, str(values["order"]), accel).calibration
     own = source_of(access, name)
     return record if own is None else replace(record, sources=(own, *record.sources))
 

@@ -133,7 +133,9 @@ def _converted(name: str, unit: str, output: str, physical: bool) -> tuple[float
         return 1.0, 0.0, unit
     if stem == "gyro_misalignment":
         return 1e3, 0.0, "mrad"
-    return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
+    if stem == "gyro_g_sensitivity":
+        return from_si(STANDARD_GRAVITY, "deg/h"), 0.0, "deg/h/g"
+    return (1e6, 0.0, "ppm") if unit == "1" else (1.0, 0.0, unit)  # of a rate table
 
 
 def _of_field(stem: str, unit: str) -> tuple[float, float, str]:

@@ -1,0 +1,184 @@
+"""What accelerometers say of the table axis: its direction in the body, free of the table's level and the lever arm.
+
+Over whole turns a table that is off level reads ``f = g a - w^2 r``, a the table axis and r the lever arm across it, so
+that the intercept of the mean of f over w^2 is along a. Source: rotation about a fixed axis; least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imulab.errors import DataError, RecordError
+from imulab.procedures.rate.choices import AXES
+from imulab.procedures.rate.dwells import Dwells
+from imulab.procedures.rate.manifest import RateTest
+from imulab.recording import Array, Recording
+from imulab.records.calibration import Calibration, Covariance
+from imulab.units import from_si
+from imulab.verdict import UNJUDGED, Note
+
+_FACE = np.cos(np.radians(30))
+_TRIAD = tuple(f"accel_{axis}" for axis in AXES)
+
+
+@dataclass(frozen=True)
+class TableAxes:
+    """The table axis in the body in each of m runs, by accelerometers.
+
+    Attributes
+    ----------
+    direction
+        Upwards, of unit length, shape (m, 3).
+    force
+        Specific force at rate 0, m/s^2, shape (m, 3), and what it gains with the rate squared, m, shape (m, 3).
+    arm
+        See `force`.
+    spread
+        Standard uncertainty of each component of a direction by the scatter of the dwells, rad, shape (m,).
+    changes
+        What one standard uncertainty of each of p parameters of the accelerometers does to it, shape (p, m, 3).
+    correlation
+        Of these parameters, shape (p, p).
+    """
+
+    direction: Array
+    force: Array
+    arm: Array
+    spread: Array
+    changes: Array
+    correlation: Array
+
+
+def find_axes(
+    test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells], accel: Calibration
+) -> TableAxes:
+    """Find the table axis of each run by the accelerometers of its recording, calibrated by their record.
+
+    Raises
+    ------
+    RecordError
+        The record holds no accelerometers.
+    DataError
+        A recording has no accelerometers, too few dwells of a whole turn, or another face than the manifest says.
+    """
+    if "bias_x" not in accel.parameters:
+        raise RecordError(f"accel: a {accel.procedure} record without accelerometers; expected one of tumble fit")
+    pairs = zip(recordings, dwells, strict=True)
+    means = [_means(recording, found, test.place(k)) for k, (recording, found) in enumerate(pairs)]
+    unit = recordings[0].triad_unit("accel")
+    outputs = np.vstack(means)
+    runs = np.repeat(np.arange(len(dwells)), [len(found.rate) for found in dwells])
+
+    def axes_by(record: Calibration) -> list[tuple[Array, Array, float]]:
+        columns = {"time": np.arange(len(outputs), dtype=np.float64), **dict(zip(_TRIAD, outputs.T, strict=True))}
+        units = {name: "s" if name == "time" else unit for name in columns}
+        corrected = record.apply(Recording(columns, units, {}, name="accelerometers"))
+        force = np.column_stack([corrected.si(name) for name in _TRIAD])
+        return [_intercept(force[runs == k], found, test.place(k)) for k, found in enumerate(dwells)]
+
+    found = axes_by(accel)
+    force = np.array([each[0] for each in found])
+    direction = force / np.linalg.norm(force, axis=1)[:, None]
+    for k, run in enumerate(test.runs):
+        if run.sign * direction[k, run.axis] < _FACE:
+            raise DataError(f"{test.place(k)}: by the accelerometers {_up(direction[k])} points up: is mounting wrong?")
+    names = [name for name in accel.covariance.names if not name.startswith(("gyro_", "mag_", "dip", "k"))]
+    matrix = accel.covariance.block(names)
+    sigma = np.sqrt(np.diag(matrix))
+    changes = []
+    for name, u in zip(names, sigma.tolist(), strict=True):
+        one = accel.parameters[name]
+        other = replace(accel, parameters={**accel.parameters, name: replace(one, value=one.value + u)})
+        moved = np.array([each[0] for each in axes_by(other)])
+        changes.append(moved / np.linalg.norm(moved, axis=1)[:, None] - direction)
+    known = np.maximum(sigma, 1e-300)
+    return TableAxes(
+        direction=direction,
+        force=force,
+        arm=np.array([each[1] for each in found]),
+        spread=np.array([each[2] for each in found]) / np.linalg.norm(force, axis=1),
+        changes=np.array(changes).reshape(len(names), len(dwells), 3),
+        correlation=matrix / np.outer(known, known),
+    )
+
+
+def _means(recording: Recording, found: Dwells, place: str) -> Array:
+    """Return the mean outputs of the accelerometers over each dwell, shape (n, 3)."""
+    missing = [name for name in _TRIAD if name not in recording]
+    if missing:
+        raise DataError(f"{place}: no column {missing[0]}; the table axis by accelerometers needs all three")
+    time, outputs = recording.si("time"), recording.triad("accel")
+    if not np.isfinite(outputs).all():
+        raise DataError(f"{place}: accel_*: expected numbers, found none at some times")
+    first, last = np.searchsorted(time, found.start), np.searchsorted(time, found.stop, side="right")
+    return np.array([outputs[a:b].mean(axis=0) for a, b in zip(first, last, strict=True)])
+
+
+def _intercept(force: Array, found: Dwells, place: str) -> tuple[Array, Array, float]:
+    """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it."""
+    turns = np.abs(found.rate) * (found.stop - found.start) / (2 * np.pi)
+    which = turns >= 1
+    squares = found.rate[which] ** 2
+    if len(np.unique(np.round(squares, 6))) < 2:
+        raise DataError(
+            f"{place}: the table axis by accelerometers needs dwells of a whole turn or more at two sizes of rate; "
+            f"expected longer dwells, found {int(which.sum())}"
+        )
+    root = np.sqrt(turns[which])[:, None]  # what is left of a tilt falls with the turns
+    columns = np.column_stack([np.ones(len(squares)), squares / squares.max()]) * root
+    coefficients, *_ = np.linalg.lstsq(columns, force[which] * root, rcond=None)
+    left = force[which] * root - columns @ coefficients
+    variance = float(np.mean(np.sum(left**2, axis=0))) / max(len(squares) - 2, 1)
+    u = float(np.sqrt(variance * np.linalg.inv(columns.T @ columns)[0, 0]))
+    return coefficients[0], coefficients[1] / squares.max(), u
+
+
+def _up(direction: Array) -> str:
+    k = int(np.argmax(np.abs(direction)))
+    return f"{'+' if direction[k] > 0 else '-'}{AXES[k]}"
+
+
+def faces_said(test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> list[str]:
+    """Return where accelerometers without a record see another face up than the manifest says."""
+    said = []
+    for k, (recording, found) in enumerate(zip(recordings, dwells, strict=True)):
+        if all(name in recording for name in _TRIAD):
+            mean = _means(recording, found, test.place(k)).mean(axis=0)
+            if _up(mean) != test.runs[k].mounting:
+                place = test.place(k)
+                said.append(f"{place}: the accelerometers see {_up(mean)} up: is mounting wrong, or their sign?")
+    return said
+
+
+def with_accelerometers(accel: Calibration, record: Calibration) -> Calibration:
+    """Return the accelerometers' record with the gyroscopes of a rate record; those it had are replaced."""
+    own = {name: p for name, p in accel.parameters.items() if not name.startswith("gyro_")}
+    names = [name for name in accel.covariance.names if not name.startswith("gyro_")]
+    size = len(names) + len(record.covariance.names)
+    joined = np.zeros((size, size))
+    joined[: len(names), : len(names)] = accel.covariance.block(names)
+    joined[len(names) :, len(names) :] = record.covariance.array()
+    sources = {source.file: source for source in (*accel.sources, *record.sources)}
+    kept = ("gyro_order", "gyro_output_unit", "largest_rate")
+    return replace(
+        accel,
+        parameters=own | dict(record.parameters),
+        covariance=Covariance((*names, *record.covariance.names), tuple(map(tuple, joined.tolist()))),
+        model={**accel.model, **{name: record.model[name] for name in kept}},
+        fit={**{name: part for name, part in accel.fit.items() if name != "gyro"}, "rate": dict(record.fit)},
+        data={**{name: part for name, part in accel.data.items() if name != "gyro"}, "rate": dict(record.data)},
+        sources=tuple(sources.values()),
+        warnings=(*(w for w in accel.warnings if not w.startswith("gyro")), *record.warnings),
+        verdict=UNJUDGED,
+    )
+
+
+def lean_said(axes: TableAxes, test: RateTest) -> list[str]:
+    """Return by how much the table axis leaned from the faces."""
+    cosines = [run.sign * axes.direction[k, run.axis] for k, run in enumerate(test.runs)]
+    most = float(np.arccos(np.clip(min(cosines), -1, 1)))
+    degrees = from_si(most, "deg")
+    return [Note(f"the table axis leaned from the faces by up to {degrees:.2g} deg, by the accelerometers")]
