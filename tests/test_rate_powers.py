@@ -51,6 +51,7 @@ def test_auto_gives_each_gyroscope_its_powers_and_apply_inverts_them(tmp_path):
     assert record.options["order"] == "auto"
     assert [record.fit["axes"][axis]["order"] for axis in "xyz"] == [1, 3, 1]
     assert record.model["gyro_order"] == 3
+    assert record.fit["axes"]["y"]["by_polynomial"] < 2e-6 < 50e-6 < record.value("gyro_nonlinearity_y")
     assert "gyro_k3_y" in record.parameters
     assert "gyro_k3_x" not in record.parameters
     rates = np.random.default_rng(3).uniform(-3, 3, (50, 3))
@@ -59,6 +60,8 @@ def test_auto_gives_each_gyroscope_its_powers_and_apply_inverts_them(tmp_path):
     flight = il.Recording.from_arrays(gyro=out / DEGREE, rate=100.0, units={"gyro": "deg/s"})
     np.testing.assert_allclose(il.apply(record, flight).triad("gyro") * DEGREE, rates, atol=2e-5)
     record.save(tmp_path / "r.json")
+    il.write_report(il.load(tmp_path / "r.json"), tmp_path / "r.html")
+    assert ">powers</th>" in (tmp_path / "r.html").read_text(encoding="utf-8")
     il.export("blob", il.load(tmp_path / "r.json"), tmp_path / "fw")
     assert (tmp_path / "fw" / "unit.blob").read_bytes()[8] == 2
     by_blob = il.apply(str(tmp_path / "fw" / "unit.blob"), flight).triad("gyro") * DEGREE

@@ -54,7 +54,7 @@ def test_a_sweep_tells_delay_and_bandwidth_from_the_scale_factor(angle, sign):
     assert found["gyro_delay_z"].value == pytest.approx(TRUE_DELAY + angle * 0.5 / FREQUENCY / OVER, abs=3e-5)
     assert found["gyro_bandwidth_z"].value == pytest.approx(1 / (2 * np.pi * LAG), rel=2e-3)
     assert found["gyro_bandwidth_z"].unit == "Hz"
-    assert fit.calibration.model["from"] == "a sweep"
+    assert fit.calibration.model["from"] == "sweeps"
 
 
 def test_a_sweep_shows_powers_of_the_rate():
@@ -150,3 +150,13 @@ def test_what_is_no_sweep_is_refused_in_a_line(made, said):
     with pytest.raises(il.ImulabError, match=said) as refused:
         il.fit_rate(made())
     assert "\n" not in str(refused.value)
+
+
+def test_accelerometers_find_no_table_axis_in_a_sweep():
+    made = il.simulate_tumble(attitudes=24, order=1, hold="2 s", unit="m/s^2", gravity=9.81)
+    record = il.fit_tumble(made, order=1, gravity=9.81).calibration
+    turned = swept(duration=10.0)
+    force = {f"accel_{a}": np.full(len(turned), 9.81 * (a == "z")) for a in "xyz"}
+    both = il.Recording({**turned.columns, **force}, {**turned.units, **dict.fromkeys(force, "m/s^2")}, name="z.csv")
+    with pytest.raises(il.ImulabError, match="needs steps of rate, held for whole turns; found a sweep"):
+        il.fit_rate(both, accel=record)

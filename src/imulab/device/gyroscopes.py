@@ -9,10 +9,13 @@ import numpy as np
 
 from imulab.device.tables import DeviceTable, Field, nonzero, values_of, whole
 from imulab.errors import RecordError
-from imulab.recording import Array
+from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
+from imulab.units import conversion_factor, from_si
 
 HIGHEST_POWER = 5
+_BEYOND = 1.05
+"""Noise, bias and the Earth's rate do not exceed the largest rate by more."""
 
 
 def gyro_table(
@@ -87,3 +90,30 @@ def monotone_range(nonlinearity: Array) -> tuple[float, float]:
     low, high = real[real < 0].max(initial=-np.inf), real[real > 0].min(initial=np.inf)
     ends = [float(np.polynomial.polynomial.polyval(s, powers)) if np.isfinite(s) else s for s in (low, high)]
     return ends[0], ends[1]
+
+
+def beyond_rates(record: Calibration, recording: Recording) -> tuple[int, float]:
+    """Return how many samples lie beyond the largest rate tested by more than 5 %, and the largest rate, rad/s.
+
+    Nothing where the record does not say what was tested.
+    """
+    if "largest_rate" not in record.model:
+        return 0, 0.0
+    sizes = [np.zeros(len(recording))]
+    for axis in record.model.get("axes", "xyz"):
+        if (name := f"gyro_{axis}") in recording:
+            factor = conversion_factor(recording.units[name], record.model["gyro_output_unit"])
+            rate = recording.column(name) * (factor / record.value(f"gyro_scale_factor_{axis}"))
+            sizes.append(np.abs(rate - record.value(f"gyro_bias_{axis}")))
+    size = np.fmax.reduce(sizes)
+    return int(np.count_nonzero(size > _BEYOND * record.model["largest_rate"]["value"])), float(size.max(initial=0.0))
+
+
+def beyond_message(record: Calibration, count: int, largest: float) -> str:
+    """Say that so many samples, the largest in rad/s, lie beyond the rates of the test."""
+    held = "line" if record.model["gyro_order"] == 1 else "polynomial"
+    return (
+        f"{count} samples beyond {from_si(record.model['largest_rate']['value'], 'deg/s'):.4g} deg/s (up to "
+        f"{from_si(largest, 'deg/s'):.4g} deg/s), the largest rate of the record's test: its {held} is extrapolated "
+        "there"
+    )

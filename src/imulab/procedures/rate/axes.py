@@ -119,6 +119,10 @@ def _means(recording: Recording, found: Dwells, place: str) -> Array:
 
 def _intercept(force: Array, found: Dwells, place: str) -> tuple[Array, Array, float]:
     """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it."""
+    if found.sweep is not None:
+        raise DataError(
+            f"{place}: the table axis by accelerometers needs steps of rate, held for whole turns; found a sweep"
+        )
     turns = np.abs(found.rate) * (found.stop - found.start) / (2 * np.pi)
     which = turns >= 1
     squares = found.rate[which] ** 2

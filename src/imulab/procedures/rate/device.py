@@ -17,9 +17,6 @@ from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, from_si, parse_unit
 
-_BEYOND = 1.05
-"""Noise, bias and the Earth's rate do not exceed the largest rate by more."""
-
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the table of a rate record; axes that it does not hold pass as they are.
@@ -71,28 +68,3 @@ def apply_rate(unit: DeviceUnit, columns: Mapping[str, Any], recording: Recordin
         kept[name] = known.symbol if known.quantity == "rate" else "rad/s"
     rate, _ = unit.gyro(outputs, None)
     return recording.with_columns({n: from_si(rate[AXES.index(n[-1])], of) for n, of in kept.items()}, kept)
-
-
-def beyond_rates(record: Calibration, recording: Recording) -> tuple[int, float]:
-    """Return how many samples lie beyond the largest rate tested by more than 5 %, and the largest rate, rad/s."""
-    if "largest_rate" not in record.model:
-        return 0, 0.0
-    model, sizes = model_of(record), [np.zeros(len(recording))]
-    for axis in model.axes:
-        if (name := f"gyro_{axis}") in recording:
-            factor = conversion_factor(recording.units[name], model.gyro_output_unit)
-            rate = recording.column(name) * (factor / record.value(f"gyro_scale_factor_{axis}"))
-            sizes.append(np.abs(rate - record.value(f"gyro_bias_{axis}")))
-    size = np.fmax.reduce(sizes)
-    return int(np.count_nonzero(size > _BEYOND * model.largest_rate.value)), float(size.max(initial=0.0))
-
-
-def beyond_message(record: Calibration, count: int, largest: float) -> str:
-    """Say that so many samples, the largest in rad/s, lie beyond the rates of the test."""
-    model = model_of(record)
-    held = "line" if model.gyro_order == 1 else "polynomial"
-    return (
-        f"{count} samples beyond {from_si(model.largest_rate.value, 'deg/s'):.4g} deg/s (up to "
-        f"{from_si(largest, 'deg/s'):.4g} deg/s), the largest rate of the record's test: its {held} is extrapolated "
-        "there"
-    )

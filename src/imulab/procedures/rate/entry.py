@@ -26,7 +26,7 @@ ENTRY = Procedure(
     ),
     elsewhere="{target} wants accelerometers too, and a rate record holds gyroscopes alone",
     rows=deferred(f"{_HERE}.engineering:rows"),
-    beyond=deferred(f"{_HERE}.device:beyond_rates"),
-    beyond_message=deferred(f"{_HERE}.device:beyond_message"),
+    beyond=deferred("imulab.device.gyroscopes:beyond_rates"),
+    beyond_message=deferred("imulab.device.gyroscopes:beyond_message"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
 )

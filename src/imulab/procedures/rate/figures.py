@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from imulab.procedures.rate.engineering import rows as engineering_rows
-from imulab.procedures.rate.sections import Rate, Seen, rate_of
+from imulab.procedures.rate.sections import OfAxis, Rate, Seen, rate_of
 from imulab.procedures.rate.sweeprecord import sweep_table
 from imulab.procedures.rate.turnrecord import turns_exhibits
 from imulab.records.calibration import Calibration
@@ -97,18 +97,39 @@ def _of_line(record: Calibration, found: Rate) -> ReportTable:
             for kind in ("nonlinearity", "asymmetry", "hysteresis")
         ]
         rows.append(
-            [name, ppm(sizes[0]), ppm(of.by_noise), f"{of.probability:.3f}", ppm(sizes[1]), ppm(sizes[2]),
+            [name, ppm(sizes[0]), ppm(of.by_noise), f"{of.probability:.3f}", *_of_powers(record, of, name),
+             ppm(sizes[1]), ppm(sizes[2]),
              "–" if of.loop is None else f"{of.loop:.3f}", ppm(of.repeatability), ppm(of.repeatability_by_noise)]
         )  # fmt: skip
     return ReportTable(
         "What a line does not hold, ppm",
         "Nonlinearity: largest residual of a rate over the largest rate; by noise it stays below the next column with "
-        "95 %, and leaves as much with probability p. Asymmetry: slope of positive less slope of negative rates. "
+        "95 %, and leaves as much with probability p. Powers: highest of the rate in the model, and the largest "
+        "residual that is left of them. Asymmetry: slope of positive less slope of negative rates. "
         "Hysteresis: largest rising less falling; p that noise makes such a loop. Repeatability: standard deviation of "
         "the scale factor over runs, and that which noise makes.",
-        ["gyro", "nonlinearity", "95 % by noise", "p", "asymmetry", "hysteresis", "p", "repeatability", "by noise"],
+        [
+            "gyro",
+            "nonlinearity",
+            "95 % by noise",
+            "p",
+            "powers",
+            "left",
+            "asymmetry",
+            "hysteresis",
+            "p",
+            "repeatability",
+            "by noise",
+        ],
         rows,
     )
+
+
+def _of_powers(record: Calibration, of: OfAxis, name: str) -> tuple[str, str]:
+    """Return the order of a gyroscope, and what its powers leave, ppm; records of before have but one order."""
+    if "order" not in record.fit["axes"][name]:
+        return str(record.model["gyro_order"]), "–"
+    return str(of.order), plain_number(of.by_polynomial * _PPM, 3)
 
 
 def _budget(record: Calibration, found: Rate) -> ReportTable:

@@ -163,7 +163,7 @@ def fit_test(test: RateTest, recordings: Sequence[Recording], order: str, accel:
     linearity = {}
     for i in measured:
         scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
-        linearity[AXES[problem.gyros[i]]] = linearity_of(_upright(problem, solution), i, scale)
+        linearity[AXES[problem.gyros[i]]] = linearity_of(_upright(problem, solution), i, scale, orders[i])
     record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
     if accel is not None:
         record = with_accelerometers(accel, record)

@@ -45,6 +45,8 @@ class Linearity:
         Standard deviation of the scale factor over runs, and what noise makes of it; None with one run.
     threshold
         Least rate that shows, and its standard uncertainty by the rates below it, rad/s; None without small rates.
+    by_polynomial
+        Largest residual of the powers of the rate that were taken.
     """
 
     rate: Array
@@ -59,10 +61,11 @@ class Linearity:
     loop: float | None
     repeatability: tuple[float, float] | None
     threshold: tuple[float, float] | None
+    by_polynomial: float
 
 
-def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
-    """Return what a line leaves of gyroscope number `gyro` over the rates about its own axis."""
+def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linearity:
+    """Return what a line, and powers up to `order`, leave of gyroscope number `gyro` over the rates about its axis."""
     own = problem.axis == problem.gyros[gyro]
     rate, runs = problem.rate[own], problem.run[own]
     values = problem.mean[own, gyro] / scale
@@ -82,6 +85,8 @@ def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
     probability = chi_square_probability(chi_square, freedom) if freedom > 0 else 1.0
     reach = coverage_factor(None, 1 - 0.05 / len(means))
     direction = _directions(rate, runs)
+    powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
+    rest = _fitted(powers, values, variance)[0]
     loop, hysteresis = _hysteresis(left, variance, key, runs, direction, rate)
     return Linearity(
         rate=rate,
@@ -96,6 +101,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float) -> Linearity:
         loop=loop,
         repeatability=_repeatability(rate, values, variance, runs),
         threshold=_threshold(rate, problem.table[own], left, variance, key),
+        by_polynomial=max(abs(float(rest[key == k].mean())) for k in np.unique(key)) / largest,
     )
 
 

@@ -15,7 +15,7 @@ from imulab.procedures.rate.linearity import Linearity
 from imulab.procedures.rate.manifest import RateTest
 from imulab.procedures.rate.parameters import model_parameters
 from imulab.procedures.rate.solve import Problem, Solution
-from imulab.procedures.rate.sweeprecord import dynamics_of, of_sines, swept
+from imulab.procedures.rate.sweeprecord import dynamics_of, motion_of, of_sines, swept
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si, parse_unit
@@ -55,7 +55,7 @@ def make_record(
         "gyro_order": max(solution.orders),
         "gyro_output_unit": unit,
         "axes": "".join(linearity),
-        "from": "steps" if all(found.sweep is None for found in dwells) else "a sweep",
+        "from": motion_of(dwells),
         "frame": "the faces on which the unit was mounted" if axes is None else "that of the accelerometers",
         "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
     }
@@ -114,6 +114,7 @@ def _fit(
                 "loop": found.loop,
                 "repeatability": None if found.repeatability is None else found.repeatability[0],
                 "repeatability_by_noise": None if found.repeatability is None else found.repeatability[1],
+                "by_polynomial": found.by_polynomial,
                 "order": solution.orders[problem.gyros.index(AXES.index(axis))],
                 "scatter": float(solution.scatter[problem.gyros.index(AXES.index(axis))]),
             }

@@ -39,6 +39,7 @@ class OfAxis(Part):
     repeatability: Size | None
     repeatability_by_noise: Size | None
     order: int
+    by_polynomial: Size
     scatter: Size
 
 

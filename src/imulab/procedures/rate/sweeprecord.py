@@ -34,6 +34,12 @@ def dynamics_of(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Parameter
     return found
 
 
+def motion_of(dwells: Sequence[Dwells]) -> str:
+    """Return how the table moved, ``model.from`` of the record."""
+    kinds = {one.sweep is None for one in dwells}
+    return "steps" if kinds == {True} else "sweeps" if kinds == {False} else "steps and sweeps"
+
+
 def swept(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Any]:
     """Return ``fit.sweeps``: of each run that was one its file, and what it says; nothing where there was none."""
     found = [
