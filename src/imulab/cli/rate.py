@@ -137,7 +137,9 @@ def fit(
     from imulab.cli.result import finish
     from imulab.procedures.run import run_task
 
-    check_outputs([output, report], [name for name in (file, options["layout"], options["accel"]) if name])
+    check_outputs(
+        [output, report], [name for name in (file, options["layout"], options["accel"], options["prior"]) if name]
+    )
     finish(run_task("rate", [file], options, GivenFiles()), output, report, json=json)
 
 
@@ -152,6 +154,9 @@ def turn(
     clock: Annotated[
         str | None, typer.Option(metavar="FRACTION", help="Uncertainty of the sample rate, such as 50ppm.")
     ] = None,
+    prior: Annotated[
+        str | None, typer.Option(metavar="RECORD", help="Earlier record of the same gyroscopes, as prior knowledge.")
+    ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -160,6 +165,11 @@ def turn(
     from imulab.cli.result import finish
     from imulab.procedures.rate.turns import fit_turns
 
-    check_outputs([output, report], [file, *([options["layout"]] if options["layout"] else [])])
+    check_outputs([output, report], [name for name in (file, options["layout"], prior) if name])
     recording = read_recording(file, **reading(options))
-    finish(call(fit_turns, recording, fence=fence, turns=turns, clock=clock).calibration, output, report, json=json)
+    finish(
+        call(fit_turns, recording, fence=fence, turns=turns, clock=clock, prior=prior).calibration,
+        output,
+        report,
+        json=json,
+    )

@@ -20,6 +20,8 @@ from imulab.records.calibration import Calibration, Covariance
 from imulab.units import from_si
 from imulab.verdict import UNJUDGED, Note
 
+BY_ACCELEROMETERS = "that of the accelerometers"
+"""The frame of a record's misalignments."""
 _FACE = np.cos(np.radians(30))
 _TRIAD = tuple(f"accel_{axis}" for axis in AXES)
 
@@ -171,7 +173,7 @@ def with_accelerometers(accel: Calibration, record: Calibration) -> Calibration:
         accel,
         parameters=own | dict(record.parameters),
         covariance=Covariance((*names, *record.covariance.names), tuple(map(tuple, joined.tolist()))),
-        model={**accel.model, **{name: record.model[name] for name in kept}},
+        model={**accel.model, **{name: record.model[name] for name in kept if name in record.model}},
         fit={**{name: part for name, part in accel.fit.items() if name != "gyro"}, "rate": dict(record.fit)},
         data={**{name: part for name, part in accel.data.items() if name != "gyro"}, "rate": dict(record.data)},
         sources=tuple(sources.values()),

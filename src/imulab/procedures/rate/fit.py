@@ -19,6 +19,7 @@ from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
 from imulab.procedures.rate.orders import choose_orders
 from imulab.procedures.rate.parameters import g_sensitivity
+from imulab.procedures.rate.prior import with_prior
 from imulab.procedures.rate.record import make_record
 from imulab.procedures.rate.simulate import RateRecordings
 from imulab.procedures.rate.solve import Problem, Solution, solve, without_lean
@@ -63,6 +64,7 @@ def fit_rate(
     latitude: float | str | None = None,
     table_uncertainty: float | str | None = None,
     accel: Record | None = None,
+    prior: Record | None = None,
     **reading: Unpack[Reading],
 ) -> RateFit:
     """Calibrate gyroscopes from recordings on a rate table.
@@ -88,6 +90,8 @@ def fit_rate(
     accel
         Record of `fit_tumble` of the same unit or its file, whose ``accel_*`` are in each recording: they tell the
         table axis in the body, and the result is a record of both triads.
+    prior
+        Earlier record of the same gyroscopes, or its file: both are one fit, and the record says whether they agree.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 
@@ -136,10 +140,20 @@ def fit_rate(
         test = replace(test, latitude=place)
     if common is not None:
         test = replace(test, relative_uncertainty=common)
-    return fit_test(test, recordings, highest, None if accel is None else as_record(accel, "fit_rate: accel"))
+    held = [
+        None if one is None else as_record(one, f"fit_rate: {name}")
+        for name, one in (("accel", accel), ("prior", prior))
+    ]
+    return fit_test(test, recordings, highest, *held)
 
 
-def fit_test(test: RateTest, recordings: Sequence[Recording], order: str, accel: Calibration | None = None) -> RateFit:
+def fit_test(
+    test: RateTest,
+    recordings: Sequence[Recording],
+    order: str,
+    accel: Calibration | None = None,
+    prior: Calibration | None = None,
+) -> RateFit:
     """Calibrate the gyroscopes of a test from the recordings of its runs; what is raised is as for `fit_rate`."""
     names, unit = _alike(test, recordings)
     dwells = [find_dwells(recording, test, index) for index, recording in enumerate(recordings)]
@@ -165,6 +179,8 @@ def fit_test(test: RateTest, recordings: Sequence[Recording], order: str, accel:
         scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
         linearity[AXES[problem.gyros[i]]] = linearity_of(_upright(problem, solution), i, scale, orders[i])
     record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
+    if prior is not None:
+        record = with_prior(record, prior, str(record.model["frame"]))
     if accel is not None:
         record = with_accelerometers(accel, record)
     return RateFit(record, tuple(dwells), linearity)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
-from imulab.procedures.rate.axes import TableAxes, faces_said, lean_said
+from imulab.procedures.rate.axes import BY_ACCELEROMETERS, TableAxes, faces_said, lean_said
 from imulab.procedures.rate.choices import AXES, EARTH
 from imulab.procedures.rate.dwells import Dwells
 from imulab.procedures.rate.linearity import Linearity
@@ -56,7 +56,7 @@ def make_record(
         "gyro_output_unit": unit,
         "axes": "".join(linearity),
         "from": motion_of(dwells),
-        "frame": "the faces on which the unit was mounted" if axes is None else "that of the accelerometers",
+        "frame": "the faces on which the unit was mounted" if axes is None else BY_ACCELEROMETERS,
         "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
     }
     if temperatures:

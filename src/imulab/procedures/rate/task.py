@@ -34,6 +34,7 @@ OPTIONS = (
     Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
            lambda text, called: fraction(text, called), None, "FRACTION"),
     file_option("accel", "Tumble record of the unit, whose accelerometers tell the table axis.", "RECORD"),
+    file_option("prior", "Earlier record of the same gyroscopes, as prior knowledge.", "RECORD"),
     *READING,
     ELEMENT,
 )  # fmt: skip
@@ -51,11 +52,11 @@ def _fit(
 
     (name,) = files
     part = part_of(values)
-    accel = None if values["accel"] is None else access.record(values["accel"])
+    accel, prior = (None if values[key] is None else access.record(values[key]) for key in ("accel", "prior"))
     if not name.lower().endswith(".toml"):
         recording = access.recording(name, values["layout"], **part)
         chosen = {key: values[key] for key in ("rates", "axis", "order", "latitude", "table_uncertainty")}
-        return fit_rate(recording, accel=accel, **chosen).calibration
+        return fit_rate(recording, accel=accel, prior=prior, **chosen).calibration
     if values["rates"] is not None or values["axis"] != "+z":
         raise OptionError(
             f"{name}: a manifest says the rates and axes of its runs; expected neither --rates nor --axis"
@@ -66,7 +67,7 @@ def _fit(
     if values["table_uncertainty"] is not None:
         test = replace(test, relative_uncertainty=values["table_uncertainty"])
     recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]
-    record = fit_test(test, recordings, str(values["order"]), accel).calibration
+    record = fit_test(test, recordings, str(values["order"]), accel, prior).calibration
     own = source_of(access, name)
     return record if own is None else replace(record, sources=(own, *record.sources))
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.procedures.inputs import Data, Reading, as_recording
+from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.rate.choices import AXES, FENCE, gyros_of
+from imulab.procedures.rate.prior import with_prior
 from imulab.procedures.rate.turnrecord import turns_record
 from imulab.procedures.rate.turnrests import Motions, carried, composed, find_motions
 from imulab.procedures.result import Result
@@ -92,6 +93,7 @@ def fit_turns(
     fence: float | str = FENCE,
     turns: str | Sequence[int] | None = None,
     clock: float | str | None = None,
+    prior: Record | None = None,
     **reading: Unpack[Reading],
 ) -> TurnsFit:
     """Find the scale factors of gyroscopes from whole turns by hand, with a rest against a fence before and after each.
@@ -109,6 +111,9 @@ def fit_turns(
         Number of turns of each in order, ``"1,5,-6"``; counted from the gyroscopes if not given.
     clock
         Relative standard uncertainty of the sample rate; without it the scale factors are those per clock.
+    prior
+        Earlier record of the same gyroscopes, of `fit_gyro` or of a rate test, or its file: both are one fit. The
+        record says whether they agree, and holds what turns do not show as the prior has it.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 
@@ -152,6 +157,8 @@ def fit_turns(
             count = _numbered(angle, motions, own, recording.name) if given is None else given
             found[AXES[axis]] = _scale(motions, own, axis, angle, count, width)
     record = turns_record(recording, motions, found, width, of_clock)
+    if prior is not None:
+        record = with_prior(record, as_record(prior, "fit_turns: prior"), None)
     return TurnsFit(record, found)
 
 

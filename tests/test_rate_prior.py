@@ -1,0 +1,137 @@
+"""An earlier record beside a new one: the same as one fit of both, and whether they agree."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from imulab.procedures.rate.simulate import RateRecordings
+
+HOW = {"noise": "0.02 deg/s", "rate": "50 Hz", "hold": "4 s", "rates": "0,50,100,200"}
+
+
+def simulated(seed, **how):
+    """A test of the unit of seed 1 with noise of its own: its outputs, and noise, are of the seed."""
+    made = il.simulate_rate(seed=1, **{**HOW, "noise": "0", **how})
+    rng = np.random.default_rng(seed)
+    recordings = []
+    for run, one in zip(made.test.runs, made.recordings, strict=True):
+        columns = {n: v if n == "time" else v + 0.02 * rng.standard_normal(len(v)) for n, v in one.columns.items()}
+        recordings.append(dataclasses.replace(one, columns=columns, name=f"{seed}_{run.file}"))
+    runs = tuple(dataclasses.replace(run, file=f"{seed}_{run.file}") for run in made.test.runs)
+    return RateRecordings(dataclasses.replace(made.test, runs=runs), tuple(recordings), made.truth)
+
+
+def joined(*tests):
+    runs = tuple(run for one in tests for run in one.test.runs)
+    return RateRecordings(
+        dataclasses.replace(tests[0].test, runs=runs), tuple(r for one in tests for r in one.recordings), {}
+    )
+
+
+MODEL = ("gyro_scale_factor", "gyro_misalignment", "gyro_k3")
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_two_records_are_what_one_fit_of_both_tests_gives(order):
+    first, second = simulated(11), simulated(12)
+    prior = il.fit_rate(first, order=order).calibration
+    alone = il.fit_rate(second, order=order).calibration
+    both = il.fit_rate(second, order=order, prior=prior).calibration
+    whole = il.fit_rate(joined(first, second), order=order).calibration
+    names = [name for name in whole.parameters if name.startswith(MODEL)]
+    assert len(names) == (9 if order == 1 else 12)
+    for name in names:
+        u = whole.parameters[name].standard_uncertainty
+        # their noises are estimated apart, so that the weights differ by some percent
+        assert both.value(name) == pytest.approx(whole.value(name), abs=0.3 * u), name
+        assert both.parameters[name].standard_uncertainty == pytest.approx(u, rel=0.1), name
+        assert u < 0.8 * alone.parameters[name].standard_uncertainty
+    assert both.value("gyro_bias_x") == pytest.approx(
+        alone.value("gyro_bias_x"), abs=3 * alone.parameters["gyro_bias_x"].standard_uncertainty
+    )
+    assert any("the prior agrees" in warning for warning in both.warnings)
+
+
+def test_what_one_table_makes_is_not_averaged_away():
+    """Two tests on a table of 1e-4: S stays at 1e-4; of two tables it would be 0.7e-4."""
+    first, second = (
+        dataclasses.replace(one, test=dataclasses.replace(one.test, relative_uncertainty=1e-4))
+        for one in (simulated(11), simulated(12))
+    )
+    prior = il.fit_rate(first, order=1).calibration
+    scale = il.fit_rate(second, order=1, prior=prior).calibration.parameters["gyro_scale_factor_x"]
+    assert scale.standard_uncertainty / scale.value == pytest.approx(1e-4, rel=0.01)
+
+
+def test_records_that_do_not_agree_are_said_to():
+    first, second = simulated(11), simulated(12)
+    bent = dataclasses.replace(
+        second,
+        recordings=tuple(
+            dataclasses.replace(one, columns={**one.columns, "gyro_y": one.column("gyro_y") * 1.0003})
+            for one in second.recordings
+        ),
+    )
+    prior = il.fit_rate(first, order=1).calibration
+    (said,) = (w for w in il.fit_rate(bent, order=1, prior=prior).calibration.warnings if "prior" in w)
+    assert "the prior does not agree" in said
+    assert "gyro_scale_factor_y differs by" in said
+
+
+def turned(scale=1.01):
+    gyro = np.random.default_rng(1).normal(0, 0.02, (2400, 3))
+    gyro[300:900, 2] += 60 * scale
+    gyro[1300:1900, 2] -= 60 * scale
+    return il.Recording.from_arrays(gyro=gyro, rate=100.0, units={"gyro": "deg/s"})
+
+
+def test_turns_correct_the_scale_factor_of_a_tumble_record(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = il.simulate_tumble(attitudes=18, order=1, hold="2 s", gyro=True, seed=3)
+    prior = il.fit_gyro(il.fit_tumble(made, order=1, gravity=9.80665).calibration, made).calibration
+    known = prior.parameters["gyro_scale_factor_z"]
+    nominal = il.fit_turns(turned(), clock="10ppm").calibration.parameters["gyro_scale_factor_z"]
+    assert known.unit == nominal.unit
+    own = il.fit_turns(turned(known.value / nominal.value * 1.01), clock="10ppm").calibration
+    scale = own.parameters["gyro_scale_factor_z"]
+    both = il.fit_turns(turned(known.value / nominal.value * 1.01), clock="10ppm", prior=prior).calibration
+    assert both.procedure == "tumble"
+    weight = 1 / np.array([known.standard_uncertainty, scale.standard_uncertainty]) ** 2
+    expected = weight @ [known.value, scale.value] / weight.sum()
+    found = both.parameters["gyro_scale_factor_z"]
+    assert found.value == pytest.approx(expected, abs=0.05 * found.standard_uncertainty)
+    assert found.standard_uncertainty == pytest.approx(weight.sum() ** -0.5, rel=0.01)
+    for name in ("gyro_misalignment_xy", "gyro_scale_factor_x", "bias_x"):
+        assert name in both.parameters
+    prior.save("prior.json")
+    il.write(turned(known.value / nominal.value * 1.01), "t.csv")
+    assert main(["rate", "turn", "t.csv", "--prior", "prior.json", "-o", "both.json"], project=False) == 0
+    assert main(["show", "both.json"], project=False) == 0
+    il.apply("both.json", made)
+    il.export("c", "both.json", "c")
+    capsys.readouterr()
+
+
+def test_what_cannot_be_a_prior_is_refused_in_a_line(tmp_path):
+    il.fit_tumble(il.simulate_tumble(attitudes=12, order=1, hold="2 s"), order=1, gravity=9.8).save(tmp_path / "a.json")
+    other = simulated(11)
+    radians = dataclasses.replace(other, recordings=tuple(
+        dataclasses.replace(r, columns={n: v if n == "time" else np.radians(v) for n, v in r.columns.items()},
+                            units={n: "s" if n == "time" else "rad/s" for n in r.units})
+        for r in other.recordings))  # fmt: skip
+    x = simulated(11, faces="+x")
+    for data, prior, said in (
+        (simulated(12), tmp_path / "a.json", "a tumble record without gyroscopes"),
+        (simulated(12), il.fit_rate(radians, order=1), "its gyroscopes are in rad/s, those of the recording in deg/s"),
+        (simulated(12, faces="+z"), il.fit_rate(x, order=1), "holds none of the parameters found here"),
+    ):
+        with pytest.raises(il.ImulabError, match=said) as refused:
+            il.fit_rate(data, order=1, prior=prior)
+        assert "\n" not in str(refused.value)
+    il.write(turned(), tmp_path / "t.csv")
+    il.fit_turns(tmp_path / "t.csv").save(tmp_path / "t.json")
+    with pytest.raises(il.ImulabError, match="the prior was made from this recording, which would count twice"):
+        il.fit_turns(tmp_path / "t.csv", prior=tmp_path / "t.json")
