@@ -36,12 +36,12 @@ def accel():
     return dataclasses.replace(found, parameters=parameters)
 
 
-def whole(faces, lean=0.0, tilt=0.0, arm=ARM, noise=0.0, seed=1, accelerometers=True):
+def whole(faces, lean=0.0, tilt=0.0, arm=ARM, noise=0.0, seed=1, accelerometers=True, leans=None):
     """A test of several runs, whose table axis leans by `lean` rad from each face."""
     rng, made, runs = np.random.default_rng(seed), [], []
     table = reference.steps(WAY, 8.0, FREQUENCY)
     for number, face in enumerate(faces):
-        axis = lean * rng.standard_normal(3)
+        axis = lean * rng.standard_normal(3) if leans is None else leans[number].copy()
         axis["xyz".index(face[1])] = 1 if face[0] == "+" else -1
         rate, force = reference.mounted(table, FREQUENCY, axis, arm, tilt)
         out = SCALE * (rate @ TURN.T + BIAS + force @ SENSITIVITY.T) + noise * rng.standard_normal(rate.shape)
@@ -72,6 +72,19 @@ def test_the_table_axis_is_that_of_the_accelerometers(accel):
     exact = il.fit_rate(level, accel=accel, order=1).calibration
     for name, true in TRUTH.items():
         assert exact.value(name) == pytest.approx(true, abs=1e-9), name
+
+
+def test_an_axis_off_by_a_degree_takes_its_cosine_from_the_scale_factor(accel):
+    """1 - cos(1 deg) = 152 ppm of a scale factor, and T times the lean, where nobody sees it."""
+    lean = np.tan(np.radians(1)) * np.eye(3)[[1, 2, 0]]
+    made = whole(SIX[::2], arm=np.zeros(3), leans=lean)
+    blind, seen = (il.fit_rate(made, accel=record, order=1).calibration for record in (None, accel))
+    for i, axis in enumerate("xyz"):
+        across = TURN[i] @ (np.eye(3)[i] + lean[i]) * np.cos(np.radians(1)) - 1
+        off = blind.value(f"gyro_scale_factor_{axis}") / SCALE[i] - 1
+        assert off == pytest.approx(across, abs=1e-9)
+        assert off == pytest.approx(-152e-6 + TURN[i] @ lean[i], abs=2e-6)
+        assert seen.value(f"gyro_scale_factor_{axis}") == pytest.approx(SCALE[i], rel=1e-9)
 
 
 def test_six_faces_tell_bias_from_g_sensitivity():
