@@ -98,10 +98,24 @@ def test_the_errors_of_a_sweep_are_those_that_the_record_states():
         scores.append(
             [(found[f"gyro_{n}_z"].value - v) / found[f"gyro_{n}_z"].standard_uncertainty for n, v in true.items()]
         )
-    # 12 squares scatter by 0.41 about 1; the scale factor's uncertainty is known to be a quarter too large
+    # 12 squares scatter by 0.41 about 1
     squares = np.square(scores).mean(axis=0)
     assert (squares > 0.1).all()
     assert (squares < 1 + 3 * 0.41).all()
+
+
+def test_steps_with_slow_ramps_between_are_steps():
+    times, rates = [0.0], [0.0]
+    for rate in (0, 50, 100, 50, 0, -50, -100, -50, 0):
+        times += [times[-1] + 10, times[-1] + 13]
+        rates += [rate, rate]
+    time = np.arange(int(times[-1] * 50)) / 50
+    table = np.interp(time, times, rates)
+    columns = {"time": time, "gyro_z": SCALE * table, "table_rate": table}
+    made = il.Recording(columns, {n: "s" if n == "time" else "deg/s" for n in columns}, name="z.csv")
+    fit = il.fit_rate(made)
+    assert fit.calibration.model["from"] == "steps"
+    assert sorted(np.round(fit.dwells[0].rate / DEGREE)) == [-100, -50, -50, 0, 0, 0, 50, 50, 100]
 
 
 def test_a_manifest_says_that_a_run_is_a_sweep(tmp_path, monkeypatch, capsys):

@@ -18,8 +18,8 @@ _BLOCK, _SIDE, _SETTLING, _LEAST = 0.1, 5, 3, 10
 _SIGMAS, _OF_STEP, _OF_COLUMN, _RIPPLE = 6.0, 1 / 20, 2e-5, 2e-3
 """Changes that count: of the noise, the smallest listed step, the largest recorded rate, and the rate itself."""
 _BATCHES = 8
-_HELD, _OF_RANGE, _SWEEP, _FLAT = 0.3, 0.02, 500, 0.03
-"""Share of a run that makes it steps, of its rates that a step keeps to; samples of a sweep; rates at one output."""
+_FEW, _OF_RANGE, _SWEEP, _FLAT = 3, 0.02, 500, 0.03
+"""Rates of steps; share of the range that a step keeps to; samples of a sweep; share of its range at one output."""
 _NEXT_TO = 0.3
 _STANDS = 0.2
 _WRONG = 0.5
@@ -96,7 +96,7 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
         raise SegmentError(
             f"{place}: a sweep needs the table's rate at every sample: expected table_rate or table_angle"
         )
-    if column is not None and (run.sweep or (_held(blocks, stretches, size) < _HELD and is_smooth(column, blocks))):
+    if column is not None and (run.sweep or (_levels(blocks, stretches, size) < _FEW and is_smooth(column, blocks))):
         return _swept(recording, time, column, outputs, names, main, place)
     if len(stretches) < 3:
         raise SegmentError(
@@ -124,11 +124,12 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     )
 
 
-def _held(blocks: Array, stretches: list[tuple[int, int]], size: int) -> float:
-    """Return the share of a run in which its rate is that of a step."""
+def _levels(blocks: Array, stretches: list[tuple[int, int]], size: int) -> int:
+    """Return the number of different rates at which a run rests; of a slow sine there are two, at its ends."""
     within = _OF_RANGE * float(np.ptp(blocks))
     parts = [blocks[a // size : b // size] for a, b in stretches]
-    return sum(len(part) for part in parts if np.ptp(part) < within) / max(len(blocks), 1)
+    rests = np.sort([part.mean() for part in parts if np.ptp(part) < within])
+    return int(np.sum(np.diff(rests, prepend=-np.inf) > within))
 
 
 def _swept(

@@ -195,7 +195,7 @@ def _covariance(matrix: Array, normal: Array, left: Array) -> Array:
     """Return the covariance of coefficients by what is left of the fit in parts of the run, correlated as it may be."""
     edges = np.linspace(0, len(left), _BATCHES + 1).astype(np.int64)[:-1]
     scores = np.add.reduceat(matrix * left[:, None], edges, axis=0)
-    wide = _BATCHES / (_BATCHES - matrix.shape[1])
+    wide = _BATCHES / (_BATCHES - 1)  # the scores of all batches add up to zero
     return np.asarray(normal @ (scores.T @ scores * wide) @ normal)
 
 
