@@ -174,3 +174,28 @@ def test_accelerometers_find_no_table_axis_in_a_sweep():
     both = il.Recording({**turned.columns, **force}, {**turned.units, **dict.fromkeys(force, "m/s^2")}, name="z.csv")
     with pytest.raises(il.ImulabError, match="needs steps of rate, held for whole turns; found a sweep"):
         il.fit_rate(both, accel=record)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize(
+    ("parts", "single"),
+    [
+        (((100, 0.3), (30, 1.1)), False),
+        (((100, 1 / 60),), True),
+        (((100, 0.1),), True),
+        (((80, 0.2), (50, 0.9), (30, 2.1)), False),
+    ],
+)
+def test_what_one_rate_cannot_tell_does_not_spoil_the_scale_factor(parts, single, noise):
+    """Derivatives that the rate and others make up, or that are noise of the table's column, are left out."""
+    rng = np.random.default_rng(3)
+    time = np.arange(6000) / 100
+    table = sum(size * np.sin(2 * np.pi * f * time) for size, f in parts)
+    columns = {"time": time, "gyro_z": SCALE * table + 0.02 * rng.standard_normal(6000)}
+    columns["table_rate"] = table + noise * rng.standard_normal(6000)
+    made = il.Recording(columns, {n: "s" if n == "time" else "deg/s" for n in columns}, name="z.csv")
+    fit = il.fit_rate(made)
+    scale = fit.calibration.parameters["gyro_scale_factor_z"]
+    assert abs(scale.value * DEGREE - SCALE) < 4 * scale.standard_uncertainty * DEGREE
+    assert scale.standard_uncertainty < 30e-6 * scale.value
+    assert (fit.dwells[0].sweep.frequency is not None) == single

@@ -7,7 +7,7 @@ sine ``w''`` is w: amplitude and phase at its frequency are all that it shows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ _PER_PERIOD = 16
 _SMOOTH = 0.02
 _LONGEST = 1 << 17
 _SHOWN = 3.0
+_OWN, _CLEAR = 1e-3, 100
+"""Share of a derivative's power that is its own, not the rate's and lower ones', and how far that exceeds noise."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Sweep:
     frequency
         Of the one sine that the rate is, Hz; None of a sweep.
     scale_error
-        What not knowing delay and bandwidth adds to the scale factor, a fraction.
+        What not knowing delay, bandwidth and drift adds to the scale factor, a fraction.
     """
 
     delay: tuple[float, float]
@@ -104,13 +106,22 @@ def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> t
     side = max(1, round(1 / (many * top * step)))
     inner, derivatives = _derivatives(rate, time, side, step)
     at, known = time[inner], rate[inner]
+    derivatives = _apart(at, known, derivatives, _noise(rate, side * step))
+    if frequency is None and len(derivatives) < 2:  # a part of one period, whose spectrum has no peak
+        frequency = float(derivatives[0].std() / known.std() / (2 * np.pi))
     values = outputs[main][inner]
     sweep, felt = _regressed(at, known, derivatives, values, frequency)
     trend = (at - at.mean()) / float(np.ptp(at))
     columns = [np.ones(len(at)), trend, felt, felt**2, felt**3]
     matrix = np.column_stack([column / np.abs(column).max() for column in columns])
     kept = [output[inner] for output in outputs]
-    fits = np.linalg.lstsq(matrix.T @ matrix, matrix.T @ np.column_stack(kept), rcond=None)[0]
+    normal = np.linalg.pinv(matrix.T @ matrix)
+    fits = normal @ (matrix.T @ np.column_stack(kept))
+    # The drift is taken off by this fit, and its error is in the scale factor as far as the rate drifts, too.
+    of_drift = float(np.sqrt(_covariance(matrix, normal, values - matrix @ fits[:, main])[1, 1]))
+    along = felt - felt.mean()
+    share = of_drift * float(trend @ along) / float(along @ along) / float(np.ptp(values) / np.ptp(felt))
+    sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, share)))
     return sweep, _by_rate(at, felt, kept, matrix, fits, step)
 
 
@@ -151,12 +162,38 @@ def _derivatives(rate: Array, time: Array, side: int, step: float) -> tuple[NDAr
     return np.flatnonzero(whole) + 4 * h, found
 
 
+def _noise(rate: Array, spacing: float) -> list[float]:
+    """Return the variances of four derivatives by the noise of the rate itself, as its eighth differences show it."""
+    of_rate = float(np.mean(np.diff(rate[:_LONGEST], n=8) ** 2)) / 12870
+    once, twice = np.array([1, -8, 0, 8, -1]) / 12, np.array([-1, 16, -30, 16, -1]) / 12
+    kernels = [once, twice, np.convolve(once, twice), np.convolve(twice, twice)]
+    return [of_rate * float(kernel @ kernel) / spacing ** (2 * k) for k, kernel in enumerate(kernels, 1)]
+
+
+def _apart(time: Array, rate: Array, derivatives: list[Array], noise: list[float]) -> list[Array]:
+    """Return the derivatives of a rate before that, beyond the first, which the rate and those before it make up.
+
+    Or which is the noise of the rate, by more than a hundredth.
+    """
+    kept = [np.ones(len(time)), time - time.mean(), rate, derivatives[0]]
+    for number, column in enumerate(derivatives[1:], 1):
+        matrix = np.column_stack(kept)
+        matrix = matrix / np.abs(matrix).max(axis=0)
+        found = np.linalg.pinv(matrix.T @ matrix) @ (matrix.T @ column)
+        left = column - matrix @ found
+        if float(left @ left) < max(_OWN * float(column @ column), _CLEAR * noise[number] * len(column)):
+            return derivatives[:number]
+        kept.append(column)
+    return derivatives
+
+
 def _regressed(
     time: Array, rate: Array, derivatives: list[Array], values: Array, frequency: float | None
 ) -> tuple[Sweep, Array]:
     """Return what a gyroscope's output says of delay and bandwidth, and the rate that it felt."""
     first = derivatives[0]
-    columns = [rate, *(derivatives[:1] if frequency is not None else derivatives)]
+    derivatives = derivatives[:1] if frequency is not None else derivatives
+    columns = [rate, *derivatives]
     columns += [np.ones(len(rate)), time - time.mean(), rate**2, *([] if frequency is not None else [rate**3])]
     size = np.array([float(np.abs(column).max()) or 1.0 for column in columns])
     matrix = np.column_stack(columns) / size
@@ -166,7 +203,7 @@ def _regressed(
     spread = _covariance(matrix, normal, left) / np.outer(size, size)
     found = found / size
     scale = float(found[0])
-    still = np.delete(matrix, range(1, 2 if frequency is not None else 5), axis=1)
+    still = np.delete(matrix, range(1, len(derivatives) + 1), axis=1)
     known = float(_covariance(still, np.linalg.pinv(still.T @ still), left)[0, 0]) / size[0] ** 2
     more = float(np.sqrt(max(float(spread[0, 0]) - known, 0.0))) / abs(scale)
     if frequency is not None:
@@ -187,7 +224,9 @@ def _regressed(
         bandwidth = (corner, corner * u_square / (2 * square))
     else:
         beyond = float(1 / (2 * np.pi * np.sqrt(max(square, 0.0) + 2 * u_square + 1e-300)))
-    felt = rate + sum(k / scale * column for k, column in zip(found[1:5], derivatives, strict=True))
+    felt = rate + sum(
+        k / scale * column for k, column in zip(found[1 : len(derivatives) + 1], derivatives, strict=True)
+    )
     return Sweep((float(tau), float(np.sqrt(both[0, 0]))), bandwidth, beyond, None, more), felt
 
 
