@@ -52,8 +52,8 @@ enum {
     IL_JUMPED = 8,     /* array: bias jump, being estimated again */
     IL_EXCLUDED = 16,  /* array: not in the fused output in this sample */
     IL_QUIET = 32,     /* array: coming back, watched before it is used */
-    IL_BEYOND = 64,    /* tumble: output that no specific force gives; centrifuge: beyond the levels tested; thermal:
-                        * outside the temperatures measured; array: a reading held, as at the end of a range */
+    IL_BEYOND = 64,    /* tumble, gyro: output that no specific force or rate gives; centrifuge: beyond the levels
+                        * tested; thermal: outside the temperatures measured; array: a reading held, as at the end of a range */
     IL_ALONE = 128     /* array: fewer than three gyros left, nothing to compare with */
 };
 
