@@ -24,6 +24,8 @@ def shown(name: str, unit: str) -> tuple[float, float, str]:
         return 1e3, 0.0, "mrad"
     if name.startswith(_FIGURES):
         return 1e6, 0.0, "ppm"
+    if name.startswith("gyro_scale_factor_slope"):
+        return 1e6, 0.0, "ppm/K"
     if name.startswith("gyro_scale_factor"):
         nominal = parse_unit(unit.removesuffix("/(rad/s)"))
         if nominal.quantity == "rate":

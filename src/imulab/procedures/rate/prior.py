@@ -51,7 +51,9 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
     known = [
         name
         for name in prior.covariance.names
-        if name.startswith(_KINDS) and (alike or not name.startswith("gyro_misalignment"))
+        if name.startswith(_KINDS)
+        and not name.startswith("gyro_scale_factor_slope")
+        and (alike or not name.startswith("gyro_misalignment"))
     ]
     own = list(record.covariance.names)
     common = [name for name in own if name in known and not name.startswith("gyro_bias")]

@@ -16,6 +16,7 @@ from imulab.procedures.rate.manifest import RateTest
 from imulab.procedures.rate.parameters import model_parameters
 from imulab.procedures.rate.solve import Problem, Solution
 from imulab.procedures.rate.sweeprecord import dynamics_of, motion_of, of_sines, swept
+from imulab.procedures.rate.temperature import temperature_slopes
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si, parse_unit
@@ -45,6 +46,7 @@ def make_record(
         wide = coverage_factor(float(nu)) * u if nu is not None and name.startswith("gyro_scale_factor") else None
         parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
     figures = _figures(linearity) | dynamics_of(test, dwells)
+    figures |= temperature_slopes(recordings, dwells, problem, solution)
     joined = np.zeros((len(matrix) + len(figures),) * 2)
     joined[: len(matrix), : len(matrix)] = matrix
     joined[len(matrix) :, len(matrix) :] = np.diag([(p.standard_uncertainty or 0.0) ** 2 for p in figures.values()])
