@@ -14,6 +14,8 @@ demo: $(ALONE)
 # The tests start many processes: each would compile what it imports again where the environment forbids to keep it.
 # Three workers for two cores: a good part of the tests waits for a browser, a port or a killed process.
 test test-all: export PYTHONDONTWRITEBYTECODE =
+# The matrices of the tests are small: threads of the linear algebra would only wait for each other beside three workers.
+test test-all: export OPENBLAS_NUM_THREADS = 1
 
 test: core $(STAMP)
 	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not slow"

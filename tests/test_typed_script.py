@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = """
 from pathlib import Path
 
@@ -38,6 +40,7 @@ il.write_report(fit, "sn42.html")
 """
 
 
+@pytest.mark.slow
 def test_a_script_of_a_user_is_clean(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT, encoding="utf-8")
