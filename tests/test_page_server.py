@@ -8,9 +8,10 @@ import json
 import queue
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -27,6 +28,12 @@ from imulab.live.page.parts import Hub, Line, Part, to_json
 from imulab.live.page.security import Guard, inside, receive_file
 
 LIMIT = 1000
+
+
+def awaited(coroutine: Coroutine[Any, Any, Any]) -> Any:
+    """Return its result, from a thread of its own: a browser that other tests have open keeps a loop in this one."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(asyncio.run, coroutine).result()
 
 
 class Echo(Part):
@@ -172,7 +179,7 @@ def guarded(port: int, host: str, listened: str = "127.0.0.1") -> int:
     headers = [(b"host", host.encode()), (b"origin", f"http://{host}".encode()), (b"x-imulab-token", b"secret")]
     scope = {"type": "http", "method": "GET", "path": "/x", "query_string": b"", "headers": headers,
              "server": ("127.0.0.1", port)}  # fmt: skip
-    asyncio.run(Guard(app, "secret", LIMIT, host=listened)(scope, receive, send))
+    awaited(Guard(app, "secret", LIMIT, host=listened)(scope, receive, send))
     return sent[0]["status"]
 
 
@@ -281,7 +288,7 @@ def test_a_slow_page_gets_the_latest_view_and_every_word():
     for number in range(5):
         line.put("view", f"view {number}", latest=True)
         line.put("event", f"event {number}")
-    assert asyncio.run(line.get()) == [*(f"event {k}" for k in range(5)), "view 4"]
+    assert awaited(line.get()) == [*(f"event {k}" for k in range(5)), "view 4"]
 
 
 def test_numbers_that_are_none_are_null():
