@@ -37,12 +37,17 @@ class UnitModel:
     @property
     def origin(self) -> list[str]:
         """Where the numbers come from, for the comments of a file."""
-        content = self.record.to_dict()["content_sha256"]
-        serial = printable(str(self.record.sensor.get("serial", "without serial number")))
-        return [
-            f"written by imulab {VERSION} for unit {serial}",
-            f"from the record of {printable(self.record.created)}, content_sha256 {content}",
-        ]
+        return origin_of(self.record)
+
+
+def origin_of(record: Calibration) -> list[str]:
+    """Return by what the file was written, for which unit, and from which record."""
+    content = record.to_dict()["content_sha256"]
+    serial = printable(str(record.sensor.get("serial", "without serial number")))
+    return [
+        f"written by imulab {VERSION} for unit {serial}",
+        f"from the record of {printable(record.created)}, content_sha256 {content}",
+    ]
 
 
 def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:

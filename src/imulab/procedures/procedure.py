@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
-    from imulab.records.triads import LinearFit, Triads
+    from imulab.records.triads import AccelerometerLaws, LinearFit, Triads
     from imulab.report.elements import Exhibits
 
 
@@ -161,6 +161,9 @@ class Procedure:
     triads
         Record to its accelerometers and gyroscopes as matrices, which other programs' files are made from; None where
         it states none.
+    laws
+        Record to the laws of its accelerometers over temperature, which autopilots take as offsets; None where it
+        states none.
     linear_fit
         Record (and whether to keep the misalignment) to its accelerometers fitted anew without nonlinearity, for
         programs that hold none; None where they cannot be.
@@ -198,6 +201,7 @@ class Procedure:
     fusion: Callable[[Calibration, str | None, str | None], Fusion] | None = None
     noise: Callable[[Calibration], Mapping[str, Any]] | None = None
     triads: Callable[[Calibration], Triads] | None = None
+    laws: Callable[[Calibration], AccelerometerLaws] | None = None
     linear_fit: Callable[..., LinearFit] | None = None
     elsewhere: str | None = None
     not_applied: str | None = None

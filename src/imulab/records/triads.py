@@ -39,6 +39,33 @@ class Gyroscopes:
 
 
 @dataclass(frozen=True)
+class AccelerometerLaws:
+    """``M = S(T) (T(T) f + b(T))`` over temperature: laws of the nine parameters in powers of theta, unit of M.
+
+    ``theta`` goes from -1 at `low` to 1 at `high`, degC, and stays at its end outside; `coefficient` (9, terms) has
+    the rows b_x b_y b_z, S_x S_y S_z, m_yx m_zx m_zy.
+    """
+
+    low: float
+    high: float
+    coefficient: Array
+    unit: str
+
+    def parameters(self, temperature: Array) -> Array:
+        """Return the nine parameters at temperatures (n,), shape (n, 9)."""
+        theta = (np.clip(temperature, self.low, self.high) - 0.5 * (self.low + self.high)) * 2 / (self.high - self.low)
+        return np.asarray(np.polynomial.polynomial.polyval(theta, self.coefficient.T).T, dtype=np.float64)
+
+    def output(self, force: Array, temperature: Array) -> Array:
+        """Return the outputs for specific forces (k, 3) at temperatures (n,), shape (n, k, 3)."""
+        bias, scale, skew = np.split(self.parameters(temperature)[:, None, :], 3, axis=2)
+        yx, zx, zy = np.moveaxis(skew, 2, 0)
+        x, y, z = force.T
+        sensed = np.stack([x + 0 * yx, yx * x + y, zx * x + zy * y + z], axis=2)
+        return np.asarray(scale * (sensed + bias), dtype=np.float64)
+
+
+@dataclass(frozen=True)
 class Accelerometers:
     """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M.
 

@@ -15,6 +15,7 @@ from imulab.procedures.thermal.model import GROUPS, Laws
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.records.triads import AccelerometerLaws
 from imulab.units import STANDARD_GRAVITY
 
 _NODES = np.linspace(-1.0, 1.0, 65)
@@ -42,6 +43,13 @@ def laws_of(record: Calibration) -> Array:
     if not (np.sign(scale) == np.sign(scale[:, :1])).all() or not scale.all():
         raise RecordError("the record has a scale factor of 0 within its range of temperature")
     return found
+
+
+def accelerometers(record: Calibration) -> AccelerometerLaws:
+    """Return the laws as exporters take them; errors as for `laws_of`."""
+    model = thermal_of(record).model
+    low, high = model.range
+    return AccelerometerLaws(low, high, laws_of(record), model.output_unit)
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:

@@ -25,6 +25,7 @@ ENTRY = Procedure(
             remarks=deferred(f"{_HERE}.apply:remarks"),
         ),
     ),
+    laws=deferred(f"{_HERE}.device:accelerometers"),
     elsewhere="{target} takes no laws over temperature",
     rows=deferred(f"{_HERE}.engineering:rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
