@@ -1,16 +1,21 @@
 """Logs that are read block by block give what they give in memory; those with faults are looked at as a whole."""
 
+import json
+
 import numpy as np
 import pytest
 
 import imulab as il
+from imulab.cli import main
 from imulab.cli.options import GivenFiles
 from imulab.errors import ImulabError
 from imulab.estimation.noise.long_rest import long_rest
 from imulab.estimation.noise.rest import at_rest
-from imulab.procedures.noise import task
+from imulab.procedures.noise import logs, task
+from imulab.procedures.noise.checkfigures import as_json
 from imulab.procedures.run import run_task
 from imulab.recording import Recording
+from imulab.records.json_text import json_text
 
 RATE = 50.0
 
@@ -124,7 +129,7 @@ def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kin
         return list(record.parameters), values, record.sensor, record.warnings
 
     small = outcome()
-    monkeypatch.setattr(task, "LARGE", 0)
+    monkeypatch.setattr(logs, "LARGE", 0)
     large = outcome()
     assert large[0] == small[0]
     assert large[1] == pytest.approx(small[1], rel=1e-4)
@@ -149,3 +154,26 @@ def test_the_rows_are_not_kept(monkeypatch):
     assert long_rest(blocks_of(log(), 1000), ["gyro_x"]) is not None
     assert max(seen) <= 1 << 12
     assert len(seen) == 2 * 40
+
+
+def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, capsys):
+    file, later = tmp_path / "log.csv", tmp_path / "later.csv"
+    il.write_csv(Recording(log(), UNITS), file)
+    il.write_csv(Recording(log(2), UNITS), later)
+    record = il.fit_noise(file, columns="gyro_x,gyro_y").calibration
+    small = il.check_noise(record, later)
+    monkeypatch.setattr(logs, "LARGE", 0)
+    monkeypatch.setattr(logs, "as_recording", None)  # as a whole it is not read
+    large = il.fit_noise(file, columns="gyro_x,gyro_y").calibration
+    assert large.sources == record.sources
+    values = {name: each.value for name, each in record.parameters.items()}
+    assert {name: each.value for name, each in large.parameters.items()} == pytest.approx(values, rel=1e-4)
+    found = il.check_noise(large, later)
+    for name, column in small.columns.items():
+        assert found.columns[name].probability == pytest.approx(column.probability, rel=0.05, abs=0.01)
+    assert any("made from this log" in note for note in il.check_noise(large, file).notes)
+    large.save(tmp_path / "record.json")
+    monkeypatch.setattr(GivenFiles, "recording", None)
+    assert main(["noise", "check", str(tmp_path / "record.json"), str(later), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said == json.loads(json_text(as_json(found)))

@@ -18,7 +18,6 @@ from imulab.cli.options import (
     check_outputs,
     note,
     quantity,
-    read_recording,
     warn,
 )
 from imulab.errors import OptionError, RecordError
@@ -26,7 +25,11 @@ from imulab.procedures.noise.task import OPTIONS
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from imulab.estimation.noise.rest import Rest
     from imulab.procedures.noise.plan import NoisePlan
+    from imulab.recording import Recording
 
 White = Annotated[
     str | None, typer.Option(metavar="N", help="White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit.")
@@ -181,16 +184,27 @@ def check(
     """
     from imulab.cli.speech import coloured
     from imulab.procedures.loading import load
-    from imulab.procedures.noise.check import check_recordings
+    from imulab.procedures.noise.check import check_logs
     from imulab.procedures.noise.checkfigures import as_json, as_text, check_page
+    from imulab.procedures.noise.logs import read_log
+    from imulab.procedures.procedure import source_of
     from imulab.verdict import Note
 
     check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
     held = load(record)
-    recordings = [read_recording(file, **reading(options)) for file in files]
+    access, how = GivenFiles(), reading(options)
+
+    def log(file: str, choose: Callable[[Recording], Sequence[str]]) -> Recording | Rest:
+        return read_log(
+            None if file == "-" else access.path(file),
+            lambda: (access.blocks(file, **how), source_of(access, file)),
+            lambda: access.recording(file, **how),
+            choose,
+        )
+
     with labelled("--{}", ["tolerance", "false_alarm"]):
         try:
-            result = check_recordings(held, recordings, tolerance, false_alarm)
+            result = check_logs(held, lambda choose: [log(file, choose) for file in files], tolerance, false_alarm)
         except RecordError as error:
             raise RecordError(f"{record}: {error}") from None
     if report:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import ClassVar, Unpack
+from typing import ClassVar, TypeAlias, Unpack
 
 import numpy as np
 
@@ -16,13 +16,15 @@ from imulab.estimation.noise.band import within
 from imulab.estimation.noise.choice import CANDIDATES
 from imulab.estimation.noise.cosine import frequencies
 from imulab.estimation.noise.likelihood import fit, time_limits
+from imulab.estimation.noise.rest import Rest
 from imulab.estimation.noise.spectrum import Spectrum
 from imulab.estimation.noise.terms import NAMES, prepare
 from imulab.estimation.noise.use import edge_as_white
 from imulab.estimation.ranked import NORMAL_95
-from imulab.procedures.inputs import Data, Reading, as_record, as_recording
+from imulab.procedures.inputs import Data, Reading, as_record
 from imulab.procedures.noise.engineering import label
 from imulab.procedures.noise.fit import fit_recordings
+from imulab.procedures.noise.logs import given_log
 from imulab.procedures.noise.sections import Column, Fit, drawn_of, fit_of
 from imulab.procedures.result import Drawn
 from imulab.quantities import fraction
@@ -35,6 +37,8 @@ from imulab.verdict import Note
 FALSE_ALARM, TOLERANCE = "5 %", "1 %"
 _SAME_RATE = 0.01
 _HALF, _CERTAIN = 0.5, 0.05
+Choose: TypeAlias = Callable[[Recording], Sequence[str]]
+"""Columns of a log to test, by its first rows."""
 
 
 @dataclass(frozen=True)
@@ -203,8 +207,11 @@ def check_noise(
     held = as_record(record, "check_noise")
     alone = not isinstance(data, list | tuple) or not data or not all(_is_log(each) for each in data)
     logs = [data] if alone else list(data)  # type: ignore[arg-type]
-    recordings = [as_recording(each, reading, check_noise) for each in logs]  # type: ignore[arg-type]
-    return check_recordings(held, recordings, tolerance, false_alarm)
+
+    def read(choose: Choose) -> list[Recording | Rest]:
+        return [given_log(each, reading, check_noise, choose) for each in logs]  # type: ignore[arg-type]
+
+    return check_logs(held, read, tolerance, false_alarm)
 
 
 def _is_log(data: object) -> bool:
@@ -213,10 +220,13 @@ def _is_log(data: object) -> bool:
     return isinstance(data, str | PathLike | Recording | Mapping) or is_frame(data)
 
 
-def check_recordings(
-    record: Calibration, recordings: Sequence[Recording], tolerance: float | str, false_alarm: float | str
+def check_logs(
+    record: Calibration,
+    read: Callable[[Choose], Sequence[Recording | Rest]],
+    tolerance: float | str,
+    false_alarm: float | str,
 ) -> NoiseCheck:
-    """Test recordings against a record; arguments and errors as for `check_noise`."""
+    """Test logs against a record; `read` returns them, given what chooses columns. Else as for `check_noise`."""
     if record.procedure != "noise":
         raise RecordError(f"a {record.procedure} record holds no model of noise; expected a record of noise fit")
     allowed, share = fraction(tolerance, "tolerance"), fraction(false_alarm, "false_alarm")
@@ -225,10 +235,12 @@ def check_recordings(
     if not 0 < share < 1:
         raise OptionError(f"false_alarm {false_alarm}: expected a share between 0 and 1, such as 5 %")
     fit = fit_of(record)
+    logs = read(lambda first: [name for name in fit.columns if name in first])
+    recordings = [log.recording if isinstance(log, Rest) else log for log in logs]
     names, notes = _columns(record, fit, recordings)
     options = record.options
     found = fit_recordings(
-        recordings, terms="auto", horizon=fit.columns[names[0]].interval.value, band=None,
+        logs, terms="auto", horizon=fit.columns[names[0]].interval.value, band=None,
         regress=options.get("regress"), columns=names, steps=options.get("steps"),
     ).calibration  # fmt: skip
     rate = fit_of(found).sample_rate.value

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from os import PathLike
 from typing import Any, Unpack
 
@@ -21,8 +20,9 @@ from imulab.estimation.noise.cosine import Stretch
 from imulab.estimation.noise.regression import Regression, ramp_coefficients
 from imulab.estimation.noise.rest import Rest, at_rest
 from imulab.frames import is_frame
-from imulab.procedures.inputs import Data, Reading, as_recording
+from imulab.procedures.inputs import Data, Reading
 from imulab.procedures.noise.choices import HORIZON, NO_COVARIATE, SAY_STEPS, check_options
+from imulab.procedures.noise.logs import given_log
 from imulab.procedures.noise.record import make_record
 from imulab.procedures.options import names_of_columns
 from imulab.procedures.result import Result
@@ -213,11 +213,12 @@ def fit_noise(
 
     sources: list[Source] = []
 
-    def read() -> Iterator[Recording]:
+    def read() -> Iterator[Recording | Rest]:
         for each in logs:
-            recording = as_recording(each, reading, fit_noise, columns=named)
-            sources.extend([recording.source] if recording.source is not None else [])
-            yield recording
+            log = given_log(each, reading, fit_noise, lambda first: chosen_columns(first, columns), named)
+            source = (log.recording if isinstance(log, Rest) else log).source
+            sources.extend([source] if source is not None else [])
+            yield log
 
     return fit_recordings(
         read(), terms=terms, horizon=horizon, band=band, regress=regress, columns=columns, steps=steps, sources=sources
@@ -296,14 +297,6 @@ def read_rests(recordings: Iterable[Recording | Rest], columns: Sequence[str] | 
             _check_alike(rests[0], rest, columns)
         rests.append(rest)
     return rests
-
-
-def long_log(blocks: Iterator[Recording], columns: Sequence[str] | None) -> Rest | None:
-    """Return a long log at rest from its blocks, without keeping its rows; None where it has to be read as a whole."""
-    from imulab.estimation.noise.long_rest import long_rest
-
-    first = next(blocks)
-    return long_rest(chain([first], blocks), chosen_columns(first, columns))
 
 
 def _check_alike(first: Rest, other: Rest, columns: Sequence[str] | None) -> None:

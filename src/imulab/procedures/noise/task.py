@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
-    from imulab.procedures.noise.fit import fit_recordings, long_log
+    from imulab.procedures.noise.fit import chosen_columns, fit_recordings
+    from imulab.procedures.noise.logs import read_log
 
     def read(name: str) -> Recording | Rest:
         part = {"layout": values["layout"], **values["part"]}
-        path = access.path(name)
-        if name != "-" and path.is_file() and path.stat().st_size > LARGE:
-            found = long_log(access.blocks(name, **part), values["columns"])
-            if found is not None:
-                return found
-        return access.recording(name, **part)
+        return read_log(
+            None if name == "-" else access.path(name),
+            lambda: (access.blocks(name, **part), None),
+            lambda: access.recording(name, **part),
+            lambda first: chosen_columns(first, values["columns"]),
+        )
 
     recordings = map(read, files)
     sources = (source for name in files if (source := source_of(access, name)) is not None)
@@ -35,8 +36,6 @@ def _fit(
     return fit_recordings(recordings, sources=sources, **fit).calibration
 
 
-LARGE = 1 << 28
-"""Bytes of a file whose rows are not kept in memory."""
 OPTIONS = (
     Option("terms", "Noises: auto, or letters of N B K G Q.", check_terms, "auto", "auto|NBK", ("auto",)),
     measure(

@@ -1,0 +1,64 @@
+"""Logs at rest as they are given: short ones as recordings, large files block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from imulab.estimation.noise.long_rest import long_rest
+from imulab.estimation.noise.rest import Rest
+from imulab.procedures.inputs import Data, Reading, as_blocks, as_recording
+from imulab.recording import Recording, Source
+
+LARGE = 1 << 28
+"""Bytes of a file whose rows are not kept in memory."""
+
+
+def given_log(
+    data: Data,
+    reading: Reading,
+    function: Callable[..., Any],
+    choose: Callable[[Recording], Sequence[str]],
+    named: Callable[[NDArray[Any]], Mapping[str, Any]] | None = None,
+) -> Recording | Rest:
+    """Return a log as a function was given it; else as `read_log`. Errors as for `as_recording`."""
+    return read_log(
+        Path(data) if isinstance(data, str | PathLike) else None,
+        lambda: as_blocks(data, reading, function),
+        lambda: as_recording(data, reading, function, columns=named),
+        choose,
+    )
+
+
+def read_log(
+    path: Path | None,
+    blocks: Callable[[], tuple[Iterator[Recording], Source | None]],
+    whole: Callable[[], Recording],
+    choose: Callable[[Recording], Sequence[str]],
+) -> Recording | Rest:
+    """Return a log; of a large file at rest, read block by block, what is left without its rows.
+
+    Parameters
+    ----------
+    path
+        Of its file, None where it has none.
+    blocks
+        Reads it block by block, and says its source.
+    whole
+        Reads it as a whole, where it is short or has faults that have to be looked at.
+    choose
+        Returns the columns to fit, given the first block.
+    """
+    if path is None or not path.is_file() or path.stat().st_size <= LARGE:
+        return whole()
+    read, source = blocks()
+    first = next(read)
+    names = choose(first)
+    found = long_rest(chain([first], read), names) if names else None
+    return whole() if found is None else replace(found, recording=replace(found.recording, source=source))
