@@ -13,6 +13,7 @@ import pytest
 import imulab as il
 from imulab.cli import common, main
 from imulab.cli.app import command
+from imulab.estimation.noise_coefficients import coefficients_dict
 from imulab.procedures.noise.checkfigures import as_json
 from imulab.quantities import quantity
 from imulab.records.json_text import json_text
@@ -467,6 +468,23 @@ def test_the_noise_of_columns_is_told_as_on_the_command_line(folder, capsys, mon
         found = il.allan_deviation("still.csv", column=name, taus="dense", window="3:25")
         for what in ("tau", "deviation", "standard_uncertainty"):
             assert column[what] == getattr(found, what).tolist()
+        told = coefficients_dict(found.coefficients, found.unit)
+        assert {key: column[key] for key in told} == json.loads(json.dumps(told))
+
+
+def test_rows_without_numbers_are_bridged_in_an_allan_curve_as_on_the_command_line(tmp_path, capsys):
+    log = il.simulate_noise(white="0.3 deg/sqrt(h)", duration="2 min", columns=["gyro_x", "gyro_y"])
+    log.columns["gyro_x"][[40, 41, 900]] = np.nan
+    il.write(log, tmp_path / "log.csv")
+    ran("allan", tmp_path / "log.csv", "--json")
+    said = json.loads(capsys.readouterr().out)
+    for name, column in said["columns"].items():
+        found = il.allan_deviation(tmp_path / "log.csv", column=name)
+        assert column["deviation"] == found.deviation.tolist()
+        told = coefficients_dict(found.coefficients, found.unit)
+        assert {key: column[key] for key in told} == json.loads(json.dumps(told))
+        assert any("3 rows without numbers" in note for note in found.notes)
+        assert set(found.notes) <= set(said["warnings"])
 
 
 def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
 
@@ -41,7 +41,7 @@ _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
 _NOISE_REACH = 20.0
 _LARGEST = 1e140
 _MOST_NAMED, _MOST_COLUMNS = 3, 6
-_FEWEST, _LEAST_FREEDOM = 50, 4.0
+FEWEST, _LEAST_FREEDOM = 50, 4.0
 _COARSE = 2.2  # of the deviation from sample to sample; whole counts of an angle show steps of 2.0 of it at most
 _FITTED = 0.5  # averaging times that a band tells, in terms of 1/f_max
 
@@ -97,19 +97,68 @@ def noise_columns(recording: Recording) -> Iterator[str]:
 def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     """Return Allan curves and noise coefficients of every sensor column, in SI, as plain JSON values.
 
-    Of a recording whose sampling rate changes, the longest stretch of one rate counts; a few rows without numbers are
-    bridged. The warnings name both.
-
-    Raises
-    ------
-    DataError, OptionError
-        As for `allan_deviation`; also without a time column, or without any sensor column.
+    Errors as for `curves_and_noise`; also without any sensor column.
     """
     names = list(noise_columns(recording))
     if not names:
         raise DataError(
             f"{recording.name}: no sensor column ({' '.join(INERTIAL)}); found {' '.join(recording.columns)}"
         )
+    recording, rate, noises, notes = curves_and_noise(recording, names, taus)
+    columns: dict[str, Any] = {}
+    for name, noise in noises.items():
+        columns[name] = {
+            "unit": si_unit(recording.units[name]),
+            "mean": float(recording.si(name).mean()),
+            **coefficients_dict(noise.coefficients, si_unit(recording.units[name])),
+            "tau": noise.curve.tau.tolist(),
+            "deviation": noise.curve.deviation.tolist(),
+            "standard_uncertainty": noise.curve.standard_uncertainty.tolist(),
+            "fitted": _listed(noise.fitted(noise.curve.tau)),
+        }
+    return {
+        "format": "imulab.noise",
+        "version": 1,
+        "file": recording.name,
+        "sensor": {key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
+        "samples": len(recording),
+        "sample_rate": {"value": rate, "unit": "Hz"},
+        "taus": taus,
+        "warnings": notes,
+        "columns": columns,
+    }
+
+
+def curves_and_noise(
+    recording: Recording, wanted: Sequence[str], taus: str | Array
+) -> tuple[Recording, float, dict[str, ColumnNoise], list[str]]:
+    """Return what is left of a recording, its rate, Hz, the noise of some of its sensor columns, and what is to say.
+
+    Of a recording whose sampling rate changes, the longest stretch of one rate counts; a few rows without numbers are
+    bridged. The notes name both.
+
+    Raises
+    ------
+    DataError, OptionError
+        As for `allan_deviation`; also without a time column.
+    """
+    names = list(noise_columns(recording))  # rows are left out by what all sensors show
+    recording, rate, notes = _mended(recording, names)
+    moved = moved_columns(recording, names, rate)
+    values = (recording.si(name) for name in wanted)  # one at a time: a long log is large
+    noises = dict(zip(wanted, columns_noise(values, rate, [moved.get(name, "") for name in wanted]), strict=True))
+    for name in wanted:
+        samples = recording.si(name)
+        if name not in moved and (step := find_step(samples)) is not None:
+            notes.append(_step_line(recording, name, step))
+        if not isinstance(taus, str) or taus != "octave":
+            noises[name] = replace(noises[name], curve=allan_deviation(samples, rate, taus))
+    notes += [type(line)(f"{recording.name}: {line}") for line in noise_lines(noises)]
+    return recording, rate, noises, notes
+
+
+def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:
+    """Rows that are readings, at one rate, Hz, and what is to say of the others."""
     notes = [f"{recording.name}: {note}" for note in recording.notes]
     recording, more = bridged(recording, names)
     for sensor in dict.fromkeys(map(kind_of, names)):
@@ -123,37 +172,7 @@ def analyse(recording: Recording, taus: str = "octave") -> dict[str, Any]:
     rate, timing = sampling_rate(recording)
     if not 1 / _LARGEST < rate < _LARGEST:
         raise DataError(f"{recording.name}: column time: {rate:.3g} samples in a second; expected a rate of sensors")
-    notes += [*more, *mended, *trimmed, *timing, *doubtful_units(recording, names, rate)]
-    moved = moved_columns(recording, names, rate)
-    columns: dict[str, Any] = {}
-    values = (recording.si(name) for name in names)  # one at a time: a long log is large
-    noises = dict(zip(names, columns_noise(values, rate, [moved.get(name, "") for name in names]), strict=True))
-    for name in names:
-        samples = recording.si(name)
-        if name not in moved and (step := find_step(samples)) is not None:
-            notes.append(_step_line(recording, name, step))
-        curve = noises[name].curve if taus == "octave" else allan_deviation(samples, rate, taus)
-        columns[name] = {
-            "unit": si_unit(recording.units[name]),
-            "mean": float(samples.mean()),
-            **coefficients_dict(noises[name].coefficients, si_unit(recording.units[name])),
-            "tau": curve.tau.tolist(),
-            "deviation": curve.deviation.tolist(),
-            "standard_uncertainty": curve.standard_uncertainty.tolist(),
-            "fitted": _listed(noises[name].fitted(curve.tau)),
-        }
-    notes += [type(line)(f"{recording.name}: {line}") for line in noise_lines(noises)]
-    return {
-        "format": "imulab.noise",
-        "version": 1,
-        "file": recording.name,
-        "sensor": {key: recording.metadata[key] for key in ("serial", "model") if key in recording.metadata},
-        "samples": len(recording),
-        "sample_rate": {"value": rate, "unit": "Hz"},
-        "taus": taus,
-        "warnings": notes,
-        "columns": columns,
-    }
+    return recording, rate, [*notes, *more, *mended, *trimmed, *timing, *doubtful_units(recording, names, rate)]
 
 
 def _check_squares(recording: Recording, names: list[str]) -> None:
@@ -188,9 +207,9 @@ def columns_noise(
     curves, why, stretches = [], [], []
     for samples, reason in zip(columns, moved or repeat("")):  # noqa: B905
         curves.append(allan_deviation(samples, rate))
-        if len(samples) < _FEWEST:
+        if len(samples) < FEWEST:
             raise DataError(
-                f"noise coefficients: {len(samples)} samples are too few; expected some {_FEWEST} samples or more"
+                f"noise coefficients: {len(samples)} samples are too few; expected some {FEWEST} samples or more"
             )
         why.append(reason or _unfit(samples, float(curves[-1].deviation[0])))
         stretches += [] if why[-1] else [[transformed(samples, 1 / rate)]]

@@ -11,6 +11,8 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import allan
+from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns
+from imulab.estimation.noise_coefficients import NoiseCoefficients
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
 from imulab.procedures.inputs import Data, Part, Window, as_recording
@@ -34,10 +36,16 @@ class AllanCurve(Drawn, allan.AllanCurve):
         Equivalent degrees of freedom, shape (t,).
     name, unit
         Of the samples.
+    coefficients
+        Noise coefficients of a sensor's column, as ``imulab allan`` prints them; None of other samples.
+    notes
+        What is to say of the column and its rows, a sentence each.
     """
 
     name: str = "samples"
     unit: str = "1"
+    coefficients: NoiseCoefficients | None = None
+    notes: tuple[str, ...] = ()
 
     subject: ClassVar[str] = "Allan deviation"
 
@@ -62,10 +70,6 @@ class AllanCurve(Drawn, allan.AllanCurve):
         return Exhibits(headline, [], [allan_figure({self.name: vars(self)}, [self.name]), table])
 
 
-def _curve(found: allan.AllanCurve, name: str = "samples", unit: str = "1") -> AllanCurve:
-    return AllanCurve(**vars(found), name=name, unit=unit)
-
-
 def allan_deviation(
     data: Data,
     rate: float | None = None,
@@ -75,10 +79,12 @@ def allan_deviation(
     window: Window | None = None,
     **reading: Unpack[Part],
 ) -> AllanCurve:
-    """Compute the overlapping Allan deviation of evenly spaced samples.
+    """Compute the overlapping Allan deviation of evenly spaced samples, and noise coefficients of a sensor's column.
 
     ``sigma^2(m / rate) = sum_k (x_{k+2m} - 2 x_{k+m} + x_k)^2 / (2 (m / rate)^2 (N - 2m))``, x the integral of the
-    samples less their mean, N its length (NIST SP 1065).
+    samples less their mean, N its length (NIST SP 1065). Of a column of 50 samples or more of a gyroscope or an
+    accelerometer, rows that are no readings are bridged, and coefficients come with the curve, as ``imulab allan`` does
+    it.
 
     Parameters
     ----------
@@ -100,7 +106,7 @@ def allan_deviation(
     Raises
     ------
     DataError
-        Fewer than 3 samples, or samples that are not finite.
+        Fewer than 3 samples, or samples that are not finite; of a sensor's column, more than 1 % of them.
     OptionError
         `taus` or `rate` cannot be used, or which column is meant is not said.
 
@@ -119,6 +125,8 @@ def allan_deviation(
     >>> still = il.simulate_array(experiment="static", duration=60.0)
     >>> il.allan_deviation(still, column="gyro_1").tau[:3].round(3).tolist()
     [0.01, 0.02, 0.04]
+    >>> il.allan_deviation(still, column="gyro_1").coefficients.angle_random_walk.reason
+    ''
     """
     if not isinstance(data, str | PathLike | Recording | Mapping) and not is_frame(data) and _is_line(data):
         if rate is None:
@@ -126,7 +134,7 @@ def allan_deviation(
         for name, value in {**reading, "column": column, "window": window}.items():
             if value is not None:
                 raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
-        return _curve(allan.allan_deviation(unmasked(data).astype(np.float64), rate, taus))
+        return AllanCurve(**vars(allan.allan_deviation(unmasked(data).astype(np.float64), rate, taus)))
     given: dict[str, Any] = {**reading, "rate": rate, "window": window}
     recording = as_recording(data, given, allan_deviation)
     names = [name for name in recording.columns if name != "time"]
@@ -136,9 +144,14 @@ def allan_deviation(
         raise OptionError(
             f"allan_deviation: {recording.name}: {found}; expected column=, one of {listed(names, column)}"
         )
+    unit = si_unit(recording.units[chosen])
+    if chosen in noise_columns(recording) and len(recording) >= FEWEST:
+        _, _, noises, notes = curves_and_noise(recording, [chosen], taus)
+        its = noises[chosen]
+        return AllanCurve(**vars(its.curve), name=chosen, unit=unit, coefficients=its.coefficients, notes=tuple(notes))
     check_finite(recording, [chosen])
     curve = allan.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
-    return _curve(curve, chosen, si_unit(recording.units[chosen]))
+    return AllanCurve(**vars(curve), name=chosen, unit=unit)
 
 
 def _is_line(data: object) -> bool:
