@@ -1,72 +1,30 @@
 #!/usr/bin/env python3
 """Write vectors.h: what the C core must compute, from equations transcribed apart.
 
-Imports nothing of imulab. Triads, drift and warm-up are computed with 60 decimal digits; blobs are packed by hand; the
-array's methods are plain Python in double, the robust one from tests/reference.
+Imports nothing of imulab. Triads, drift and warm-up are computed here, with 60 decimal digits; array_vectors.py has the
+array's methods, pack_blobs.py the blobs.
 
 `make_vectors.py --seeds DIR` writes the blobs, a file each, for the fuzzer.
 """
 
 import math
 import random
-import struct
 import sys
 import zlib
 from decimal import Decimal, getcontext
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parents[1] / "tests"))
-from reference import gyro_array as reference  # noqa: E402
+from array_vectors import ELEMENTS, EVERY, SAMPLES, SCENARIOS, array
+from pack_blobs import make_blobs, write_seeds
+from write_c import LINES, emit, emit_bytes, emit_words
 
+HERE = Path(__file__).resolve().parent
 getcontext().prec = 60
 G = 9.80665
-LINES = []
 
 
 def d(x):
     return Decimal(x)
-
-
-# ---- writing C -----------------------------------------------------------------------------------------------------
-
-
-def number(x):
-    x = float(x)
-    if math.isnan(x):
-        return "VNAN"
-    return f"R({x!r})"
-
-
-def nested(values):
-    """A C initialiser, broken into lines of readable length."""
-    if not isinstance(values, (list, tuple)):
-        return number(values)
-    inner, line = "", 0
-    for value in values:
-        text = nested(value) + ","
-        fresh = isinstance(value, (list, tuple)) or line + len(text) > 110
-        inner += ("\n" if fresh else " ") + text
-        line = len(text) if fresh else line + 1 + len(text)
-    return "{" + inner.strip() + "}"
-
-
-def shape(values):
-    return f"[{len(values)}]" + shape(values[0]) if isinstance(values, (list, tuple)) else ""
-
-
-def emit(name, values):
-    LINES.append(f"static const il_real {name}{shape(values)} = {nested(values)};")
-
-
-def emit_bytes(name, data):
-    LINES.append(f"static const uint8_t {name}[{len(data)}] = {{")
-    LINES.extend("    " + ", ".join(map(str, data[i : i + 28])) + "," for i in range(0, len(data), 28))
-    LINES.append("};")
-
-
-def emit_words(name, words):
-    LINES.append(f"static const uint32_t {name}[{len(words)}] = {{{', '.join(f'{w}u' for w in words)}}};")
 
 
 def polynomial(coefficients, u):
@@ -300,230 +258,7 @@ def warmup():
     emit("v_warmup_bias", expected)
 
 
-# ---- gyro array ----------------------------------------------------------------------------------------------------
-
-ELEMENTS, SAMPLES, RATE = 6, 400, 50.0
-TURN = [math.ldexp(round(math.ldexp(0.2 * math.sin(0.02 * k), 20)), -20) for k in range(SAMPLES)]  # rad/s
-EVERY = 7  # samples between two that are written down
-
-
-def base_readings():
-    """A slow turn seen by six unequal gyros; multiples of 2^-20, so that float and double start alike."""
-    rng = random.Random(5)
-    offset = [rng.uniform(-5e-3, 5e-3) for _ in range(ELEMENTS)]
-    sigma = [1e-3 * rng.uniform(0.6, 1.6) for _ in range(ELEMENTS)]
-    return [
-        [math.ldexp(round(math.ldexp(turn + b + rng.gauss(0, s), 20)), -20) for b, s in zip(offset, sigma)]
-        for turn in TURN
-    ]
-
-
-def faulty(scenario, base, k, i):
-    """Reading k of gyro i in three of the scenarios of arrays.h, which has all."""
-    if scenario == 4 and i == 0 and 100 <= k < 130:  # bursts of what is not a number
-        return math.nan
-    if scenario == 4 and i == 4 and 200 <= k < 205:
-        return math.inf
-    if scenario == 7 and 200 <= k < 210:  # all lost
-        return math.nan
-    if scenario == 8 and i != 4 and 200 <= k < 260:  # all but one
-        return -math.inf
-    return base[k][i]
-
-
-SCENARIOS = 16
-HEALTHY_MEMORY = 0.015625  # a fixed gain
-
-
-def support(rows, kernel):
-    spread, count, out = 0.0, 0, []
-    for z in rows:
-        good = [x for x in z if math.isfinite(x)]
-        m = len(good)
-        if m == 0:
-            out.append(math.nan)
-            continue
-        if m == 1:
-            out.append(good[0])
-            continue
-        pairs = [(i, j) for i in range(m) for j in range(i)]
-        count += 1
-        mean_square = sum((good[i] - good[j]) ** 2 for i, j in pairs) / len(pairs)
-        spread += (mean_square - spread) / count
-        weight = [0.0] * m
-        for i, j in pairs:
-            square = (good[i] - good[j]) ** 2 / spread
-            degree = math.exp(-square / 2) if kernel == 0 else math.exp(-math.sqrt(square))
-            weight[i] += degree
-            weight[j] += degree
-        out.append(sum(w * x for w, x in zip(weight, good)) / sum(weight))
-    return out
-
-
-def least_squares(rows, memory):
-    method = reference.LeastSquares(ELEMENTS, memory)
-    return [method.step(z) for z in rows]
-
-
-def fixed(rows, weights):
-    out = []
-    for z in rows:
-        good = [i for i in range(ELEMENTS) if math.isfinite(z[i])]
-        total = sum(weights[i] for i in good)
-        out.append(sum(weights[i] * z[i] for i in good) / total if good else math.nan)
-    return out
-
-
-def kalman(rows, gain, first, given):
-    """Virtual gyro with a constant gain; a missing gyro is given the mean innovation of the others."""
-    rate, b, out = None, [0.0] * ELEMENTS, []
-    for z in rows:
-        good = [i for i in range(ELEMENTS) if math.isfinite(z[i])]
-        if not good:
-            out.append(math.nan)
-            continue
-        mean = sum(z[i] for i in good) / len(good)
-        if rate is None:
-            if first:
-                b = [z[i] - mean if i in good else 0.0 for i in range(ELEMENTS)]
-            elif given is not None:
-                b = list(given)
-            rate = sum(z[i] - b[i] for i in good) / len(good)
-        innovation = {i: z[i] - rate - b[i] for i in good}
-        usual = sum(innovation.values()) / len(good)
-        v = [innovation.get(i, usual) for i in range(ELEMENTS)]
-        rate += sum(gain[0][i] * v[i] for i in range(ELEMENTS))
-        b = [b[i] + sum(gain[i + 1][j] * v[j] for j in range(ELEMENTS)) for i in range(ELEMENTS)]
-        out.append(rate)
-    return out
-
-
-def thinned(runs):
-    return [run[::EVERY] for run in runs]
-
-
-def array():
-    rng = random.Random(6)
-    base = base_readings()
-    emit("v_array_base", base)
-    emit("v_array_turn", [TURN[k] for k in range(SAMPLES)])
-
-    rates = []
-    for memory in (None, HEALTHY_MEMORY):
-        method = reference.Robust(ELEMENTS, rate=RATE, memory=memory)
-        rates.append([method.step(z) for z in base])
-    emit("v_robust_rate", thinned(rates))
-    reliability = [1.0, 4.0, 0.5, 2.0, 9.0, 1.5]
-    emit("v_array_reliability", reliability)
-    method = reference.Robust(ELEMENTS, rate=RATE, reliability=reliability)
-    emit("v_robust_calibrated", thinned([[method.step(z) for z in base]])[0])
-
-    bias = [rng.uniform(-5e-3, 5e-3) for _ in range(ELEMENTS)]
-    emit("v_array_bias", bias)
-    feedback = []
-    for initial, memory, start in (
-        ("first", None, 1),
-        ("zero", None, 1),
-        (bias, None, 1),
-        ("first", 0.125, 1),
-        ("zero", None, 40),
-    ):
-        method = reference.Feedback(ELEMENTS, initial, memory, start)
-        feedback.append([method.step(z) for z in base])
-    emit("v_feedback_rate", thinned(feedback))
-    lost = [[faulty(4, base, k, i) for i in range(ELEMENTS)] for k in range(SAMPLES)]
-    gone = [[faulty(8, base, k, i) for i in range(ELEMENTS)] for k in range(SAMPLES)]
-    none = [[faulty(7, base, k, i) for i in range(ELEMENTS)] for k in range(SAMPLES)]
-    emit("v_mean_rate", thinned([fixed(rows, [1.0] * ELEMENTS) for rows in (lost, gone, none)]))
-    emit("v_covariance_rate", thinned([fixed(rows, reliability) for rows in (lost, gone, none)]))
-    emit("v_support_rate", [thinned([support(rows, kernel) for rows in (lost, gone, none)]) for kernel in (0, 1)])
-    emit("v_least_squares_rate", thinned([least_squares(base, None), least_squares(base, 0.125)]))
-    gain = [[0.05 / ELEMENTS * rng.uniform(0.8, 1.2) for _ in range(ELEMENTS)]]
-    gain += [[(0.01 if i == j else -0.002) * rng.uniform(0.8, 1.2) for j in range(ELEMENTS)] for i in range(ELEMENTS)]
-    emit("v_kalman_gain", gain)
-    emit(
-        "v_kalman_rate",
-        thinned([kalman(lost, gain, True, None), kalman(gone, gain, False, None), kalman(none, gain, False, bias)]),
-    )
-    # Three axes of two gyros each: offset and alignment first, then the mean.
-    offset = [[rng.uniform(-0.01, 0.01) for _ in range(2)] for _ in range(3)]
-    matrix = [[[(i == j) + rng.uniform(-0.1, 0.1) for j in range(3)] for i in range(3)] for _ in range(2)]
-    reading = [[[rng.uniform(-1, 1) for _ in range(2)] for _ in range(3)] for _ in range(4)]
-    out = []
-    for sample in reading:
-        z = [
-            [sum(matrix[e][r][c] * (sample[c][e] - offset[c][e]) for c in range(3)) for e in range(2)] for r in range(3)
-        ]
-        out.append([sum(row) / 2 for row in z])
-    emit("v_aligned_offset", offset)
-    emit("v_aligned_matrix", matrix)
-    emit("v_aligned_reading", reading)
-    emit("v_aligned_rate", out)
-
-
 # ---- blobs ---------------------------------------------------------------------------------------------------------
-
-
-def section(kind, *parts):
-    payload = b"".join(parts)
-    return struct.pack("<II", kind, len(payload)) + payload
-
-
-def blob(width, *sections, version=1):
-    body = b"".join(sections)
-    head = b"\x89IMULAB\n" + struct.pack("<HHI", version, width, 20 + len(body))
-    return head + body + struct.pack("<I", zlib.crc32(head + body))
-
-
-def words(*values):
-    return struct.pack(f"<{len(values)}I", *values)
-
-
-def reals(width, *values):
-    return struct.pack(f"<{len(values)}{'d' if width == 8 else 'f'}", *values)
-
-
-def counted(width, n, start):
-    """n numbers that say where they stand, all exact in float."""
-    return reals(width, *(start + i / 8 for i in range(n)))
-
-
-def make_sections(w):
-    tumble_of = [
-        section(1, words(order), counted(w, 15, order), counted(w, 3 * (order - 1), 50)) for order in range(1, 6)
-    ]
-    gyro_of = [section(2, words(0), counted(w, 15, 1)), section(2, words(1), counted(w, 24, 1))]
-    drift = section(3, words(1, 0), counted(w, 11, 2))
-    warm = []
-    for model in range(4):
-        terms, rows = (4, 2 if model == 0 else 3) if model < 3 else (2, 3)
-        head = words(model, model % 3, 3, 2, terms) + reals(w, 300, 60, 20, 15, 90, 200) + reals(w, -40, 0, 60)
-        tables = counted(w, rows * 2 * terms, 1) + (counted(w, rows * 2 * terms, 100) if model == 3 else b"")
-        warm.append(section(4, head, tables))
-    sensors = []
-    for method in range(7):
-        n, axes = 3, 3 if method == 4 else 1
-        mask = [1, 2, 4, 8, 7, 8, 16][method]
-        size = axes * n * (mask & 1) + n * axes * axes * (mask >> 1 & 1) + axes * n * (mask >> 2 & 1)
-        size += axes * n * (mask >> 3 & 1) + axes * (n + 1) * n * (mask >> 4 & 1)
-        head = words(method, n, axes, 2 if mask & 4 else 0, 1, 1, 100, 20, 10, 5, mask)
-        sensors.append(section(5, head, reals(w, 0.25, 6, 4, 0.0078125, 0.5, 0.0625), counted(w, size, 1)))
-    return tumble_of, gyro_of, drift, warm, sensors
-
-
-def make_blobs(w):
-    tumble_of, gyro_of, drift, warm, sensors = make_sections(w)
-    text = section(0, b'{"format": "imulab.blob"}')
-    made = [blob(w), blob(w, text), blob(w, text, tumble_of[1], gyro_of[1], drift, warm[3], sensors[4])]
-    field = [section(6, words(1), counted(w, 15, 3)), section(6, words(2), counted(w, 18, 3))]
-    crossed = section(1, words(256 + 2), counted(w, 15, 2), counted(w, 6, 50))  # with cross terms
-    laws = [
-        section(7, words(pieces, terms), counted(w, pieces + 1, -20), counted(w, 9 * pieces * terms, 30))
-        for pieces, terms in ((1, 4), (3, 2))
-    ]
-    bent = section(2, words(1, 3), counted(w, 24, 1), counted(w, 12, 60))  # of order 3: version 2
-    made += [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field, *laws)]
-    return [*made, blob(w, bent, version=2)]
 
 
 def blobs():
@@ -542,15 +277,6 @@ def blobs():
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)
     LINES.append(f"static const uint32_t v_crc = {zlib.crc32(letters)}u;")
-
-
-def write_seeds(folder):
-    """The blobs for the fuzzer, whose first byte says what it mends: once nothing, once size and CRC."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for w in (4, 8):
-        for i, data in enumerate(make_blobs(w)):
-            for choice in (2, 3 + (w & 8) // 2):
-                (folder / f"{w}-{i}-{choice}").write_bytes(bytes([choice]) + data)
 
 
 def main():
