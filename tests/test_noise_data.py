@@ -464,3 +464,16 @@ def test_a_sensor_filter_does_not_decide_about_slow_noise(reduced):
 def best_model(spectrum):
     models = ("N", "NK", "NB", "NBK")
     return min(models, key=lambda model: fitted([spectrum], model)[2] + 4 * len(model))
+
+
+@pytest.mark.parametrize(("step", "least", "most"), [(60.0, 8, 10), (0.0, 0, 0)])
+def test_a_step_is_told_from_the_random_walk_that_a_model_takes_it_for(step, least, most):
+    """400 s of N and 1/f noise, drawn in time, 60 deg/h beside 6.6 deg/h: the model fitted first has a walk."""
+    said = 0
+    for seed in range(10):
+        rng = np.random.default_rng([seed, 3])
+        x = reference.draw(rng, {"N": 0.005, "B": 10 / 3600}, 40_000, 0.01, burn=40_000)
+        x[int(40_000 * rng.uniform(0.2, 0.8)) :] += step / 3600
+        fit = il.fit_noise({"gyro_x": x}, rate=100.0, unit="deg/s")
+        said += bool(fit.columns["gyro_x"].steps)
+    assert least <= said <= most

@@ -13,7 +13,7 @@ from imulab.recording import Array, Recording
 from imulab.report import panels, render_page
 from imulab.report.bulk import bulk, edge_marks, edge_note
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
-from imulab.report.traces import DASHES, SYMBOLS, band, rounded, scatter
+from imulab.report.traces import DASHES, MARGIN, SYMBOLS, band, rounded, scatter
 from imulab.verdict import Note, verdict_of
 
 _HOUR = 3600.0
@@ -131,6 +131,7 @@ def allan_figure(columns: Mapping[str, Any], names: Sequence[str]) -> Figure:
             "xaxis": {**log, "title": {"text": "averaging time, s"}},
             "yaxis": {**log, "title": {"text": f"Allan deviation, {unit}"}, "automargin": True},
             "legend": LEGEND,
+            "margin": MARGIN,
             "showlegend": len(names) > 1,
         },
         height=430,

@@ -10,7 +10,7 @@ import numpy as np
 
 from imulab.estimation.noise.band import Allowance, Band, allow, usable_band, within
 from imulab.estimation.noise.choice import CANDIDATES, Averaged, Choice, average, choose
-from imulab.estimation.noise.cleaning import Step, find_steps, step_coefficients
+from imulab.estimation.noise.cleaning import STEP, Step, find_steps, step_coefficients
 from imulab.estimation.noise.cosine import Stretch, variances_of_coefficients
 from imulab.estimation.noise.intervals import profile
 from imulab.estimation.noise.likelihood import Flags, fit, time_limits
@@ -111,14 +111,14 @@ class Analysis:
         """Return the variance of the coefficients in the bins of each spectrum, (b,)."""
         return _split(self.bins.variances(self.values[None])[0], self.spectra)
 
-    def steps(self, stretches: Sequence[Stretch]) -> list[tuple[Step, ...]]:
+    def steps(self, stretches: Sequence[Stretch], limit: float = STEP) -> list[tuple[Step, ...]]:
         """Return the changes of level of stretches, its own or these before something was taken out, by its noise."""
         found, start = [], 0
         variances = self.variances()
         for each in stretches:
             stop = start + len(each.spectra)
             level = variances_of_coefficients(variances[start:stop], each)
-            found.append(find_steps(each.slow, level, each.count, each.interval))
+            found.append(find_steps(each.slow, level, each.count, each.interval, limit))
             start = stop
         return found
 

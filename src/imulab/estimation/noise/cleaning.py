@@ -18,7 +18,8 @@ _FALSE_ALARM, _FEWEST, _SKIRT = 1e-9, 16, 3
 _LEAST = 100  # coefficients whose median tells the level: that of 16 is off by a factor of 3 now and then
 _STRONG, _NEAR, _WANDERS, _MOST_STRONG, _ROUNDS = 1e5, 50, 0.01, 8, 14
 """Lines so far above the median are fitted, by so many coefficients on both sides, if so little of them is left."""
-_STEP = 5.0
+STEP, PERHAPS = 5.0, 4.0
+"""|z| beyond which a change of level is a step; and may be one that the fit took for random walk."""
 _MOST_STEPS = 5
 _AROUND, _FEWEST_BLOCKS, _MOST_KNOCKED = 21, 64, 0.05
 _LEVEL, _FIFTH, _LOUD = 6.0, 10, 3.0
@@ -220,11 +221,12 @@ def _sine_coefficients(j: Array, place: float, count: int) -> Array:
     return np.asarray(np.stack([cosine, sine]) * np.sqrt(2 / count) / 4)
 
 
-def find_steps(slow: Array, variances: Array, count: int, interval: float) -> tuple[Step, ...]:
+def find_steps(slow: Array, variances: Array, count: int, interval: float, limit: float = STEP) -> tuple[Step, ...]:
     """Find steps of the level, one after the other, by their size over its standard uncertainty under the noise model.
 
     A step at sample k has the coefficients ``h_j = -sqrt(2/n) sin(pi j k/n)/s_j``, s_j = 2 sin(pi j/2n); its size is
-    ``sum h_j c_j/lambda_j / sum h_j^2/lambda_j``, and z that over its uncertainty. |z| > 5 is a step.
+    ``sum h_j c_j/lambda_j / sum h_j^2/lambda_j``, and z that over its uncertainty. |z| above the limit is a
+    step.
 
     Parameters
     ----------
@@ -232,12 +234,14 @@ def find_steps(slow: Array, variances: Array, count: int, interval: float) -> tu
         The lowest coefficients and their variances, shape (J,); infinite variances leave coefficients out.
     count, interval
         Samples of the stretch, n, and the time between them, s.
+    limit
+        Of ``|z|``.
     """
     found: list[Step] = []
     c = slow
     while len(found) < _MOST_STEPS:
         place, size, u = _largest_step(c, variances, count)
-        if not abs(size) > _STEP * u:
+        if not abs(size) > limit * u:
             break
         found.append(Step(place * interval, size, u))
         c = c - size * step_coefficients(len(c), place, count)

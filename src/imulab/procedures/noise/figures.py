@@ -14,7 +14,7 @@ from imulab.procedures.noise.sections import Binned, Column, Fit, drawn_of, fit_
 from imulab.records.calibration import Calibration
 from imulab.report import panels
 from imulab.report.elements import BAD, GOOD, INK, LEGEND, QUIET, Exhibits, Figure, ReportTable, plain_number
-from imulab.report.traces import band, log_axis, rounded, scatter
+from imulab.report.traces import MARGIN, band, log_axis, rounded, scatter
 
 _DIGITS = 5
 _PARTS = ("white", "1/f", "walk", "quantisation", "Gauss-Markov", "second Gauss-Markov")
@@ -195,6 +195,7 @@ def _curve(record: Calibration, fit: Fit, name: str) -> Figure:
             "xaxis": log_axis("averaging time, s"),
             "yaxis": log_axis(f"Allan deviation, {unit}", automargin=True),
             "legend": LEGEND,
+            "margin": MARGIN,
         },
         height=430,
     )

@@ -15,7 +15,7 @@ from imulab.errors import DataError, OptionError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
 from imulab.estimation.noise.analysis import Analysis, analysed, without_steps
 from imulab.estimation.noise.choice import CANDIDATES
-from imulab.estimation.noise.cleaning import Line, Step
+from imulab.estimation.noise.cleaning import PERHAPS, Line, Step
 from imulab.estimation.noise.cosine import Stretch
 from imulab.estimation.noise.regression import Regression, ramp_coefficients
 from imulab.estimation.noise.rest import Rest, at_rest
@@ -330,11 +330,11 @@ def _column(
     stretches = [each for rest in rests for each in rest.stretches(name)]
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
     analysis = analysed(stretches, candidates, band)
-    found = analysis.steps(stretches)
-    if any(found):  # once more, by noise that has no step
+    found = analysis.steps(stretches, PERHAPS)
+    if any(found):  # by noise that has no step: fitted to one, the model takes some of it for random walk
         without = analysed(without_steps(stretches, found), candidates, band)
         found = without.steps(stretches)
-        analysis = analysed(without_steps(stretches, found), candidates, band) if flat else analysis
+        analysis = analysed(without_steps(stretches, found), candidates, band) if flat and any(found) else analysis
     drifts = []
     for covariate, slow in _covariates(temperatures, analysis.stretches).items():
         regression = analysis.regressed(slow)
