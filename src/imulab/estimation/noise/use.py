@@ -12,6 +12,7 @@ _AT_BOUND = 1.5
 """A Gauss-Markov term within this factor of the shortest time constant is the edge of the band, no slow noise."""
 _WHITE_TO_FILTER = 3.0
 """Horizons of so many time constants see a Gauss-Markov term as white noise."""
+_NO_TIME = 1e-30
 _OF_FLICKER = 0.1
 """Share of B^2 h that is white to a filter.
 
@@ -48,13 +49,16 @@ def walk_square(values: Array, horizon: Array, interval: float, shortest: float 
 def white_square(values: Array, horizon: Array, shortest: float = 0.0) -> Array:
     """Return the square of the white noise that goes with the walk of a horizon, (u/sqrt(Hz))^2, shape (..., t).
 
-    ``N_h^2 = N^2 + 0.1 B^2 h + sum 2 S^2 T`` over the Gauss-Markov terms that `walk_square` leaves out. Parameters as
-    there.
+    ``N_h^2 = N^2 + 0.1 B^2 h + sum 2 S^2 T [1 - (T/h) (1 - e^(-h/T))]`` over the Gauss-Markov terms that `walk_square`
+    leaves out, whose integral over h it predicts; those at the edge of the band count in full. Parameters as there.
     """
     total = values[..., :1] ** 2 + _OF_FLICKER * values[..., 1:2] ** 2 * horizon
+    edge = at_band_edge(values, shortest)
     for k, (sigma, time) in enumerate(zip(SIGMA, TIME, strict=True)):
         density = 2 * values[..., sigma, None] ** 2 * values[..., time, None]
-        total = total + np.where(_is_fast(values, k, horizon, shortest), density, 0.0)
+        many = np.maximum(horizon, _NO_TIME) / np.maximum(values[..., time, None], _NO_TIME)
+        share = np.where(edge[..., k, None], 1.0, 1 + np.expm1(-many) / many)
+        total = total + np.where(_is_fast(values, k, horizon, shortest), share * density, 0.0)
     return np.asarray(total)
 
 
