@@ -91,7 +91,7 @@ def first_figure(folder: Path, record: str, picture: str) -> None:
     figure = exhibits.figures[0]
     page = folder / f"one_{picture}.html"
     page.write_text(render_index(exhibits.headline, "", [Card(figure.title, "", [], replace(figure, title=""))]))
-    screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 260)
+    screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 310)
 
 
 def main() -> None:
