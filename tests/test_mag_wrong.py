@@ -271,3 +271,17 @@ def test_two_exchanged_axes_are_found_from_the_dip_where_the_latitude_is_known()
             il.fit_mag(swapped, order=2, **known)
     il.fit_mag(table(accel, mag), order=2, latitude="47 deg")
     il.fit_mag(swapped, order=2, latitude="5 deg")  # near the equator the dip has either sign
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(1.0, False), (1.8, False), (1 / 1.8, False), (2.2, True), (4.0, True), (0.2, True)]
+)
+def test_a_magnitude_that_the_earth_does_not_have_is_said_without_a_field(factor, said):
+    rng = np.random.default_rng(7)
+    truth = unit(rng)
+    accel, mag = outputs(truth, attitudes(rng), world_field(24), rng)
+    record = il.fit_mag(table(accel, factor * mag), gravity=G, order=2).calibration
+    assert any("the Earth's field has 22 to 67 uT" in one for one in record.warnings) == said
+    assert any("the field's magnitude was not stated" in one for one in record.warnings) != said
+    if said:
+        assert record.verdict.state != "good"

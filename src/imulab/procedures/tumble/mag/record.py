@@ -31,6 +31,9 @@ _LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
 _HOPELESS = 5.0  # times that
 _STEPS_BY_CHANCE = 0.01
 _POINTING = np.radians(3.0)
+_OF_THE_EARTH = 22e-6, 67e-6  # T
+_BUILDING = 1.4
+"""Factor by which iron in a building may raise or lower the field."""
 
 
 def with_mag(
@@ -293,10 +296,19 @@ def _warnings(
             )
         )
     if ready.mag.field is None and parse_unit(ready.means.unit).quantity == "magnetic field":
-        found.append(
-            Note(
-                "mag: the field's magnitude was not stated: the field is in units of the local one; give --field, such "
-                f"as --field {1e6 * ready.mag.size * parse_unit(ready.means.unit).factor:.3g}uT, for uT"
-            )
-        )
+        found.append(_unstated(ready.mag.size * parse_unit(ready.means.unit).factor, ready.means.unit))
     return found
+
+
+def _unstated(field: float, unit: str) -> str:
+    """Say that |m| is none of the Earth's [T], or else that the field's magnitude was not stated."""
+    low, high = _OF_THE_EARTH
+    if not low / _BUILDING < field < high * _BUILDING:
+        return (
+            f"mag: |m| is {1e6 * field:.3g} uT in the unit {unit}, but the Earth's field has {1e6 * low:.0f} to "
+            f"{1e6 * high:.0f} uT: state the unit that the outputs have, or the field by --field"
+        )
+    return Note(
+        "mag: the field's magnitude was not stated: the field is in units of the local one; give --field, such "
+        f"as --field {1e6 * field:.3g}uT, for uT"
+    )
