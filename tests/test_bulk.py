@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from imulab.fleet.panels import staggered
 from imulab.report.bulk import bulk, edge_marks, edge_note
 
 
@@ -49,6 +50,10 @@ def test_marks_stand_at_the_edge_with_the_value(upright):
     assert (down[on], down[along], down["text"]) == ([found.low], [6], ["-80 µg"])
     assert (up[on], up[along], up["text"]) == ([found.high], [5], ["60 µg"])
     assert down["marker"]["symbol"] != up["marker"]["symbol"]
+
+
+def test_the_value_of_one_mark_stands_above_the_bars():
+    assert staggered(np.array([False, True, False]), 5)[1] > 5
 
 
 def test_many_marks_keep_their_values_for_hovering():

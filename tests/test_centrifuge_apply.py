@@ -194,6 +194,8 @@ def test_the_report_shows_what_was_asked(record):
         "Repeatability over power cycles",
         "Spectrum around the table rate",
     ]  # fmt: skip
+    repeated = next(item for item in exhibits.figures if item.title == "Repeatability over power cycles")
+    assert {trace["name"] for trace in repeated.traces} <= {f"power cycle {n}" for n in range(1, 9)}
     assert exhibits.headline.startswith("X drifts by 3.")
     undirected = exhibits_of(record_of(False))
     assert undirected.headline

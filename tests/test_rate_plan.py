@@ -123,6 +123,20 @@ def test_a_plan_is_drawn():
     predicted, wanted = plan.plot().figure.traces
     assert predicted["x"] == pytest.approx([0, 100, 300])
     assert wanted["y"] == pytest.approx([20] * 3)
+    assert plan.plot().figure.message == f"{plan.shown()[0]}."
+
+
+@pytest.mark.parametrize(
+    "made", [lambda: il.plan_rate(arw=WALK), lambda: il.plan_rate(turn="0.02 %"), il.plan_centrifuge]
+)
+def test_the_axes_of_a_plan_have_a_unit_numbers_and_words_for_their_letters(made):
+    figure = made().plot().figure
+    upward = figure.layout["yaxis"]
+    (letters, unit) = upward["title"]["text"].split(", ")
+    assert unit.startswith(("ppm", "%"))
+    assert figure.caption.startswith(f"{letters}: ")
+    assert "standard uncertainty" in figure.caption
+    assert (upward["type"], upward["dtick"]) == ("log", "D2")  # less than a decade would have no number otherwise
 
 
 REFUSED = {

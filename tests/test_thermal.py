@@ -1,6 +1,7 @@
 """The calibration over temperature: exact data, statistics, rest ramps, and what a person can get wrong."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -147,6 +148,16 @@ def test_the_record_goes_all_the_way(tmp_path, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def made():
     return list(il.simulate_thermal([-20, 0, 25, 45, 60], attitudes=10))
+
+
+def test_scale_factors_are_drawn_from_a_temperature_that_is_named(made):
+    figure = il.fit_thermal(made, gravity=9.80665).plot("scale factor").figure
+    assert figure.layout["yaxis"]["title"]["text"] == "scale factor, ppm"
+    assert figure.layout["yaxis"]["exponentformat"] == "none"  # 5000, not 5k
+    named = float(re.search(r"value at (\S+) degC", figure.caption)[1])
+    drawn = [trace for trace in figure.traces if trace.get("name")]
+    for trace in drawn:
+        assert trace["x"][np.argmin(np.abs(trace["y"]))] == pytest.approx(named, abs=1.1)
 
 
 def warmer(recording, by):

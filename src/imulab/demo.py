@@ -121,7 +121,8 @@ make -C firmware test
 
 _LIVE = (
     "live in the browser, with a simulated unit and the workbench beside it:\n"
-    "    imulab live simulate --follow --save live.csv --page     (without --page in the terminal)"
+    "    imulab live simulate --follow --save live.csv --page     (without --page in the terminal)\n"
+    "    the page needs more packages: pip install 'imulab[live]'"
 )
 
 

@@ -77,7 +77,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         out = item.outliers & inside
         if out.any():
             traces.append(_outlier_marks(item.serials, values, out, x, y))
-        grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}")
+        grid.panel(layout, index, len(panels), f"{item.name}, {shown.unit}", "units")
         if far is not None:
             far = replace(far, low=min(far.low, *limits, far.high), high=max(far.high, *limits, far.low))
             labels = [f"{s} {number(float(v))}" for s, v in zip(item.serials, values, strict=True)]
@@ -85,6 +85,7 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
                 far, values, small.staggered(far.beyond, int(counts.max())), labels, axes=(x, y), upright=False
             )
             layout[grid.axis_key(x)]["range"] = [far.low, far.high]
+            layout[grid.axis_key(y)]["range"] = [0, 1.25 * int(counts.max())]
             beyond += int(far.beyond.sum())
         layout["shapes"] += [grid.line(x, y, float(shown.of(item.median)), "#22303a", "dot")]
         layout["shapes"] += [grid.line(x, y, end, BAD, "solid") for end in limits]

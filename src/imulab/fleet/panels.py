@@ -19,9 +19,9 @@ _DAYS = 4.0
 
 
 def staggered(marked: NDArray[np.bool_], top: int) -> list[float]:
-    """Return heights for marks at the side of a histogram, one below the other from the highest bar down."""
+    """Return heights for marks at the side of a histogram, one below the other from above the highest bar down."""
     order = np.cumsum(marked) - 1
-    return [round(top * (1 - 0.15 * (k % 7)), 3) for k in order.tolist()]
+    return [round(top * (1.15 - 0.15 * (k % 7)), 3) for k in order.tolist()]
 
 
 def limits_in_view(item: ParameterStatistics, shown: Display, values: Array) -> list[float]:

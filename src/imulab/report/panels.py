@@ -52,8 +52,8 @@ def grid() -> dict[str, Any]:
     }
 
 
-def panel(layout: dict[str, Any], index: int, count: int, title: str) -> None:
-    """Put the axes and title of panel `index` of `count` into a layout."""
+def panel(layout: dict[str, Any], index: int, count: int, title: str, up: str = "") -> None:
+    """Put the axes and title of panel `index` of `count` into a layout; `up`: what the y axes are of."""
     rows = math.ceil(count / COLUMNS)
     row, column = divmod(index, COLUMNS)
     width = (1 - _GAP_ACROSS * (COLUMNS - 1)) / COLUMNS
@@ -65,6 +65,8 @@ def panel(layout: dict[str, Any], index: int, count: int, title: str) -> None:
     axis = {"zeroline": False, "gridcolor": "#e6eaed", "exponentformat": "none", "tickfont": {"size": 11}}
     layout[axis_key(x)] = {**axis, "domain": [left, left + width], "anchor": y, "nticks": 5}
     layout[axis_key(y)] = {**axis, "domain": [max(top - height, 0.0), top], "anchor": x, "nticks": 5}
+    if up and column == 0:
+        layout[axis_key(y)]["title"] = {"text": up, "font": {"size": 11}, "standoff": 4}
     layout["annotations"].append(
         {
             "text": title,

@@ -24,7 +24,12 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
 
 def log_axis(title: str, **more: Any) -> dict[str, Any]:
     """Return the layout of a logarithmic axis."""
-    return axis(title, type="log", dtick=1, exponentformat="none", **more)
+    return axis(title, **{"type": "log", "dtick": 1, "exponentformat": "none"} | more)
+
+
+def short_log_axis(title: str, **more: Any) -> dict[str, Any]:
+    """Return the layout of a logarithmic axis over a decade or two, with numbers at 2 and 5 between the powers."""
+    return log_axis(title, **{"dtick": "D2", "tickformat": "~g"} | more)
 
 
 def scatter(x: Sequence[Any], y: Sequence[Any], mode: str, **more: Any) -> dict[str, Any]:

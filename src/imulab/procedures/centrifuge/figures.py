@@ -226,7 +226,7 @@ def _repeatability(record: Calibration, r: Centrifuge, sets: list[str]) -> Figur
                 bars.append(100 * (relative(found.K.standard_uncertainty or 0.0, K) + 1))
             colour = _CYCLES[cycle_number % len(_CYCLES)]
             traces.append(
-                _scatter(x, y, f"power cycle {cycle}", "markers", **_place(number),
+                _scatter(x, y, f"power cycle {cycle:g}", "markers", **_place(number),
                          marker={"symbol": SYMBOLS[cycle_number % len(SYMBOLS)], "size": 7, "color": colour},
                          error_y={"type": "data", "array": bars, "thickness": 1, "width": 3, "color": QUIET},
                          showlegend=number == 0)

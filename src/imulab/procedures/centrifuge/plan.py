@@ -18,6 +18,7 @@ from imulab.procedures.centrifuge.manifest import Manifest, make_manifest, manif
 from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
 from imulab.report.elements import BAD, GOOD, LEGEND, Figure
 from imulab.report.plots import Plot
+from imulab.report.traces import log_axis, short_log_axis
 from imulab.shown import Shown
 from imulab.units import from_si, to_si
 
@@ -126,11 +127,14 @@ class Plan(Shown):
              "y": [100 * self.wanted] * 2, "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
         ]  # fmt: skip
         layout = {
-            "xaxis": {"title": {"text": "specific force, g"}, "type": "log", "tickvals": force},
-            "yaxis": {"title": {"text": "u(K) / K, %"}, "type": "log", "dtick": 1},
+            "xaxis": log_axis("specific force, g", tickvals=force),
+            "yaxis": short_log_axis("u(K) / K, %"),
             "legend": LEGEND,
         }
-        return Plot(Figure("What the test will give", f"{self.shown()[0]}.", traces, layout), "Centrifuge plan")
+        caption = "u(K) / K: relative standard uncertainty of the drift per specific force."
+        return Plot(
+            Figure("What the test will give", caption, traces, layout, message=f"{self.shown()[0]}."), "Centrifuge plan"
+        )
 
 
 def plan_centrifuge(

@@ -58,7 +58,9 @@ def _rate(fused: Fused) -> Figure:
         traces.append(scatter(*points, "markers", name=label, text=who, marker=marker, hovertemplate=hover))
     return curves(
         title="Fused rate over time",
-        caption="Marks: where a gyro began to be in such a state.",
+        caption="Marks: where a gyro began to be in such a state."
+        if len(traces) > len(names)
+        else "No gyro was flagged.",
         traces=traces,
         x=axis("time, s"),
         y=axis(f"rate, {' '.join(units)}"),

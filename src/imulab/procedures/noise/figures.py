@@ -188,7 +188,8 @@ def _curve(record: Calibration, fit: Fit, name: str) -> Figure:
         f"{plain_number(float(tau[at]), 2)} s; "
         + (f"the model does not fit (p = {p:.1g})." if rejected(p, len(fit.test)) else "the model fits."),
         caption="Deviation between neighbouring means over the averaging time. Circles: the record without its lines. "
-        "Line: the chosen model; dashed and dotted: its parts. Shaded: the 95 % band of all models that the record "
+        "Line: the chosen model, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation; dashed and dotted: its parts. "
+        "Shaded: the 95 % band of all models that the record "
         "allows, each by its weight. The last circles are of few means.",
         traces=traces,
         layout={
@@ -226,10 +227,10 @@ def _ratios(record: Calibration, fit: Fit, names: Any, page: int, pages: int) ->
                         marker={"color": colour, "size": 6}, hovertemplate="%{x:.3g} Hz: %{y:.3g}<extra></extra>",
                         error_y={"type": "data", "array": rounded(2 * u[inside], _DIGITS), "color": colour, "width": 0})
             )  # fmt: skip
-        panels.panel(layout, index, len(names), name)
+        panels.panel(layout, index, len(names), name, "record / model")
         title = {"text": "frequency, Hz", "font": {"size": 11}, "standoff": 4}
         layout[panels.axis_key(x)] |= {"type": "log", "dtick": 1, "title": title}
-        top = max(1.6, min(3.0, 1.1 * float((ratio + 2 * u)[used].max(initial=1.5))))
+        top = max(1.6, min(2.9, 1.1 * float((ratio + 2 * u)[used].max(initial=1.5))))
         layout[panels.axis_key(y)]["range"] = [0.0, top]
         off = np.abs(np.log(np.maximum(ratio, 1e-9)))[used] / np.maximum(u[used], 1e-9)
         if off.size and off.max() > worst[0]:

@@ -27,6 +27,7 @@ from imulab.quantities import RANDOM_WALK, fraction, in_si, of_units, whole
 from imulab.recording import Array
 from imulab.report.elements import BAD, GOOD, LEGEND, Figure, plain_number
 from imulab.report.plots import Plot
+from imulab.report.traces import axis, short_log_axis
 from imulab.shown import Shown
 from imulab.units import from_si
 
@@ -151,11 +152,14 @@ class RatePlan(Shown):
              "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
         ]  # fmt: skip
         layout = {
-            "xaxis": {"title": {"text": "rate, deg/s"}},
-            "yaxis": {"title": {"text": "u of the mean of a stay, ppm of full scale"}, "type": "log", "dtick": 1},
+            "xaxis": axis("rate, deg/s"),
+            "yaxis": short_log_axis("u, ppm of full scale"),
             "legend": LEGEND,
         }
-        return Plot(Figure("What each stay will give", f"{self.shown()[0]}.", traces, layout), "Rate plan")
+        caption = "u: standard uncertainty of the mean of one stay; full scale is the largest rate."
+        return Plot(
+            Figure("What each stay will give", caption, traces, layout, message=f"{self.shown()[0]}."), "Rate plan"
+        )
 
 
 def plan_rate(

@@ -12,6 +12,7 @@ from imulab.errors import OptionError
 from imulab.recording import Array
 from imulab.report.elements import BAD, GOOD, LEGEND, Figure
 from imulab.report.plots import Plot
+from imulab.report.traces import axis, short_log_axis
 from imulab.shown import Shown
 
 _TURNS = 1000
@@ -58,9 +59,13 @@ class TurnPlan(Shown):
             {"type": "scatter", "mode": "lines", "name": "wanted", "x": number, "y": [1e6 * self.wanted] * self.turns,
              "line": {"color": BAD, "width": 1.5, "dash": "dash"}},
         ]  # fmt: skip
-        layout = {"xaxis": {"title": {"text": "turns each way"}}, "legend": LEGEND,
-                  "yaxis": {"title": {"text": "u(S)/S, ppm"}, "type": "log", "dtick": 1}}  # fmt: skip
-        return Plot(Figure("Turns by hand", f"{self.shown()[0]}.", traces, layout), "Plan of turns")
+        layout = {
+            "xaxis": axis("turns each way", dtick=max(1, round(self.turns / 20))),
+            "yaxis": short_log_axis("u(S)/S, ppm"),
+            "legend": LEGEND,
+        }
+        caption = "u(S)/S: relative standard uncertainty of the scale factor."
+        return Plot(Figure("Turns by hand", caption, traces, layout, message=f"{self.shown()[0]}."), "Plan of turns")
 
 
 def plan_turns(wanted: float, fence: float) -> TurnPlan:

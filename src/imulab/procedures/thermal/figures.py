@@ -19,7 +19,7 @@ _POINTS = 81
 _COLOURS = (GOOD, "#b58a1b", "#7a4f9a")
 _READ = (
     ("bias", 1e3 / STANDARD_GRAVITY, "mg"),
-    ("scale factor", 1e6, "ppm from the middle"),
+    ("scale factor", 1e6, "ppm"),
     ("misalignment", 1e3, "mrad"),
 )
 _MICRO_G = 1e6 / STANDARD_GRAVITY
@@ -94,9 +94,14 @@ def _over_temperature(group: int, temperature: Any, values: Any, spread: Any) ->
         ]  # fmt: skip
     return Figure(
         title=f"{name.capitalize()} over temperature",
-        caption="Bands: two standard uncertainties, all that power cycles differ by included.",
+        caption="Bands: two standard uncertainties, all that power cycles differ by included."
+        + (f" Change from the value at {temperature[len(temperature) // 2]:.3g} degC." if group == 1 else ""),
         traces=traces,
-        layout={"xaxis": axis("temperature, degC"), "yaxis": axis(f"{name}, {unit}"), "legend": LEGEND},
+        layout={
+            "xaxis": axis("temperature, degC"),
+            "yaxis": axis(f"{name}, {unit}", exponentformat="none"),
+            "legend": LEGEND,
+        },
     )
 
 

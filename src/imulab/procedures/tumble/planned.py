@@ -17,6 +17,7 @@ from imulab.recording import Recording
 from imulab.report import render_plan
 from imulab.report.elements import GOOD, Figure
 from imulab.report.plots import Plot
+from imulab.report.traces import axis
 from imulab.shown import Shown
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.writers import write_csv
@@ -111,11 +112,15 @@ class TumblePlan(Shown, Plan):
         """Return roll and pitch of the attitudes, numbered in their order."""
         roll, pitch = np.degrees(roll_pitch(self.directions)).T.tolist()
         numbers = [str(number) for number in range(1, len(roll) + 1)]
+        sides = [("top center", "bottom center")[k % 2] for k in range(len(roll))]
         trace = {
             "type": "scatter", "mode": "lines+markers+text", "x": roll, "y": pitch, "text": numbers,
-            "textposition": "top center", "line": {"color": GOOD, "width": 1}, "marker": {"color": GOOD, "size": 8},
+            "textposition": sides, "line": {"color": GOOD, "width": 1}, "marker": {"color": GOOD, "size": 8},
         }  # fmt: skip
-        layout = {"xaxis": {"title": {"text": "roll, deg"}}, "yaxis": {"title": {"text": "pitch, deg"}}}
+        layout = {
+            "xaxis": axis("roll, deg", dtick=90, range=[-195, 195]),
+            "yaxis": axis("pitch, deg", dtick=45, range=[-110, 110]),
+        }
         return Plot(Figure("Attitudes to measure", self.lead, [trace], layout), "Tumble plan")
 
     def _pictures(self) -> list[dict[str, str]]:
