@@ -396,6 +396,9 @@ def test_the_figure_of_a_fused_rate_marks_where_gyros_fail():
     stuck = next(trace for trace in states["data"] if trace["name"] == "stuck")
     assert set(stuck["y"]) == {"gyro_3"}
     assert result.time[3000] < min(stuck["x"]) < max(stuck["x"]) < result.time[4010]
+    whole = il.fuse(il.simulate_array(experiment="static", duration=10.0)).plot("rate").figure
+    assert (len(whole.traces), whole.caption) == (1, "No gyro was flagged.")
+    assert result.plot("rate").figure.caption.startswith("Marks: ")
 
 
 def test_a_change_is_drawn_in_units_of_its_uncertainty():
