@@ -31,6 +31,7 @@ def problem(rng, triad, temperatures, count, noise=60e-6, turn_on=0.0, stated=No
         reading=reading,
         covariance=np.tile(np.eye(3) * (stated or noise) ** 2, (n, 1, 1)),
         temperature=np.concatenate([at for _, at in soaks]),
+        rate=np.zeros(n),
         step=np.zeros(n),
         shared=np.ones(n, dtype=bool),
         recording=np.repeat(np.arange(len(temperatures)), count),

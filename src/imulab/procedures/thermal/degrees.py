@@ -57,17 +57,19 @@ def clusters_of(temperature: Array) -> NDArray[np.int64]:
 
 
 def seen(solution: Solution) -> Observability:
-    """Return what the holds tell apart, unmoved directions included."""
+    """Return what the holds tell apart, unmoved directions included; lag and loops were judged before."""
     rows = solution.rows
-    return observability(rows.jacobian, 1 / (np.diag(rows.noise) + solution.excess**2))
+    fitted = np.s_[solution.laws.size : len(solution.coefficients)]
+    return observability(np.delete(rows.jacobian, fitted, axis=1), 1 / (np.diag(rows.noise) + solution.excess**2))
 
 
 def left_out(solution: Solution, kept: NDArray[np.bool_], cluster: NDArray[np.int64]) -> list[LeftOut]:
     """Return the errors at each interior temperature under a fit, with these coefficients alone, to all others."""
     rows, found = solution.rows, []
-    columns = np.concatenate([kept, np.ones(rows.jacobian.shape[1] - len(kept), dtype=np.bool_)])
-    whole = np.zeros(rows.jacobian.shape[1])
-    whole[: len(kept)] = solution.coefficients
+    columns = np.ones(rows.jacobian.shape[1], dtype=np.bool_)
+    columns[: len(kept)] = kept
+    whole = np.zeros(len(columns))
+    whole[: len(solution.coefficients)] = solution.coefficients
     target, jacobian = rows.jacobian @ whole - rows.residual, rows.jacobian[:, columns]
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
     for number in range(1, int(cluster.max(initial=0))):
@@ -94,6 +96,7 @@ def _part(rows: Rows, which: NDArray[np.bool_]) -> Rows:
         noise=rows.noise[np.ix_(which, which)],
         offsets=(rows.offsets[0][which], rows.offsets[1][which]),
         errors=rows.errors[which],
+        drift=rows.drift[which],
         owner=rows.owner[which],
         magnitude=rows.magnitude[which],
     )
@@ -156,7 +159,7 @@ def _start(problem: Problem, laws: Laws, limit: int, tau: float | None, name: st
 def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> tuple[Solution, Observability]:
     solution = solve(problem, laws, tau=tau)
     view = seen(solution)
-    size = solution.rows.jacobian.shape[1]
+    size = solution.rows.jacobian.shape[1] - len(problem.free)
     if view.rank < size or not solution.converged:
         names = laws.spoken() + [f"direction of unmoved hold {k // 2 + 1}" for k in range(size - laws.size)]
         confused = ", ".join(view.confused(names)[:6])
@@ -177,16 +180,17 @@ def _step(solution: Solution, group: int, cluster: NDArray[np.int64]) -> Step:
         for _ in range(3):
             at += degree + 1
             kept[at - 1] = kept[at - 1] and kind != group
-    gone = ~kept
+    gone = np.flatnonzero(~kept)
     value = solution.coefficients[gone]
     square = float(value @ np.linalg.solve(solution.covariance[np.ix_(gone, gone)], value)) / len(value)
     freedom = min(solution.degrees_of_freedom(row) for row in np.eye(len(kept))[gone])
     degrees[group] -= 1
-    probability = _tail(square, len(value), freedom)
+    probability = tail(square, len(value), freedom)
     return Step((degrees[0], degrees[1], degrees[2]), _rms(left_out(solution, kept, cluster)), probability)
 
 
-def _tail(square: float, count: int, freedom: float) -> float:
+def tail(square: float, count: int, freedom: float) -> float:
+    """Return the probability of so large a mean square of `count` terms; chi-square where the freedom is infinite."""
     from imulab.estimation.special import chdtrc, fdtrc
 
     return float(fdtrc(count, freedom, square) if np.isfinite(freedom) else chdtrc(count, count * square))

@@ -45,6 +45,7 @@ def exhibits(record: Calibration) -> Exhibits:
         ("temperatures", str(fit.temperatures)),
         ("biases, power cycle to power cycle", told),
         ("left-out temperatures", _left(found)),
+        *_drift(found),
     ]
     items: list[Figure | ReportTable] = [
         _coefficients(record),
@@ -56,6 +57,24 @@ def exhibits(record: Calibration) -> Exhibits:
     if fit.degrees:
         items.append(_compared(found))
     return Exhibits(headline, facts, items)
+
+
+def _drift(found: Thermal) -> list[tuple[str, str]]:
+    """Return lag and loops as facts, where the recordings tell them."""
+    fit, facts = found.fit, []
+    for label, tested, factor, unit in (
+        ("lag behind the thermometer", fit.lag, 1.0, "s"),
+        *(
+            (f"loop of {name}", loop, _MICRO_G, "µg")
+            for name, loop in zip(AXES, (fit.loop_x, fit.loop_y, fit.loop_z), strict=True)
+        ),
+    ):
+        if tested is not None and tested.standard_uncertainty is not None:
+            value, u = format_uncertain(tested.value * factor, tested.standard_uncertainty * factor)
+            facts.append(
+                (label, f"{value} {unit} (u {u}), " + ("taken out of the laws" if tested.fitted else "not significant"))
+            )
+    return facts
 
 
 def _left(found: Thermal) -> str:
@@ -126,7 +145,8 @@ def _residuals(found: Thermal) -> Figure:
     return Figure(
         title="Residual |f| - g of each hold over temperature",
         caption="Bars: the hold's own standard uncertainty. Warming and cooling apart: where they differ, the unit "
-        "lags behind its thermometer, or does not come back.",
+        "lags behind its thermometer, or does not come back; a lag or loop that is significant is taken out here, "
+        "while corrected outputs keep it.",
         traces=traces,
         layout={"xaxis": axis("temperature, degC"), "yaxis": axis("|f| - g, µg"), "legend": LEGEND},
     )

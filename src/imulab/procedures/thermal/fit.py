@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
 import numpy as np
@@ -18,6 +18,7 @@ from imulab.procedures.thermal.checks import check_holds, prepared
 from imulab.procedures.thermal.choices import degrees_of
 from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose
 from imulab.procedures.thermal.holds import Holds, find_holds
+from imulab.procedures.thermal.lag import drift_of, moving
 from imulab.procedures.thermal.model import GROUPS, Laws
 from imulab.procedures.thermal.record import make_record
 from imulab.procedures.thermal.solve import Problem
@@ -142,6 +143,10 @@ def fit_thermal(
     laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
     name = recordings[0].name + (f" and {len(recordings) - 1} more" if len(recordings) > 1 else "")
     solution, steps, held, view = choose(problem, laws, wanted, scatter, name)
+    drift = drift_of(problem, solution, scatter)
+    if drift.free:
+        problem = replace(problem, free=drift.free)
+        solution, steps, held, view = choose(problem, laws, wanted, scatter, name)
     options = {
         "degrees": wanted if isinstance(wanted, str) else list(wanted),
         "gravity": local.value,
@@ -150,7 +155,7 @@ def fit_thermal(
         **({} if temperature_column is None else {"temperature_column": temperature_column}),
         **({} if settle is None else {"settle": in_si(settle, "settle", "time", "s")}),
     }
-    record = make_record(holds, problem, solution, steps, held, view, local, scale, options, name)
+    record = make_record(holds, problem, solution, drift, steps, held, view, local, scale, options, name)
     return ThermalFit(record, view, tuple(steps), tuple(held))
 
 
@@ -168,6 +173,7 @@ def _problem(holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[
         holds.mean / scale,
         holds.covariance / (scale[:, None] * scale),
         holds.temperature,
+        moving(holds),
         holds.step,
         holds.shared,
         holds.recording,

@@ -11,6 +11,7 @@ from imulab.estimation.least_squares import Observability, coverage_factor
 from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
+from imulab.procedures.thermal.lag import Drift, entries, findings
 from imulab.procedures.thermal.model import GROUPS
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Problem, Solution
@@ -28,6 +29,7 @@ def make_record(
     holds: Holds,
     problem: Problem,
     solution: Solution,
+    drift: Drift,
     steps: Sequence[Step],
     left_out: Sequence[LeftOut],
     view: Observability,
@@ -63,12 +65,12 @@ def make_record(
             "output_unit": holds.unit,
             "gauge": _GAUGE,
         },
-        fit=_fit(holds, residual, solution, steps, left_out, view, options, g),
+        fit=_fit(holds, residual, solution, steps, left_out, view, options, g) | entries(drift, g),
         options=dict(options),
         data=_data(holds, g * residual, g * uncertainty),
         sensor=sensor,
         sources=sources,
-        warnings=tuple(_findings(holds, solution, steps, left_out, gravity, options, name)),
+        warnings=tuple(_findings(holds, solution, drift, left_out, gravity, options, name)),
     )
 
 
@@ -145,9 +147,9 @@ def in_si_powers(solution: Solution, gravity: Gravity, scale: Array) -> tuple[Ar
             factor += [(g, float(scale[axis]) / g, 1.0)[group]] * (degree + 1)
             share += [(1.0, -1.0, 0.0)[group]] * (degree + 1)
     matrix = np.array(factor)[:, None] * laws.to_powers()
-    values = matrix @ solution.coefficients
+    values = matrix @ solution.coefficients[: laws.size]
     shared = np.array(share) * values * gravity.standard_uncertainty / g
-    covariance: Array = matrix @ solution.covariance @ matrix.T + np.outer(shared, shared)
+    covariance: Array = matrix @ solution.covariance[: laws.size, : laws.size] @ matrix.T + np.outer(shared, shared)
     return values, covariance
 
 
@@ -173,7 +175,7 @@ def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[s
 def _findings(
     holds: Holds,
     solution: Solution,
-    steps: Sequence[Step],
+    drift: Drift,
     left_out: Sequence[LeftOut],
     gravity: Gravity,
     options: Mapping[str, Any],
@@ -194,6 +196,7 @@ def _findings(
         "explains: the unit's law has a bend between the temperatures; record one more there"
         for each in far
     ]
+    found += findings(drift, solution, name)
     rows = solution.rows
     standard = np.abs(rows.residual) / np.sqrt(np.diag(rows.noise) + solution.excess**2)
     out = np.flatnonzero((standard > _STANDS_OUT) & (rows.owner >= 0))

@@ -71,6 +71,13 @@ class TurnOn(Part):
     from_: str
 
 
+class Tested(Quantity):
+    """``fit.lag`` in s, ``fit.loop_x`` ...: a value, its probability if there were none, whether the laws hold it."""
+
+    probability: float
+    fitted: bool
+
+
 class Fit(Part):
     """``fit``."""
 
@@ -82,6 +89,10 @@ class Fit(Part):
     between_recordings: TurnOn
     left_out_temperature: list[LeftOut]
     degrees: list[Degrees]
+    lag: Tested | None = None
+    loop_x: Tested | None = None
+    loop_y: Tested | None = None
+    loop_z: Tested | None = None
 
 
 class Held(Part):

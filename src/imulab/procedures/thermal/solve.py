@@ -35,15 +35,18 @@ _TELLS = 0.1
 
 @dataclass(frozen=True)
 class Problem:
-    """Holds in units of g: readings (n, 3), covariances of the mean (n, 3, 3), temperature, change, as in `Holds`.
+    """Holds in units of g: readings (n, 3), covariances of the mean (n, 3, 3), temperature, step, as in `Holds`.
 
-    `tilt`: standard deviation of the direction of an unmoved hold, rad; `zero`: biases to start from, shape (3,);
-    `known`: a prior as rows of nine parameters, ``(temperature, values (9,), covariance (9, 9))``.
+    `rate`: change of the temperature, K/s, 0 where it counts as still; `tilt`: standard deviation of the direction of
+    an unmoved hold, rad; `zero`: biases to start from, shape (3,); `known`: a prior as rows of nine parameters,
+    ``(temperature, values (9,), covariance (9, 9))``; `free`: what is fitted beside the laws, the lag (s) as 0, the
+    loops of x, y and z (g) as 1 to 3.
     """
 
     reading: Array
     covariance: Array
     temperature: Array
+    rate: Array
     step: Array
     shared: NDArray[np.bool_]
     recording: NDArray[np.int64]
@@ -51,6 +54,7 @@ class Problem:
     tilt: float
     zero: Array
     known: tuple[float, Array, Array] | None = None
+    free: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,8 @@ class Rows:
     """The linearised rows at some coefficients: residuals (N,), Jacobian (N, c), own covariance as blocks.
 
     `offsets` are the derivatives by an offset of bias (and scale factor) of each power cycle, (N, 3 R) each; `errors`
-    the loadings of errors of the temperature; `owner` the hold of each row, -1 for a prior's; `magnitude` those that
-    are magnitudes.
+    the loadings of errors of the temperature; `drift` the derivatives by lag and loops, (N, 4), fitted or not; `owner`
+    the hold of each row, -1 for a prior's; `magnitude` those that are magnitudes.
     """
 
     residual: Array
@@ -67,6 +71,7 @@ class Rows:
     noise: Array
     offsets: tuple[Array, Array]
     errors: Array
+    drift: Array
     owner: NDArray[np.int64]
     magnitude: NDArray[np.bool_]
 
@@ -83,7 +88,10 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Solution:
-    """What was found: coefficients (c,), their covariance, rows, excess (g), tau, and degrees of freedom of each."""
+    """What was found: coefficients (c,), their covariance, rows, excess (g), tau, and degrees of freedom of each.
+
+    The coefficients are those of the laws, then the lag and the loops that were fitted beside them.
+    """
 
     laws: Laws
     coefficients: Array
@@ -98,11 +106,12 @@ class Solution:
     converged: bool
 
     def degrees_of_freedom(self, weights: Array) -> float:
-        """Return Satterthwaite's degrees of freedom of ``weights . coefficients``."""
-        whole = float(weights @ self.covariance @ weights)
+        """Return Satterthwaite's degrees of freedom of ``weights . coefficients``, which may be the first ones only."""
+        n = len(weights)
+        whole = float(weights @ self.covariance[:n, :n] @ weights)
         own = 1 / self.excess_freedom if np.isfinite(self.excess_freedom) else 0.0
         if self.scatter.rank:
-            share = float(weights @ self.by_tau @ weights) * self.scatter.spread[0] / max(whole, 1e-300)
+            share = float(weights @ self.by_tau[:n, :n] @ weights) * self.scatter.spread[0] / max(whole, 1e-300)
             own += min(share, 1.0) ** 2 / self.scatter.rank
         return 1 / own if own > 0 else np.inf
 
@@ -110,8 +119,7 @@ class Solution:
 def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Array) -> Rows:
     """Return the rows at these coefficients; `directions` are those of the unmoved groups, shape (G, 3)."""
     n, count = len(problem.reading), int(problem.recording.max(initial=0)) + 1
-    design = laws.design(problem.temperature)
-    parameters = design @ coefficients
+    parameters, design, drift, slope = _parameters(problem, laws, coefficients)
     force, change = forces(parameters, problem.reading)
     length = np.linalg.norm(force, axis=1)
     unit = force / length[:, None]
@@ -119,7 +127,7 @@ def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Arr
     noise = np.einsum("nij,njk,nlk->nil", sensed, problem.covariance, sensed)
     along = np.einsum("ni,nij,nj->n", unit, noise, unit)
     lengthening = 0.5 * (np.trace(noise, axis1=1, axis2=2) - along)
-    by_heat = np.einsum("nij,njc,c->ni", change, laws.slope(problem.temperature), coefficients)
+    by_heat = np.einsum("nij,nj->ni", change, slope)
     member = np.flatnonzero(problem.group >= 0)
     base, across = _frames(unit, directions, problem.group)
     basis = np.concatenate([unit[:, None, :], across], axis=1)  # (n, 3, 3): along, two across
@@ -141,10 +149,28 @@ def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Arr
     offsets = tuple(_per_recording(felt[:, 3 * k : 3 * k + 3], problem.recording[owner], count) for k in (0, 1))
     heat = np.einsum("Ni,Ni->N", pick, by_heat[owner]) * problem.step[owner]
     errors = _errors(heat, owner, problem, count)
-    found = Rows(
-        residual, np.hstack([jacobian, turns]), own, (offsets[0], offsets[1]), errors, owner.astype(np.int64), ~side
-    )
+    by_drift = np.einsum("Nj,Njk->Nk", felt, drift[owner])
+    jacobian = np.hstack([jacobian, by_drift[:, list(problem.free)], turns])
+    found = Rows(residual, jacobian, own, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side)
     return found if problem.known is None else _with_prior(found, problem.known, laws, coefficients)
+
+
+def _parameters(problem: Problem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the parameters of each hold (n, 9), their derivatives by the laws' coefficients, by lag and loops, by T.
+
+    ``p(T - L dT/dt)`` is taken to first order, which leaves p'' (L dT/dt)^2 / 2: a microgram at 20 s and 1 K/min; the
+    loop of a bias is ``h sign(dT/dt) (1 - theta^2)``, none at the ends, where the temperature turns.
+    """
+    size, own = laws.size, np.zeros(4)
+    own[list(problem.free)] = coefficients[size:]
+    design, slopes = laws.design(problem.temperature), laws.slope(problem.temperature)
+    slope = slopes @ coefficients[:size]
+    drift = np.zeros((len(slope), 9, 4))
+    drift[:, :, 0] = -problem.rate[:, None] * slope
+    turn = np.sign(problem.rate) * (1 - laws.place(problem.temperature) ** 2)
+    drift[:, range(3), range(1, 4)] = turn[:, None]
+    parameters = design @ coefficients[:size] + drift @ own
+    return parameters, design - own[0] * problem.rate[:, None, None] * slopes, drift, slope
 
 
 def _frames(unit: Array, directions: Array, group: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -186,11 +212,12 @@ def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeff
         own[n + 3 * k : n + 3 * k + 3, -3:] = np.eye(3)
         offsets.append(own)
     return Rows(
-        np.append(rows.residual, design @ coefficients - values),
+        np.append(rows.residual, design @ coefficients[: laws.size] - values),
         np.vstack([rows.jacobian, np.hstack([design, np.zeros((9, extra))])]),
         noise,
         (offsets[0], offsets[1]),
         np.vstack([rows.errors, np.zeros((9, rows.errors.shape[1]))]),
+        np.vstack([rows.drift, np.zeros((9, 4))]),
         np.append(rows.owner, np.full(9, -1)),
         np.append(rows.magnitude, np.zeros(9, dtype=np.bool_)),
     )
@@ -221,7 +248,12 @@ def whitener(rows: Rows, excess: float, tau: Array) -> Callable[[Array], Array]:
 
 def solve(problem: Problem, laws: Laws, *, tau: float | None = None) -> Solution:
     """Fit the laws; `tau` is the scatter of the biases from one power cycle to the next, g, if it is known."""
-    coefficients = _start(problem, laws)
+    still = replace(problem, free=())
+    coefficients = _start(still, laws)
+    if problem.free:  # a lag is the shift of laws that must be there first
+        begun = _directions(still, laws, coefficients)
+        coefficients = _iterate(still, laws, coefficients, begun, _LOOSE**2, np.zeros(2), 1e-6)[0]
+        coefficients = np.append(coefficients, np.zeros(len(problem.free)))
     directions = _directions(problem, laws, coefficients)
     excess, excess_freedom, scatter, converged = 0.0, np.inf, Scatter(), False
     if tau is not None:
@@ -243,7 +275,7 @@ def solve(problem: Problem, laws: Laws, *, tau: float | None = None) -> Solution
     jacobian, residual = white(rows.jacobian), white(rows.residual)
     inverse = np.linalg.pinv(jacobian, rcond=1e-13)
     loading = inverse @ white(rows.offsets[0])
-    count = laws.size
+    count = len(coefficients)
     left = residual - jacobian @ (inverse @ residual)
     return Solution(
         laws, coefficients, (inverse @ inverse.T)[:count, :count], rows, float(np.sqrt(excess)), excess_freedom,
@@ -278,7 +310,7 @@ def nominal(laws: Laws, zero: Array) -> Array:
 def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
     """Mean direction of each unmoved group at these coefficients."""
     count = int(problem.group.max(initial=-1)) + 1
-    force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
+    force, _ = forces(_parameters(problem, laws, coefficients)[0], problem.reading)
     found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
     found /= np.linalg.norm(found, axis=1)[:, None]
     return found
@@ -294,7 +326,7 @@ def _iterate(
         jacobian = white(rows.jacobian)
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
         step = -np.linalg.lstsq(jacobian / scale, white(rows.residual), rcond=1e-11)[0] / scale
-        coefficients = coefficients + step[: laws.size]
+        coefficients = coefficients + step[: len(coefficients)]
         directions = _directions(problem, laws, coefficients)
         rows = linearise(problem, laws, coefficients, directions)
         if np.abs(step[: laws.size]).max() < tolerance:
