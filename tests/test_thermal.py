@@ -234,3 +234,29 @@ def test_a_record_with_another_range_is_refused(made, tmp_path):
     file.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(il.ImulabError):
         il.load(file)
+
+
+def test_records_over_other_ranges_are_compared_at_temperatures_of_both():
+    one, other = (
+        il.fit_thermal(il.simulate_thermal(temperatures=at, attitudes="12", seed=seed), degrees="2,1,0").calibration
+        for at, seed in (("-20,0,25,45", 1), ("0,25,45,60", 1))
+    )
+    found = il.compare_records(one, other)
+    assert len(found.changes) == 3 * 3 + 3 * 2 + 3
+    for place, temperature in enumerate((0.0, 22.5, 45.0)):
+        change = found.changes[place]
+        at = float(change.name.split()[2])
+        assert change.name.startswith("bias_x at")
+        assert abs(at - temperature) < 1.0
+        (a, u), (b, v) = ([part[0, 0] for part in predicted(record, np.array([at]))] for record in (one, other))
+        assert change.difference == pytest.approx(b - a, abs=1e-9)
+        assert change.standard_uncertainty == pytest.approx(np.hypot(u, v), rel=1e-3)
+
+
+def test_records_without_a_temperature_in_common_are_not_compared():
+    one, other = (
+        il.fit_thermal(il.simulate_thermal(temperatures=at, attitudes="12"), degrees="1,0,0").calibration
+        for at in ("-20,-10,0", "25,45,60")
+    )
+    with pytest.raises(il.errors.RecordError, match="expected ranges that share 1 K or more"):
+        il.compare_records(one, other)

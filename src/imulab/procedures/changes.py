@@ -76,7 +76,11 @@ def compare_records(first: Record, second: Record) -> Changes:
     ('order 1 and 2',)
     """
     one, other = (as_record(record, "compare_records") for record in (first, second))
-    return Changes(**vars(compared(one, other, procedure_of(one).same_meaning)), record=one)
+    procedure = procedure_of(one)
+    pair = one, other
+    if procedure.comparable and other.procedure == one.procedure:
+        pair = procedure.comparable(one, other)
+    return Changes(**vars(compared(*pair, procedure.same_meaning)), record=one)
 
 
 def verdict(comparison: Comparison) -> str:

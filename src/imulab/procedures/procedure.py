@@ -179,6 +179,9 @@ class Procedure:
         Change of a parameter and record to the factor from SI and the unit in which it is read; by unit if None.
     same_meaning
         Name of a parameter and two records to whether it means the same in both; by its unit alone if None.
+    comparable
+        Two records to the same two with parameters that mean the same in both, None where theirs do; raises RecordError
+        where there are none.
     heading
         Record to what adds magnetic heading and dip to a recording that it corrected; raises RecordError where it holds
         no magnetometers. None where no record of the procedure does.
@@ -209,6 +212,7 @@ class Procedure:
     summary: Callable[[Calibration], tuple[list[str], list[list[str]]]] | None = None
     change_unit: Callable[[Change, Calibration], tuple[float, str]] | None = None
     same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
+    comparable: Callable[[Calibration, Calibration], tuple[Calibration, Calibration]] | None = None
     heading: Callable[[Calibration], Callable[[Recording], Recording]] | None = None
     beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None
     beyond_message: Callable[[Calibration, int, float], str] | None = None

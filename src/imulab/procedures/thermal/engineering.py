@@ -31,8 +31,3 @@ def rows(record: Calibration) -> list[Row]:
 def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     """Return the factor from SI and the unit in which the change of a coefficient is read."""
     return shown(change.name, change.unit)
-
-
-def same_meaning(name: str, first: Calibration, second: Calibration) -> bool:
-    """Return whether a coefficient means the same in both records: powers of T - T0 with the same T0 and degree."""
-    return all(first.model[key] == second.model[key] for key in ("reference_temperature", "degrees", "output_unit"))

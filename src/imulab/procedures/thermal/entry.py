@@ -29,5 +29,5 @@ ENTRY = Procedure(
     elsewhere="{target} takes no laws over temperature",
     rows=deferred(f"{_HERE}.engineering:rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
-    same_meaning=deferred(f"{_HERE}.engineering:same_meaning"),
+    comparable=deferred(f"{_HERE}.compare:at_common_temperatures"),
 )

@@ -1,0 +1,68 @@
+"""Two thermal records at temperatures of both, since each has coefficients of powers about a T0 of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from imulab.errors import RecordError
+from imulab.procedures.thermal.model import GROUPS
+from imulab.procedures.thermal.sections import thermal_of
+from imulab.recording import Array
+from imulab.records.calibration import Calibration, Covariance, Parameter
+
+_LEAST = 1.0  # K that two ranges share, so that temperatures written to 0.1 degC differ
+
+
+def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Calibration, Calibration]:
+    """Return both records with the values of their laws in place of coefficients, as many as the higher degree takes.
+
+    Raises
+    ------
+    RecordError
+        Their ranges of temperature have less than 1 K in common.
+    """
+    models = [thermal_of(record).model for record in (first, second)]
+    low, high = max(model.range[0] for model in models), min(model.range[1] for model in models)
+    if high - low < _LEAST:
+        ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
+        raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
+    degrees = np.max([model.degrees.each for model in models], axis=0).tolist()
+    low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
+    nodes = [np.linspace(low, high, degree + 1) if degree else np.array([0.5 * (low + high)]) for degree in degrees]
+    nodes = [np.round(places, 1) for places in nodes]
+    return _at(first, nodes), _at(second, nodes)
+
+
+def _at(record: Calibration, nodes: list[Array]) -> Calibration:
+    """Return a record with the values of its laws at the temperatures of each kind, degC, in place of coefficients."""
+    sections, names = thermal_of(record), record.covariance.names
+    turn_on, freedom = sections.fit.between_recordings, record.fit.get("degrees_of_freedom")
+    rows, values, labels, units = [], [], [], []
+    known: dict[str, float | None] = {}
+    at = 0
+    for (kind, axes), degree, own in zip(GROUPS, sections.model.degrees.each, nodes, strict=True):
+        powers = (own[:, None] - sections.model.reference_temperature.value) ** np.arange(degree + 1)
+        scatter = {"bias": turn_on.bias, "scale_factor": turn_on.scale_factor}.get(kind)
+        for axis in axes:
+            used = names[at : at + degree + 1]
+            row = np.zeros((len(own), len(names)))
+            row[:, at : at + degree + 1] = powers
+            rows.append(row)
+            values.append(powers @ np.array([record.value(name) for name in used]))
+            labels += [f"{kind}_{axis} at {temperature:.1f} degC" for temperature in own]
+            units += [record.parameters[used[0]].unit] * len(own)
+            at += degree + 1
+        # What recordings scatter by is told by few of them, and is most of what these values are uncertain by.
+        few = scatter is not None and scatter.value > 0 and turn_on.rank > 0
+        known |= dict.fromkeys(labels[-len(axes) * len(own) :], turn_on.rank if few else freedom)
+    spread = np.vstack(rows)
+    matrix = spread @ record.covariance.array() @ spread.T
+    parameters = {
+        label: Parameter(float(value), float(u), unit)
+        for label, value, u, unit in zip(labels, np.concatenate(values), np.sqrt(np.diag(matrix)), units, strict=True)
+    }
+    covariance = Covariance(tuple(labels), tuple(map(tuple, matrix.tolist())))
+    fit = {**record.fit, "degrees_of_freedom": known}
+    return replace(record, parameters=parameters, covariance=covariance, fit=fit)
