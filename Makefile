@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ALONE := $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.alone)
 
-.PHONY: demo test test-all core fuzz dist lint format bench compare footprint truth docs clean
+.PHONY: demo test test-all core fuzz dist wheel-names lint format bench compare footprint truth docs clean
 
 demo: $(ALONE)
 	$(BIN)/imulab demo demo
@@ -40,6 +40,10 @@ dist: $(VENV)/.release
 	if [ "$$(uname)" = Linux ]; then PATH="$(CURDIR)/$(BIN):$$PATH" auditwheel repair -w dist build/wheel/*.whl; \
 	else mv build/wheel/*.whl dist/; fi
 	ls dist
+
+# Names the wheels that the release workflow builds on the three systems, as a check of their configuration.
+wheel-names: $(VENV)/.release
+	for system in linux macos windows; do $(BIN)/cibuildwheel --print-build-identifiers --platform $$system . || exit 1; done
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -87,7 +87,8 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
             layout[grid.axis_key(x)]["range"] = [far.low, far.high]
             layout[grid.axis_key(y)]["range"] = [0, 1.25 * int(counts.max())]
             beyond += int(far.beyond.sum())
-        layout["shapes"] += [grid.line(x, y, float(shown.of(item.median)), "#22303a", "dot")]
+        below_labels = 1.0 if far is None else 0.8
+        layout["shapes"] += [grid.line(x, y, float(shown.of(item.median)), "#22303a", "dot", below_labels)]
         layout["shapes"] += [grid.line(x, y, end, BAD, "solid") for end in limits]
         layout[grid.axis_key(y)]["rangemode"] = "tozero"
     standing = sorted({s for item in panels for s, o in zip(item.serials, item.outliers, strict=True) if o})

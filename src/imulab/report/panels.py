@@ -82,8 +82,8 @@ def panel(layout: dict[str, Any], index: int, count: int, title: str, up: str = 
     )
 
 
-def line(x: str, y: str, place: float, colour: str, dash: str) -> dict[str, Any]:
-    """Return an upright line through a panel."""
+def line(x: str, y: str, place: float, colour: str, dash: str, height: float = 1) -> dict[str, Any]:
+    """Return an upright line through a panel, from its foot to a share of its height."""
     return {
         "type": "line",
         "xref": x,
@@ -91,6 +91,6 @@ def line(x: str, y: str, place: float, colour: str, dash: str) -> dict[str, Any]
         "x0": place,
         "x1": place,
         "y0": 0,
-        "y1": 1,
+        "y1": height,
         "line": {"color": colour, "width": 1.5, "dash": dash},
     }
