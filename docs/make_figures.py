@@ -85,13 +85,35 @@ def centrifuge(folder: Path) -> None:
     screenshot(page, FIGURES / "centrifuge_tilt.png", 1080, 690)
 
 
-def first_figure(folder: Path, record: str, picture: str) -> None:
-    """Headline and first figure of one record of the demonstration."""
+def one_figure(folder: Path, record: str, picture: str, words: str = "") -> None:
+    """One figure of a record: the first under the record's headline, or the one with these words under its own."""
     exhibits = exhibits_of(il.load(folder / record))
-    figure = exhibits.figures[0]
+    figure = next(item for item in exhibits.figures if words in item.title)
+    heading = figure.message if words else exhibits.headline
+    card = Card(figure.title, "", [], replace(figure, title="", message="" if words else figure.message))
     page = folder / f"one_{picture}.html"
-    page.write_text(render_index(exhibits.headline, "", [Card(figure.title, "", [], replace(figure, title=""))]))
+    page.write_text(render_index(heading, "", [card]))
     screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 310)
+
+
+def guides(folder: Path) -> None:
+    """One figure of each worked example that the demonstration does not run."""
+    recording, table = str(folder / "nine.csv"), str(folder / "table")
+    ramps = folder / "ramps"
+    for words in (
+        f"tumble simulate --field 48.2uT --gravity 9.81362 -o {recording}",
+        f"tumble fit {recording} --gravity 9.81362 --with gyro,mag --field 48.2uT -o {folder}/nine.json",
+        f"rate simulate -o {table}",
+        f"rate fit {table}/test.toml -o {folder}/rate.json",
+        f"thermal simulate -o {ramps} --ramps 3",
+        f"thermal fit {ramps}/tumble_25.csv {ramps}/ramp_1.csv {ramps}/ramp_2.csv {ramps}/ramp_3.csv "
+        f"-o {folder}/thermal.json",
+    ):
+        commands(words.split())
+    one_figure(folder, "nine.json", "gyroscopes", "gyroscopes miss")
+    one_figure(folder, "nine.json", "magnetometer", "field before and after")
+    one_figure(folder, "rate.json", "rate")
+    one_figure(folder, "thermal.json", "thermal")
 
 
 def main() -> None:
@@ -101,9 +123,10 @@ def main() -> None:
         run(folder, commands)
         screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 930)
         screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 1075)
-        first_figure(folder, "array.json", "gyro_array")
-        first_figure(folder, "warmup.json", "warmup")
-        first_figure(folder, "noise.json", "noise")
+        one_figure(folder, "array.json", "gyro_array")
+        one_figure(folder, "warmup.json", "warmup")
+        one_figure(folder, "noise.json", "noise")
+        guides(folder)
         centrifuge(folder)
 
 
