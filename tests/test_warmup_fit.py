@@ -281,18 +281,39 @@ def test_units_of_a_type_are_told_apart_from_cycles():
         il.fit_warmup(many(0.0), temperatures=[-40, -20, 0])
 
 
+def with_slow_noise(cycle, rng):
+    """A power cycle with 1/f noise of 30 deg/h and a walk of 100 deg/h/sqrt(h) added, much above its white noise."""
+    columns, n = dict(cycle.columns), len(cycle)
+    interval = float(cycle.time[1] - cycle.time[0])
+    frequency = np.fft.rfftfreq(4 * n, interval)
+    frequency[0] = np.inf
+    for name in ("gyro_x", "gyro_y", "gyro_z"):
+        # One-sided densities B^2 / (pi f) and K^2 / (2 pi^2 f^2); four times the length, so that nothing wraps.
+        density = 30**2 / (np.pi * frequency) + (100 / 60) ** 2 / (2 * np.pi**2 * frequency**2)
+        size = np.sqrt(density * n / interval)
+        spectrum = size * (rng.standard_normal(len(size)) + 1j * rng.standard_normal(len(size)))
+        columns[name] = columns[name] + np.fft.irfft(spectrum, 4 * n)[:n]
+    return replace(cycle, columns=columns)
+
+
 @pytest.mark.slow
-def test_intervals_of_the_curve_cover(reduced):
-    """The curve's uncertainty from repeatability: 95 % intervals at one temperature, five cycles, pooled over three."""
+@pytest.mark.parametrize("slow_noise", [False, True])
+def test_intervals_of_the_curve_cover(reduced, slow_noise):
+    """The curve's uncertainty from repeatability: 95 % intervals at one temperature, five cycles, pooled over three.
+
+    The scatter between cycles holds what a cycle's mean at rest, its reference, is uncertain by, whatever the colour.
+    """
     trials, inside, total = (150 if reduced else 600), 0, 0
+    rng = np.random.default_rng(7)
     at = np.array([-40.0, -30, -20])
     times = np.array([2.0, 20, 60, 120, 200, 290])
     for trial in range(trials):
-        cycles = [
-            find_power_cycle(simulate_power_cycle(t, seed=[trial, i, c], sample_rate=2, scatter=0, accel=False))
+        made = [
+            simulate_power_cycle(t, seed=[trial, i, c], sample_rate=2, scatter=0, accel=False)
             for i, t in enumerate(at)
             for c in range(5)
         ]
+        cycles = [find_power_cycle(with_slow_noise(each, rng) if slow_noise else each) for each in made]
         curves, _ = make_curves(cycles, at, tolerance=1, settling_time=END, limit={})
         sums = statistics(curves, "knot-log-cubic", (20.0,))
         solution = solve(curves, "knot-log-cubic", (20.0,), sums, np.ones(len(cycles)))
@@ -310,7 +331,7 @@ def test_intervals_of_the_curve_cover(reduced):
             half = 2.45 * np.sqrt(np.einsum("tp,apq,tq->ta", basis, covariance[k], basis))  # Student, 6 degrees
             inside += int((np.abs(miss) <= half).sum())
             total += miss.size
-    print(f"coverage {100 * inside / total:.1f} % of {total}")
+    print(f"coverage, slow noise {slow_noise}: {100 * inside / total:.2f} % of {total}")
     # Axes, temperatures and trials are apart; the times of a curve are not, and count once. By chance once in 10,000.
     apart = total // len(times)
     fewest, most = binom.interval(1 - 1e-4, apart, 0.95)

@@ -12,13 +12,13 @@ import numpy as np
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import allan
 from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns
-from imulab.estimation.noise_coefficients import NoiseCoefficients
+from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients_dict
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
 from imulab.procedures.inputs import Data, Part, Window, as_recording
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording, check_finite
-from imulab.report.elements import Exhibits, ReportTable, format_uncertain
+from imulab.report.elements import Exhibits, Figure, ReportTable, format_uncertain
 from imulab.units import si_unit
 
 
@@ -52,8 +52,8 @@ class AllanCurve(Drawn, allan.AllanCurve):
     __repr__ = allan.AllanCurve.__repr__
 
     def exhibits(self) -> Exhibits:
-        """Return the curve with its 95 % interval, and a table of it."""
-        from imulab.report.noise_figures import allan_figure, shown_unit
+        """Return the coefficients, where there are any, the curve with its 95 % interval, and a table of it."""
+        from imulab.report.noise_figures import allan_figure, coefficient_rows, coefficients_table, shown_unit
 
         unit, factor = shown_unit(self.unit, "bias_instability")
         pairs = zip(self.deviation.tolist(), self.standard_uncertainty.tolist(), strict=True)
@@ -67,7 +67,11 @@ class AllanCurve(Drawn, allan.AllanCurve):
             f"Allan deviation of {self.name} over {rows[0][0]} to {rows[-1][0]} s; least {' ± '.join(rows[least][1:])} "
             f"{unit} at {rows[least][0]} s."
         )
-        return Exhibits(headline, [], [allan_figure({self.name: vars(self)}, [self.name]), table])
+        items: list[Figure | ReportTable] = [allan_figure({self.name: vars(self)}, [self.name]), table]
+        if self.coefficients is not None:
+            its = {"unit": self.unit, **coefficients_dict(self.coefficients, self.unit)}
+            items.insert(0, coefficients_table(coefficient_rows({"columns": {self.name: its}})))
+        return Exhibits(headline, [], items)
 
 
 def allan_deviation(

@@ -55,17 +55,7 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
     known = [f"{row[0]} {row[2]} ± {row[3]} {row[4]}" for row in white if row[2] != "not determined"]
     more = f" and {len(known) - _MOST_NAMED} more columns in the table" if len(known) > _MOST_NAMED else ""
     lost = f"; not determined for {len(white) - len(known)} of {len(white)} columns" if len(known) < len(white) else ""
-    items: list[Figure | ReportTable] = [
-        ReportTable(
-            "Noise coefficients",
-            "Value and standard uncertainty u, of the model that fits the spectrum best; 0 ± u: it does not show. "
-            "Angle (velocity) random walk: the white noise of the rate (specific "
-            "force). Bias instability: the level of 1/f noise, below which no averaging helps. Rate (acceleration) "
-            "random walk: how the zero wanders.",
-            ["column", "coefficient", "value", "u", "unit"],
-            rows,
-        )
-    ]
+    items: list[Figure | ReportTable] = [coefficients_table(rows)]
     for names in kinds.values():
         items += [allan_figure(found["columns"], names[k : k + _MOST_LINES]) for k in range(0, len(names), _MOST_LINES)]
     items += [_samples(found, recording, page) for page in panels.pages(list(found["columns"]))]
@@ -192,6 +182,19 @@ def _samples(found: dict[str, Any], recording: Recording, names: Sequence[str]) 
         traces=traces,
         layout=layout,
         height=panels.height(len(names)),
+    )
+
+
+def coefficients_table(rows: list[list[str]]) -> ReportTable:
+    """Return the table of rows of coefficients."""
+    return ReportTable(
+        "Noise coefficients",
+        "Value and standard uncertainty u, of the model that fits the spectrum best; 0 ± u: it does not show. "
+        "Angle (velocity) random walk: the white noise of the rate (specific "
+        "force). Bias instability: the level of 1/f noise, below which no averaging helps. Rate (acceleration) "
+        "random walk: how the zero wanders.",
+        ["column", "coefficient", "value", "u", "unit"],
+        rows,
     )
 
 

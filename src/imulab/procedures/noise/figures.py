@@ -149,7 +149,9 @@ def _models(fit: Fit) -> ReportTable:
     return ReportTable(
         "Models",
         "Chosen terms, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation, with the weight among all candidates "
-        "(a G of the shortest time that the band tells is a filter or vibration, and counts as white noise); the next; "
+        "(a G of the shortest time that the band tells is a filter or vibration, and counts as white noise); the "
+        "heaviest of the others, which may weigh more than the chosen one: a choice asks twice the gain of a weight "
+        "from each further parameter, so that no term is named without need; "
         "the probability of the test of fit (of a good model below 0.01 in one record of a hundred); the "
         "highest frequency used; by how much bins are off the model; what was taken for no noise.",
         ["column", "chosen", "next", "p of fit", "up to, Hz", "ripple, %", "spikes", "lines", "steps"],
