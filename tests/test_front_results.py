@@ -363,7 +363,7 @@ def compared():
         (check, ["Residual |f| − g of each fresh attitude under the record"], 24),
         (changes, ["Change of each parameter in units of its standard uncertainty"], 9),
         (fused, ["Fused rate over time", "State of each gyro"], 6),
-        (curve, ["Allan deviation, gyro_1"], 12),
+        (curve, ["Allan deviation, gyro_1"], 3),  # the coefficients stand first
         (
             compared,
             ["Allan deviation of each method", "Angle error over time", "Weight and health of each gyro under robust"],
