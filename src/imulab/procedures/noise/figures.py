@@ -231,7 +231,8 @@ def _ratios(record: Calibration, fit: Fit, names: Any, page: int, pages: int) ->
             )  # fmt: skip
         panels.panel(layout, index, len(names), name, "record / model")
         title = {"text": "frequency, Hz", "font": {"size": 11}, "standoff": 4}
-        layout[panels.axis_key(x)] |= {"type": "log", "dtick": 1, "title": title}
+        apart = 2 if f.max() > 1e4 * f.min() else 1  # decades from tick to tick: a printed panel is narrow
+        layout[panels.axis_key(x)] |= {"type": "log", "dtick": apart, "tickangle": 0, "title": title}
         top = max(1.6, min(2.9, 1.1 * float((ratio + 2 * u)[used].max(initial=1.5))))
         layout[panels.axis_key(y)]["range"] = [0.0, top]
         off = np.abs(np.log(np.maximum(ratio, 1e-9)))[used] / np.maximum(u[used], 1e-9)
