@@ -21,7 +21,7 @@ _STRONG, _NEAR, _WANDERS, _MOST_STRONG, _ROUNDS = 1e3, 50, 0.01, 8, 14
 _STRONG_SLOW, _SLOW = 1e5, 200
 """The same of the lowest coefficients, where slow noise is read: a sway there must not pass for a line."""
 _NOISE = 3.0
-"""Over the median of the squares of coefficients: their mean is 2.2 of it, with what it scatters by over 100 of them."""
+"""Over the median of the squares of coefficients: their mean is 2.2 of it, and scatters over 100 of them."""
 STEP, PERHAPS = 5.0, 4.0
 """|z| beyond which a change of level is a step; and may be one that the fit took for random walk."""
 _MOST_STEPS = 5
