@@ -16,7 +16,8 @@ from imulab.errors import ObservabilityError
 from imulab.estimation.least_squares import Observability, observability
 from imulab.procedures.thermal.choices import APART, DEGREES
 from imulab.procedures.thermal.model import GROUPS, Laws
-from imulab.procedures.thermal.solve import Problem, Rows, Solution, solve, together, whitener
+from imulab.procedures.thermal.rows import Problem, Rows, together, whitener
+from imulab.procedures.thermal.solve import Solution, solve
 from imulab.recording import Array
 
 Degrees = tuple[int, int, int]

@@ -21,7 +21,7 @@ from imulab.procedures.thermal.holds import Holds, find_holds
 from imulab.procedures.thermal.lag import drift_of, moving
 from imulab.procedures.thermal.model import GROUPS, Laws
 from imulab.procedures.thermal.record import make_record
-from imulab.procedures.thermal.solve import Problem
+from imulab.procedures.thermal.rows import Problem
 from imulab.quantities import in_si
 from imulab.recording import Array
 from imulab.records.calibration import Calibration

@@ -16,7 +16,8 @@ from imulab.procedures.thermal.choices import APART
 from imulab.procedures.thermal.degrees import tail
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import AXES
-from imulab.procedures.thermal.solve import Problem, Solution, solve, whitener
+from imulab.procedures.thermal.rows import Problem, whitener
+from imulab.procedures.thermal.solve import Solution, solve
 from imulab.recording import Array
 from imulab.verdict import Note
 

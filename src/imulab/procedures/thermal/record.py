@@ -13,8 +13,9 @@ from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
 from imulab.procedures.thermal.model import GROUPS
+from imulab.procedures.thermal.rows import Problem
 from imulab.procedures.thermal.sections import thermal_of
-from imulab.procedures.thermal.solve import Problem, Solution
+from imulab.procedures.thermal.solve import Solution
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.verdict import Note
