@@ -234,7 +234,8 @@ def _of_head(recording: Recording) -> Gravity | None:
     except OptionError:
         return None
     relative = _TO_MICRO * found.standard_uncertainty / found.value
-    known = f" (± {relative:.3g} ppm)" if relative else ""
+    size = f"{relative:.3g} ppm" if relative < 999.5 else f"{relative / 1e4:.2g} %"
+    known = f" (± {size})" if relative else ""
     said = (
         f"gravity {found.value:.6g} m/s^2{known} was taken from the head of {recording.name}, as no option gave another"
     )

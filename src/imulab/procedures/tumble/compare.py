@@ -17,6 +17,7 @@ from imulab.procedures.result import Drawn
 from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.checks import check_fresh, made_from
+from imulab.procedures.tumble.engineering import small_g
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
 from imulab.procedures.tumble.mag.check import FEWEST, MagCheck, check_mag
 from imulab.procedures.tumble.model import length_noise, norm_and_jacobian, parameter_names
@@ -27,7 +28,6 @@ from imulab.quantities import in_si
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits
-from imulab.units import from_si
 from imulab.verdict import Note
 
 
@@ -78,10 +78,10 @@ class Check(Drawn):
 
     def __repr__(self) -> str:
         p = "" if self.probability is None else f", p = {self.probability:.2g}"
-        worst = from_si(abs(float(self.residuals[self.worst])), "ug")
+        worst = small_g(abs(float(self.residuals[self.worst])))
         return (
             f"Check({'pass' if self.passed else 'fail'}{p}, {len(self.residuals)} attitudes, the farthest off is "
-            f"number {self.worst + 1} by {worst:.3g} µg)"
+            f"number {self.worst + 1} by {worst})"
         )
 
     @property

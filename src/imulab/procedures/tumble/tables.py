@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imulab.procedures.tumble.engineering import engineering_rows, micro_g, propagated_rows
+from imulab.procedures.tumble.engineering import engineering_rows, micro_g, propagated_rows, small_g
 from imulab.procedures.tumble.sections import Prior, Trials, fit_of, model_of
 from imulab.records.calibration import Calibration
 from imulab.report.elements import ReportTable, format_uncertain, plain_number
@@ -22,7 +22,7 @@ def _basis(record: Calibration) -> str:
     if not fit.excess.value or freedom is None:
         return "Noise known from the attitudes' own scatter; normal quantiles."
     return (
-        f"Noise known from the attitudes' own scatter, with {micro_g(fit.excess.value):.3g} µg more for each "
+        f"Noise known from the attitudes' own scatter, with {small_g(fit.excess.value)} more for each "
         f"attitude, as its residual makes plausible; Student's t with {freedom:.0f} effective degrees of freedom."
     )
 
@@ -41,7 +41,8 @@ def parameters_table(record: Calibration) -> ReportTable:
         elif row.standard_uncertainty is not None and factor is not None:
             half = factor * row.standard_uncertainty
             interval = " to ".join(format_uncertain(row.value + s * half, row.standard_uncertainty)[0] for s in (-1, 1))
-        given = [] if fit.blend is None else ["–" if row.given_order is None else f"{row.given_order:.2g}"]
+        order_known = "–" if row.given_order is None else format_uncertain(row.value, row.given_order)[1]
+        given = [] if fit.blend is None else [order_known]
         rows.append([row.name, value, uncertainty, *given, interval, row.unit])
     basis = _basis(record)
     if fit.blend is not None:
@@ -94,10 +95,11 @@ def _agreement(rows: list[list[str]]) -> str:
         return ""
     name, *_, ratio, _ = max(rows, key=lambda row: abs(float(row[3]) - 1))
     percent = 100 * abs(float(ratio) - 1)
+    apart = f"{plain_number(percent, 2)} % ({name})"
     if percent <= _AGREE:
-        return f"The linear and the Monte Carlo intervals agree: their widths within {percent:.2g} % ({name})."
+        return f"The linear and the Monte Carlo intervals agree: their widths within {apart}."
     return (
-        f"The linear and the Monte Carlo intervals differ: their widths by up to {percent:.2g} % ({name}). Use the "
+        f"The linear and the Monte Carlo intervals differ: their widths by up to {apart}. Use the "
         "Monte Carlo intervals."
     )
 
