@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from imulab.errors import OptionError, quoted
-from imulab.quantities import in_si, quantity
+from imulab.quantities import in_si, quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.verdict import Note
 
@@ -185,10 +185,10 @@ def stated_gravity(text: str, option: str) -> Gravity:
     OptionError
         It is none (the message begins with `option`), or cannot be the gravity of any place.
     """
-    first, sign, second = re.sub(r"\+/?-|±", "±", text).partition("±")
+    first, second = with_uncertainty(text)
     value = quantity(first, option, "acceleration", "m/s^2")
     _check_possible(value)
-    if sign:
+    if second is not None:
         uncertainty = quantity(second, f"{option} {text!r}, uncertainty", "acceleration", "m/s^2")
         if not 0 <= uncertainty < 0.1 * abs(value):
             raise OptionError(

@@ -43,6 +43,12 @@ def quantity(text: str, option: str, kind: str, default_unit: str) -> float:
     return to_si(float(match[1]), unit.symbol)
 
 
+def with_uncertainty(text: str) -> tuple[str, str | None]:
+    """Part ``9.81362+-0.00002`` (``+/-``, ``±``) into value and standard uncertainty, None where there is none."""
+    first, sign, second = re.sub(r"\+/?-|±", "±", text).partition("±")
+    return first, second if sign else None
+
+
 def split_quantity(text: str, option: str, example: str) -> tuple[float, str]:
     """Return the number of a text such as ``0.3 deg/sqrt(h)`` and what stands behind it.
 

@@ -256,6 +256,10 @@ def mag(
     mag_order: Annotated[str, one_of(MAG_ORDERS, "2: quadratic terms too; auto: where they predict.")] = "1",
     drop: Annotated[list[str] | None, typer.Option(metavar="N", help="Attitude to leave out; repeatable.")] = None,
     hemisphere: Annotated[str | None, one_of(HEMISPHERES, "To check the sign of the dip.")] = None,
+    dip: Annotated[
+        str | None,
+        typer.Option(metavar="67.2+-0.2", help="Dip of the place, deg, to compare with the one found."),
+    ] = None,
     order: Annotated[str, typer.Option(help="Order of the accelerometers' model, auto or 1 to 5.")] = "auto",
     options: dict[str, str | None],
     output: OutputFile = None,
@@ -265,15 +269,17 @@ def mag(
     """Calibrate a magnetometer triad in the accelerometers' frame from the same attitudes, into one record of both."""
     from imulab.gravity import gravity_option
     from imulab.procedures.loading import load
-    from imulab.procedures.tumble.mag.fit import fit_mag, hemisphere_at
+    from imulab.procedures.tumble.mag.fit import fit_mag
+    from imulab.procedures.tumble.mag.stated import stated_place
 
     check_outputs([output, report], [name for name in (file, accel, options["layout"]) if name])
     known = None if accel is None else load(accel)
     local = gravity_option(options["gravity"], options["latitude"], options["height"], FLAG)
+    place = call(stated_place, hemisphere=hemisphere, latitude=options["latitude"], dip=dip)
     found = call(
         fit_mag, read_recording(file, **reading(options)), accel=known, same_direction=tuple(same_direction or ()),
         field=field, loss=loss, mag_order=mag_order, drop=tuple(drop or ()),
-        hemisphere=hemisphere or hemisphere_at(options["latitude"]), gravity=local, order=order,
+        hemisphere=place.hemisphere, dip=place.dip, gravity=local, order=order,
     )  # fmt: skip
     finish(found.calibration, output, report, json=json)
 

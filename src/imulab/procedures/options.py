@@ -81,7 +81,7 @@ def text_option(name: str, help: str, **more: Any) -> Option:  # noqa: A002
     return Option(name, help, lambda text, _: text, **more)
 
 
-def choice(name: str, help: str, choices: Sequence[str], default: str) -> Option:  # noqa: A002
+def choice(name: str, help: str, choices: Sequence[str], default: str | None = None) -> Option:  # noqa: A002
     """Return an option that is one of a few words."""
 
     def read(text: str, called: str) -> str:

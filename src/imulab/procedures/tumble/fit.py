@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Unpack
 
 from numpy.typing import ArrayLike
 
@@ -20,6 +20,7 @@ from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
 from imulab.procedures.tumble.findings import Estimate
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
 from imulab.procedures.tumble.linearised import SOURCE_THRESHOLD, Threshold
+from imulab.procedures.tumble.mag.stated import Place, stated_place
 from imulab.procedures.tumble.model import parameter_count
 from imulab.procedures.tumble.montecarlo import MonteCarlo, propagate
 from imulab.procedures.tumble.options import check_options, further_triads
@@ -83,6 +84,8 @@ def fit_tumble(
     threshold: Sequence[float] | str | None = None,
     with_: str | Sequence[str] = (),
     field: float | str | None = None,
+    hemisphere: str | None = None,
+    dip: float | str | tuple[float, float] | None = None,
     covariance: ArrayLike | None = None,
     progress: Callable[[int], None] = lambda _: None,
     **reading: Unpack[Reading],
@@ -134,6 +137,8 @@ def fit_tumble(
         or 1 to 5 without cross terms, and neither prior, nonlinearity nor Monte Carlo.
     field
         Magnitude of the field, T, or a text such as ``"48.2uT"``, with ``"mag"``; without it the field is the unit.
+    hemisphere, dip
+        As for `fit_mag`, with ``"mag"``; the hemisphere also by the latitude.
     covariance
         Of means of attitudes without a time, in their squared unit, shape (3, 3) or (n, 3, 3).
     progress
@@ -184,32 +189,30 @@ def fit_tumble(
     further = further_triads(with_, "with_")
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
     check_options(
-        order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing,
-        nonlinearity=nonlinearity, cross=cross, threshold=threshold, further=further, field=magnitude,
+        order, method, loss, monte_carlo=monte_carlo, with_prior=prior is not None, ageing=ageing, cross=cross, dip=dip,
+        nonlinearity=nonlinearity, threshold=threshold, further=further, field=magnitude, hemisphere=hemisphere,
     )  # fmt: skip
+    place = stated_place(hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
     local = local_gravity(at_place(gravity, latitude, height), attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = nominal_scaling(attitudes, local.value)
     known = None if prior is None else as_record(prior, "fit_tumble: prior")
-    if known is not None:
-        order = _prior_order(known, order, attitudes)
+    order = order if known is None else _prior_order(known, order, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
     estimate = estimate_triad(
-        attitudes, local, scaling, order, loss, rest,
-        nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross,
+        attitudes, local, scaling, order, loss, rest, nonlinearity=nonlinearity, prior=known, ageing=ageing, cross=cross
     )  # fmt: skip
     trials = None if monte_carlo is None else _propagated(estimate, monte_carlo, progress)
-    given = {"nonlinearity": nonlinearity and list(nonlinearity), "monte_carlo": monte_carlo, "cross": cross or None}
-    if rest is not None:
-        given["threshold"] = rest.in_si(local.value)
-    options: dict[str, Any] = {"order": order, "method": method, "loss": loss, "gravity": local.value}
-    options |= {name: value for name, value in given.items() if value is not None}
-    record = make_record(estimate, local, scaling, options, trials)
-    if estimate.problem.order == 0:
-        record = with_assumed_alignment(record)
+    options = {
+        "order": order, "method": method, "loss": loss, "gravity": local.value,
+        "nonlinearity": nonlinearity and list(nonlinearity), "monte_carlo": monte_carlo, "cross": cross or None,
+        "threshold": None if rest is None else rest.in_si(local.value),
+    }  # fmt: skip
+    record = make_record(estimate, local, scaling, {k: v for k, v in options.items() if v is not None}, trials)
+    record = with_assumed_alignment(record) if estimate.problem.order == 0 else record
     return TumbleFit(
-        calibration=_with_further(record, further, attitudes, local, loss, magnitude),
+        calibration=_with_further(record, further, attitudes, local, loss, magnitude, place),
         observability=estimate.observability,
         orders=estimate.orders,
         residuals=local.value * estimate.found.solution.deviations[0],
@@ -224,12 +227,15 @@ def _with_further(
     gravity: Gravity,
     loss: str,
     field: float | None,
+    place: Place,
 ) -> Calibration:
     """Return the record with further triads, each fitted on the record of those before it."""
     if "mag" in further:
         from imulab.procedures.tumble.mag.fit import fit_mag
 
-        record = fit_mag(attitudes, accel=record, gravity=gravity, loss=loss, field=field).calibration
+        record = fit_mag(
+            attitudes, accel=record, gravity=gravity, loss=loss, field=field, hemisphere=place.hemisphere, dip=place.dip
+        ).calibration
     if "gyro" in further:
         from imulab.procedures.tumble.gyro import fit_gyro
         from imulab.procedures.tumble.gyrorecord import with_gyro

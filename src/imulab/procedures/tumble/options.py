@@ -42,6 +42,8 @@ def check_options(
     threshold: Sequence[float] | None = None,
     further: Sequence[str] = (),
     field: float | None = None,
+    hemisphere: str | None = None,
+    dip: object = None,
 ) -> None:
     """Check what can be checked before there is data.
 
@@ -86,8 +88,7 @@ def check_options(
             cross=cross or None, prior=with_prior or None, nonlinearity=nonlinearity, monte_carlo=monte_carlo,
         )  # fmt: skip
     check_field(field)
-    if field is not None and "mag" not in further:
-        raise OptionError("field without magnetometers: expected it with mag, or with gyro,mag")
+    _check_of_mag("mag" in further, field=field, hemisphere=hemisphere, dip=dip)
     if monte_carlo is None:
         return
     check_trials(monte_carlo)
@@ -133,6 +134,13 @@ def _check_with_mag(**others: object) -> None:
                 f"with_ mag does not go with {shown}: both triads are fitted together by method norm, order auto or 1 "
                 "to 5, from these attitudes alone"
             )
+
+
+def _check_of_mag(asked: bool, **stated: object) -> None:
+    """Refuse what is stated of a field where no magnetometers are asked for."""
+    for name, value in stated.items():
+        if value is not None and not asked:
+            raise OptionError(f"{name} without magnetometers: expected it with mag, or with gyro,mag")
 
 
 def check_field(field: float | None) -> None:

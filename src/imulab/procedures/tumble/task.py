@@ -21,7 +21,7 @@ from imulab.procedures.options import (
 )
 from imulab.procedures.procedure import Files, Task
 from imulab.procedures.tumble import texts
-from imulab.procedures.tumble.choices import FURTHER, LOSSES, METHODS, ORDERS
+from imulab.procedures.tumble.choices import FURTHER, HEMISPHERES, LOSSES, METHODS, ORDERS
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
 
 
-_NAMED = ("order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo", "with_", "field")
+_NAMED = (
+    "order", "method", "loss", "threshold", "ageing", "nonlinearity", "cross", "monte-carlo", "with_", "field",
+    "hemisphere", "latitude", "dip",
+)  # fmt: skip
 
 
 def _fit(
@@ -55,6 +58,8 @@ def _fit(
         threshold=values["threshold"],
         with_=values["with"],
         field=values["field"],
+        hemisphere=values["hemisphere"],
+        dip=values["dip"],
         progress=progress,
     ).calibration
 
@@ -133,6 +138,8 @@ OPTIONS = (
         "uT",
         shows="48.2uT",
     ),
+    choice("hemisphere", "With mag: to check the sign of the dip; without it by --latitude.", HEMISPHERES),
+    Option("dip", "With mag: dip of the place, deg, to compare with the one found.", texts.dip, shows="67.2+-0.2"),
     *READING,
     ELEMENT,
 )
@@ -140,6 +147,7 @@ OPTIONS = (
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.gravity import gravity_option
+    from imulab.procedures.tumble.mag.stated import stated_place
     from imulab.procedures.tumble.options import check_options
 
     values = read_options(OPTIONS, texts, label)
@@ -150,7 +158,11 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
             monte_carlo=values["monte_carlo"], with_prior=values["prior"] is not None, ageing=values["ageing"],
             nonlinearity=values["nonlinearity"], cross=values["cross"], threshold=values["threshold"],
             further=values["with"], field=values["field"],
+            hemisphere=values["hemisphere"], dip=values["dip"],
         )  # fmt: skip
+        if "mag" in values["with"]:
+            place = stated_place(values["hemisphere"], values["latitude"], values["dip"])
+            values["hemisphere"] = place.hemisphere
     values["gravity"] = gravity_option(values["gravity"], values["latitude"], values["height"], label)
     return {**values, "part": part_of(values)}
 

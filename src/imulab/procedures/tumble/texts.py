@@ -6,9 +6,12 @@ import math
 
 from imulab.errors import OptionError, listed
 from imulab.procedures.tumble.choices import ORDERS
-from imulab.quantities import quantity
+from imulab.quantities import quantity, with_uncertainty
 from imulab.units import STANDARD_GRAVITY
 
+OF_FIELD_MODELS = math.radians(0.2)
+"""Standard uncertainty of the dip that a model of the Earth's field gives, rad (technical report of the WMM2025)."""
+_MOST_UNCERTAIN = math.radians(10.0)
 _CHANGES = (("number", "ppm"), ("acceleration", "ug"), ("angle", "arcsec"))
 
 
@@ -60,6 +63,37 @@ def nonlinearity(text: str, name: str) -> tuple[float, float]:
         raise OptionError(f"{name} {text!r}: expected two standard deviations, of k2 and k3, such as 20ug,20ug")
     first, second = (quantity(part.strip(), name, "acceleration", "ug") / STANDARD_GRAVITY for part in parts)
     return first, second
+
+
+def dip(text: str, name: str) -> tuple[float, float]:
+    """Return a dip such as ``67.2`` or ``67.2+-0.1 deg`` and its standard uncertainty, rad.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    first, second = with_uncertainty(text)
+    value = quantity(first, name, "angle", "deg")
+    if second is None:
+        return check_dip(value, OF_FIELD_MODELS, name)
+    return check_dip(value, quantity(second, f"{name} {text!r}, uncertainty", "angle", "deg"), name)
+
+
+def check_dip(value: float, uncertainty: float, name: str) -> tuple[float, float]:
+    """Return a dip and its standard uncertainty, rad, that can be.
+
+    Raises
+    ------
+    OptionError
+        They cannot.
+    """
+    if not (abs(value) <= math.pi / 2 and 0 <= uncertainty <= _MOST_UNCERTAIN):
+        raise OptionError(
+            f"{name} {math.degrees(value):g} deg ± {math.degrees(uncertainty):g} deg: expected -90 to 90 deg, positive "
+            "where the field points down, and a standard uncertainty of 0 to 10 deg"
+        )
+    return value, uncertainty
 
 
 def order(text: str, name: str) -> int | str:

@@ -13,7 +13,7 @@ from imulab.estimation.least_squares import f_test
 from imulab.gravity import Gravity, at_place
 from imulab.procedures.inputs import Reading, Record, as_record
 from imulab.procedures.result import Result
-from imulab.procedures.tumble.choices import HEMISPHERES, LOSSES, MAG_ORDERS
+from imulab.procedures.tumble.choices import LOSSES, MAG_ORDERS
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
 from imulab.procedures.tumble.gyrorecord import with_gyro_of
 from imulab.procedures.tumble.mag.field import FEWEST
@@ -22,13 +22,15 @@ from imulab.procedures.tumble.mag.prepare import check_seen, prepare
 from imulab.procedures.tumble.mag.record import with_mag
 from imulab.procedures.tumble.mag.scaling import Ready
 from imulab.procedures.tumble.mag.solve import Joint, solve
+from imulab.procedures.tumble.mag.stated import Place, stated_place
 from imulab.procedures.tumble.options import check_field
 from imulab.quantities import in_si
 from imulab.records.calibration import Calibration
 
 _STEEPEST = np.radians(87.0)
-_EQUATOR = np.radians(20.0)
-"""The magnetic equator lies within 16 deg of the geographic one."""
+_OFF = np.radians(0.5)
+_CONTRADICTS = 4.0
+"""Standard uncertainties, and rad, beyond which a stated dip is refused."""
 _GAIN = 0.9
 _SIGNIFICANT = 0.01
 _MOST_ASIDE = 5
@@ -75,6 +77,7 @@ def fit_mag(
     mag_order: int | str = 1,
     drop: Sequence[int | str] = (),
     hemisphere: str | None = None,
+    dip: float | str | tuple[float, float] | None = None,
     gravity: float | str | Gravity | None = None,
     latitude: float | str | None = None,
     height: float | str | None = None,
@@ -108,6 +111,10 @@ def fit_mag(
         Attitudes to leave out, numbers from 1.
     hemisphere
         ``north`` or ``south``, to check the sign of the dip; by the latitude, where that is given, beyond 20 deg.
+    dip
+        Of the place, rad, with its standard uncertainty, ``(1.17, 0.003)``, or a text, ``"67.2+-0.2 deg"``; without one
+        that of a model of the Earth's field, 0.2 deg. It is compared with the dip that is found, and not used in the
+        fit.
     gravity, latitude, height, order
         As for `fit_tumble`.
     reading
@@ -119,7 +126,8 @@ def fit_mag(
     ObservabilityError
         The attitudes cannot separate the parameters, as where all face one way; the message says what would help.
     DataError
-        The columns are missing, dead, saturated or in another unit; there are too few attitudes.
+        The columns are missing, dead, saturated or in another unit; there are too few attitudes; the dip is not
+        that of the hemisphere, or off what was stated by 4 standard uncertainties and 0.5 deg.
     OptionError
         An option has a value that cannot be.
 
@@ -136,8 +144,8 @@ def fit_mag(
     True
     """
     magnitude = None if field is None else in_si(field, "field", "magnetic field", "uT")
-    _check_options(loss, mag_order, order, hemisphere, magnitude)
-    hemisphere = hemisphere or hemisphere_at(latitude)
+    _check_options(loss, mag_order, order, magnitude)
+    place = stated_place(hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_mag)
     known = None if accel is None else as_record(accel, "fit_mag: accel")
     ready = prepare(
@@ -160,10 +168,10 @@ def fit_mag(
             f"{', and does one axis point the same way in those of same-direction' if same_direction else ''}?"
         ) from None
     check_seen(what, np.delete(ready.kept, [one.index for one in aside]), name)
-    _check_result(joint, ready, hemisphere)
+    _check_result(joint, ready, place)
     options = {
         "loss": loss, "mag_order": mag_order if mag_order == "auto" else int(mag_order),
-        "field": magnitude, "hemisphere": hemisphere,
+        "field": magnitude, "hemisphere": place.hemisphere, "dip": place.dip and list(place.dip),
         "drop": list(map(str, drop)),
         "same_direction": [group if isinstance(group, str) else list(group) for group in same_direction],
     }  # fmt: skip
@@ -174,22 +182,12 @@ def fit_mag(
     return MagFit(record, joint, what, aside)
 
 
-def hemisphere_at(latitude: float | str | None) -> str | None:
-    """Return the magnetic hemisphere at a latitude, rad or a text; None near the equator, and where none is given."""
-    angle = 0.0 if latitude is None else in_si(latitude, "latitude", "angle", "deg")
-    return None if abs(angle) < _EQUATOR else "north" if angle > 0 else "south"
-
-
-def _check_options(
-    loss: str, mag_order: int | str, order: int | str, hemisphere: str | None, field: float | None
-) -> None:
+def _check_options(loss: str, mag_order: int | str, order: int | str, field: float | None) -> None:
     for name, value, choices in (("loss", loss, LOSSES), ("mag-order", str(mag_order), MAG_ORDERS)):
         if value not in choices:
             raise OptionError(f"{name} {quoted(value)}: expected one of {listed(choices, str(value))}")
     if str(order) not in ("auto", "1", "2", "3", "4", "5"):
         raise OptionError(f"order {quoted(order)}: expected auto or 1 to 5")
-    if hemisphere is not None and hemisphere not in HEMISPHERES:
-        raise OptionError(f"hemisphere {quoted(hemisphere)}: expected north or south")
     check_field(field)
 
 
@@ -239,11 +237,12 @@ def _order_two(joint: Joint, asked: str, *, robust: bool) -> Joint:
     return second if better and p < _SIGNIFICANT else joint
 
 
-def _check_result(joint: Joint, ready: Ready, hemisphere: str | None) -> None:
+def _check_result(joint: Joint, ready: Ready, place: Place) -> None:
     name = ready.estimate.attitudes.recording.name
     if not joint.converged and not np.isfinite(joint.theta).all():
         raise DataError(f"{name}: the fit of both triads does not converge on these attitudes")
-    dip = float(joint.theta[joint.pair.layout.dip_at])
+    at, hemisphere = joint.pair.layout.dip_at, place.hemisphere
+    dip = float(joint.theta[at])
     if abs(dip) > _STEEPEST:
         raise DataError(
             f"{name}: the field is vertical to {90 - abs(np.degrees(dip)):.1f} deg (dip {np.degrees(dip):+.1f} deg): "
@@ -255,4 +254,14 @@ def _check_result(joint: Joint, ready: Ready, hemisphere: str | None) -> None:
             f"{name}: the dip is {np.degrees(dip):+.1f} deg, that of the {found}ern hemisphere: an odd number of "
             "magnetometer axes is reversed, or the accelerometers read minus the specific force (gravity): change the "
             "signs of the three accelerometer columns, or of one or three magnetometer columns"
+        )
+    if place.dip is None:
+        return
+    stated, uncertainty = place.dip
+    sigma = float(np.hypot(np.sqrt(joint.covariance[at, at]), uncertainty))
+    if abs(dip - stated) > max(_CONTRADICTS * sigma, _OFF):
+        raise DataError(
+            f"{name}: the dip is {np.degrees(dip):.2f} deg, {np.degrees(stated):.2f} deg was stated: they differ by "
+            f"{abs(dip - stated) / sigma:.0f} standard uncertainties: is iron near, do both triads belong to the same "
+            "attitudes, or is the stated dip of another place? Without it the dip of this place is found and used"
         )

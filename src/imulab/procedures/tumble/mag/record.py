@@ -30,6 +30,7 @@ _LARGE_RMS, _LARGE_DIP = 0.02, np.radians(1.0)
 """Scatter of |m| and dip that steady attitudes in one field do not have; the worst of real ones: 0.5 %, 0.3 deg."""
 _HOPELESS = 5.0  # times that
 _STEPS_BY_CHANCE = 0.01
+_OF_NORMAL = 1.96
 _POINTING = np.radians(3.0)
 _OF_THE_EARTH = 22e-6, 67e-6  # T
 _BUILDING = 1.4
@@ -77,6 +78,7 @@ def with_mag(
             *ready.means.notes,
             *ready.notes,
             *_warnings(ready, joint, seen, aside, moved, options, heading[0]),
+            *_stated_dip(parameters["dip"], options.get("dip")),
         ),
         verdict=UNJUDGED,
     )
@@ -234,6 +236,20 @@ def _step(joint: Joint, labels: Sequence[str]) -> list[str]:
         f"{'higher' if step.magnitude > 0 else 'lower'} and the dip {np.degrees(abs(step.dip)):.2g} deg "
         f"{'higher' if step.dip > 0 else 'lower'} than before (p {step.probability:.1g}): was iron, such as a phone, "
         "near in a part of the attitudes, or did the place change?"
+    ]
+
+
+def _stated_dip(found: Parameter, stated: Sequence[float] | None) -> list[str]:
+    """Say if the dip is off what was stated, beyond the uncertainty of both."""
+    if stated is None:
+        return []
+    off, sigma = found.value - stated[0], float(np.hypot(found.standard_uncertainty or 0.0, stated[1]))
+    if abs(off) <= _OF_NORMAL * sigma:
+        return []
+    return [
+        f"mag: the dip of {np.degrees(found.value):.2f} deg is {np.degrees(abs(off)):.2g} deg "
+        f"{'more' if off > 0 else 'less'} than the {np.degrees(stated[0]):.2f} deg stated, {abs(off) / sigma:.1f} "
+        "standard uncertainties: is iron near, or is the stated dip of another place?"
     ]
 
 
