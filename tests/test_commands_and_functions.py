@@ -47,6 +47,7 @@ FUNCTIONS = {
     "noise plan": il.plan_noise,
     "noise check": il.check_noise,
     "noise simulate": il.simulate_noise,
+    "thermal plan": il.plan_thermal,
     "thermal simulate": il.simulate_thermal,
     "thermal fit": il.fit_thermal,
     "rate plan": il.plan_rate,
@@ -276,6 +277,22 @@ MADE = {
         lambda out: il.write(
             il.simulate_noise(white=DEGREE * 0.3 / 60, gm=("20 deg/h", 60), duration=100, columns=["gyro_z"]), out
         ),
+    ),
+    "thermal plan": (
+        [
+            "--temperatures=0,50",
+            "--time",
+            "5 h",
+            "--noise",
+            "40ug",
+            "--degrees",
+            "2,1,0",
+            "--from",
+            "head:30",
+            "-o",
+            "one.csv",
+        ],
+        lambda out: il.plan_thermal([0, 50], time=18000.0, noise="40ug", degrees=(2, 1, 0), from_="head:30").save(out),
     ),
     "thermal simulate": (
         ["--temperatures", "-20,60", "--attitudes", "3", "--ramps", "1", "--duration", "2 min", "-o", "one"],
@@ -508,6 +525,7 @@ def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
     "made",
     [
         lambda: il.plan_tumble(24, noise="20ug"),
+        lambda: il.plan_thermal(),
         lambda: il.plan_warmup(),
         lambda: il.plan_centrifuge(),
         lambda: il.plan_noise(white="0.3 deg/sqrt(h)", walk="10 deg/h/sqrt(h)", gm="5 deg/h:100 s"),
@@ -517,7 +535,7 @@ def test_a_fleet_is_run_and_reported_as_on_the_command_line(tmp_path, capsys):
         lambda: il.simulate_thermal(attitudes=2),
         lambda: il.simulate_rate(hold=1.0),
     ],
-    ids=["tumble", "warmup", "centrifuge", "noise", "rates", "rig", "cycles", "chamber", "table"],
+    ids=["tumble", "soaks", "warmup", "centrifuge", "noise", "rates", "rig", "cycles", "chamber", "table"],
 )
 def test_results_show_themselves_in_twelve_lines_at_most(made):
     result = made()

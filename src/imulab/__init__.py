@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from imulab.procedures.reports import write_report as write_report
     from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
     from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
+    from imulab.procedures.thermal.plan import plan_thermal as plan_thermal
     from imulab.procedures.thermal.simulate import simulate_thermal as simulate_thermal
     from imulab.procedures.tumble.attitudes import Attitudes as Attitudes
     from imulab.procedures.tumble.compare import check_tumble as check_tumble
@@ -140,6 +141,7 @@ _HOME = {
     "plan_noise": "procedures.noise.plan",
     "plan_rate": "procedures.rate.plan",
     "plan_tumble": "procedures.tumble.planning",
+    "plan_thermal": "procedures.thermal.plan",
     "plan_warmup": "procedures.warmup.plan",
     "read": "readers",
     "read_blocks": "readers",

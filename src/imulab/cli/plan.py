@@ -1,9 +1,9 @@
-"""``imulab tumble plan``: a plan to CSV, sheet and what is printed."""
+"""``imulab tumble plan`` and ``thermal plan``: a plan to CSV, sheet and what is printed."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from imulab.atomic_write import replacing
 from imulab.cli.options import call, check_outputs
@@ -17,13 +17,32 @@ from imulab.shown import aligned
 from imulab.units import STANDARD_GRAVITY
 from imulab.writers import write_csv_to
 
+if TYPE_CHECKING:
+    from imulab.procedures.thermal.planned import ThermalPlan
+
 
 def run(*, output: str | None, report: str | None, json: bool, **options: Any) -> None:
     """Plan, print the prediction, and write what was asked for."""
-    check_outputs([output, report], [name for name in (options["add"], options["from_"]) if name])
+    check_plan_outputs(output, report, [name for name in (options["add"], options["from_"]) if name])
+    plan = call(plan_tumble, **options)
+    write_plan(plan, output, report)
+    if json:
+        print(_as_json(plan), end="")
+        return
+    lead, titles, rows = plan.shown()
+    print("\n".join([lead, *aligned(titles, rows)]))
+    say_written(output, report)
+
+
+def check_plan_outputs(output: str | None, report: str | None, inputs: list[str]) -> None:
+    """Check before the work that the plan can be written; errors as for `check_outputs`."""
+    check_outputs([output, report], inputs)
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
-    plan = call(plan_tumble, **options)
+
+
+def write_plan(plan: TumblePlan | ThermalPlan, output: str | None, report: str | None) -> None:
+    """Write the table and the sheet, both or neither."""
     with ExitStack() as stack:
         to_csv = stack.enter_context(replacing(output)) if output else None
         to_sheet = stack.enter_context(replacing(report)) if report else None
@@ -31,11 +50,10 @@ def run(*, output: str | None, report: str | None, json: bool, **options: Any) -
             write_csv_to(plan.recording(), to_csv)
         if to_sheet:
             to_sheet.write(plan.sheet().encode("utf-8"))
-    if json:
-        print(_as_json(plan), end="")
-        return
-    lead, titles, rows = plan.shown()
-    print("\n".join([lead, *aligned(titles, rows)]))
+
+
+def say_written(output: str | None, report: str | None) -> None:
+    """Say what was written."""
     for name, what in ((output, "plan"), (report, "sheet")):
         if name:
             print(f"{what}: {name}")

@@ -1,8 +1,9 @@
-"""``imulab thermal``: simulate and fit."""
+"""``imulab thermal``: plan, simulate and fit."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,14 +11,105 @@ from imulab.cli.fit_options import one_of, with_options
 from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs
 from imulab.procedures.thermal.choices import LAWS, TEMPERATURES
 from imulab.procedures.thermal.task import OPTIONS
+from imulab.procedures.tumble.choices import STARTS
+
+if TYPE_CHECKING:
+    from imulab.procedures.thermal.planned import ThermalPlan
 
 
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    group.command("simulate")(simulate)
-    group.command("fit")(fit)
+    for function in (plan, simulate, fit):
+        group.command(function.__name__)(function)
     return group
+
+
+def plan(
+    temperatures: Annotated[
+        str, typer.Option(metavar="LOW,HIGH", help="Lowest and highest temperature, degC.")
+    ] = "-20,60",
+    time: Annotated[str, typer.Option(help="In the chamber, all told, min, or with a unit.")] = "8 h",
+    soak: Annotated[str, typer.Option(help="Until the unit has the next temperature, min.")] = "45 min",
+    attitude: Annotated[str, typer.Option(help="For one attitude, the turn to it included, min.")] = "1 min",
+    noise: Annotated[
+        str,
+        typer.Option(metavar="60ug|FILE", help="Noise of |f| in one attitude, or a recording or record that has it."),
+    ] = "60 ug",
+    turn_on_scatter: Annotated[
+        str, typer.Option(help="What biases move by from one power cycle to the next, mg.")
+    ] = "0.1 mg",
+    degrees: Annotated[str, typer.Option(metavar="B,S,M", help="Of bias, scale factor and misalignment.")] = "3,2,1",
+    source: Annotated[
+        str,
+        one_of(
+            STARTS,
+            "Where attitudes may lie: sphere, fixture:15 or head:15 (steps in deg), or a file that lists them.",
+            "--from",
+            metavar="sphere|FILE",
+        ),
+    ] = "sphere",
+    output: Annotated[str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Plan to write.")] = None,
+    report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
+    json: AsJson = False,
+) -> None:
+    """Choose soaks, temperatures and attitudes for the time there is, and say what the laws will give."""
+    from imulab.cli.plan import check_plan_outputs, say_written, write_plan
+    from imulab.procedures.thermal.plan import plan_thermal
+    from imulab.shown import aligned
+
+    check_plan_outputs(output, report, [name for name in (noise, source) if Path(name).is_file()])
+    made = call(
+        plan_thermal, temperatures=temperatures, time=time, soak=soak, attitude=attitude, noise=noise,
+        turn_on_scatter=turn_on_scatter, degrees=degrees, from_=source,
+    )  # fmt: skip
+    write_plan(made, output, report)
+    if json:
+        print(_plan_json(made), end="")
+        return
+    lead, titles, rows = made.shown()
+    tables = [made.compared(), (["predicted sd of", "value", "unit"], [list(row) for row in made.predicted])]
+    print("\n".join([lead, *aligned(titles, rows)]))
+    for titles, rows in tables:
+        print("\n".join(["", *aligned(titles, rows)]))
+    say_written(output, report)
+
+
+def _plan_json(made: ThermalPlan) -> str:
+    """Return the plan for scripts, in SI."""
+    from imulab.records.json_text import json_text
+
+    def force(value: float) -> dict[str, Any]:
+        return {"value": value, "unit": "m/s^2"}
+
+    return json_text(
+        {
+            "degrees": list(made.degrees),
+            "duration": {"value": made.duration, "unit": "s"},
+            "noise": force(made.noise),
+            "turn_on_scatter": force(made.turn_on_scatter),
+            "mean": force(made.mean),
+            "predicted": {
+                "temperature": made.temperature.tolist(),
+                "standard_uncertainty": made.deviation.tolist(),
+                "unit": "m/s^2",
+            },
+            "soaks": [
+                {
+                    "temperature": soak.temperature,
+                    "reached_by": "warming" if soak.warming else "cooling",
+                    "start": soak.start,
+                    "duration": soak.duration,
+                    "up": soak.directions.tolist(),
+                }
+                for soak in made.soaks
+            ],
+            "compared": [
+                {"soaks": each.soaks, "attitudes": each.attitudes, "mean": each.mean, "worst": each.worst}
+                for each in made.tried
+            ],
+        }
+    )
 
 
 def simulate(

@@ -143,7 +143,7 @@ def plan_tumble(
     if seen.rank < size:
         confused = " ".join(seen.confused(parameter_names(order)))
         raise ObservabilityError(f"{source}: the candidate attitudes cannot separate {confused} of order {order}")
-    paths = np.vstack([_shortest_path(each) for each in rounds if len(each)])
+    paths = np.vstack([shortest_path(each) for each in rounds if len(each)])
     return Plan(paths, order, inverse(jacobian.T @ jacobian), seen.condition, len(before))
 
 
@@ -220,7 +220,7 @@ def _distinct(directions: Array) -> Array:
     return distinct
 
 
-def _shortest_path(directions: Array) -> Array:
+def shortest_path(directions: Array) -> Array:
     """Order the attitudes so that little is turned between them: nearest neighbour, then 2-opt, level first."""
     count = len(directions)
     angle = np.arccos(np.clip(directions @ directions.T, -1, 1))

@@ -99,13 +99,13 @@ def plan_tumble(
     check_method(method, number)
     if with_ not in (None, "mag"):
         raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings")
-    sigma, source = _noise(noise)
+    sigma, source = noise_of(noise)
     distinct = method == "linearised" if distinct_verticals is None else distinct_verticals
     found = plan.plan_tumble(
         order=number,
         attitudes=whole(attitudes, "attitudes"),
         criterion=criterion,
-        candidates=_candidates(from_),
+        candidates=candidates_of(from_),
         already=None if add is None else _measured_directions(add),
         source=from_ if isinstance(from_, str) else "from_",
         distinct_verticals=distinct,
@@ -131,7 +131,7 @@ def _record(data: object) -> Calibration | None:
     return data
 
 
-def _noise(given: Any) -> tuple[float, str]:
+def noise_of(given: Any) -> tuple[float, str]:
     """Noise of |f| in one attitude, g: a quantity, or what the attitudes of a recording or record have; and whose."""
     if given is None:
         raise OptionError(
@@ -170,7 +170,8 @@ def _noise_of(record: Calibration) -> float:
     return float(np.sqrt(reduced)) / g
 
 
-def _candidates(given: Any) -> Array | None:
+def candidates_of(given: Any) -> Array | None:
+    """Return the upward directions among which a plan chooses, as ``--from`` names them; None for the whole sphere."""
     if isinstance(given, str):
         if given == STARTS[0]:
             return None

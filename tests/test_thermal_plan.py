@@ -1,0 +1,139 @@
+"""Plans of a calibration over temperature: temperatures, attitudes by exchange, and whether the promise is kept."""
+
+import json
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from imulab.procedures.thermal.design import Design, exchange, nodes, way
+from imulab.procedures.thermal.model import Laws
+from imulab.procedures.thermal.solve import Problem, solve
+from imulab.procedures.tumble.plan import sphere_candidates
+from reference import thermal as reference
+
+G = reference.G
+LAWS = Laws(-20.0, 60.0, (3, 2, 1))
+
+
+def test_temperatures_are_ends_and_extrema_of_the_legendre_polynomial():
+    """P4 = (35 x^4 - 30 x^2 + 3) / 8 has its extrema at 0 and +-sqrt(3/7): -20, -6, 20, 46 and 60 degC."""
+    assert nodes(5) == pytest.approx([-1, -np.sqrt(3 / 7), 0, np.sqrt(3 / 7), 1], abs=1e-12)
+    plan = il.plan_thermal("-20,60", time="6 h", turn_on_scatter=0.0)
+    assert sorted({round(soak.temperature, 1) for soak in plan.soaks}) == [-20.0, -6.2, 20.0, 46.2, 60.0]
+
+
+def test_soaks_beyond_the_temperatures_come_back_to_inner_ones_from_the_other_side():
+    assert way(5, 6) == [0, 1, 2, 3, 4, 2]
+    assert way(5, 8) == [0, 1, 2, 3, 4, 3, 2, 1]
+    assert way(5, 12) == [0, 1, 2, 3, 4, 3, 2, 1, 0, 1, 2, 3]
+    soaks = il.plan_thermal(time="8 h").soaks
+    assert [soak.warming for soak in soaks] == [False, True, True, True, True, False, False, False]
+
+
+def worst(temperatures, sets=None, tau=0.0):
+    design = Design(LAWS, np.asarray(temperatures), tau)
+    found = (
+        [design.covariance(sets)]
+        if sets
+        else [exchange(design, sphere_candidates(), [8] * len(temperatures), seed)[1] for seed in (1, 2, 3, 4)]
+    )
+    return min(design.deviations(each).max() for each in found)
+
+
+def test_exchange_does_what_was_found_for_it():
+    """5 temperatures, 8 attitudes: 0.98 of an attitude's noise at worst, evenly spaced 1.03, spirals 1.08 to 1.33."""
+    at = LAWS.middle + LAWS.half * nodes(5)
+    assert worst(at) == pytest.approx(0.98, abs=0.015)
+    assert worst(np.linspace(-20, 60, 5)) == pytest.approx(1.03, abs=0.015)
+    rng = np.random.default_rng(1)
+    spirals = [worst(at, [reference.directions(rng, 8) for _ in at]) for _ in range(8)]
+    assert min(spirals) > 1.05
+    assert 1.12 < np.mean(spirals) < 1.3
+
+
+def test_recordings_count_more_than_attitudes_where_biases_scatter():
+    """tau 0.1 mg, 60 ug: 5x60 is worth 100 ug at its worst, 9 temperatures with 8 each 91 to 93."""
+    at, tau = LAWS.middle + LAWS.half * nodes(5), 100 / 60
+    rng = np.random.default_rng(1)
+    assert 60 * worst(at, [reference.directions(rng, 60) for _ in at], tau) == pytest.approx(100, abs=2)
+    assert 60 * worst(LAWS.middle + LAWS.half * nodes(9), tau=tau) == pytest.approx(92, abs=2)
+
+
+@pytest.mark.parametrize("tau", [pytest.param(0.0, marks=pytest.mark.slow), 1e-4])
+def test_the_stated_deviation_is_that_of_simulated_tests(tau):
+    """Within 5 %, over 100 units measured by the plan, in the mean over temperature and at its worst."""
+    plan = il.plan_thermal("-20,60", time="5 h", soak="52 min", noise="60 ug", turn_on_scatter=tau * 9.80665)
+    at, squares = plan.temperature[::5], []
+    place = np.repeat([soak.temperature for soak in plan.soaks], [len(soak.directions) for soak in plan.soaks])
+    number = np.repeat(np.arange(len(plan.soaks)), [len(soak.directions) for soak in plan.soaks])
+    up = np.vstack([soak.directions for soak in plan.soaks])
+    for trial in range(100):
+        rng = np.random.default_rng([3, trial])
+        triad = reference.Triad(rng)
+        offset = tau * G * rng.standard_normal((len(plan.soaks), 3))
+        means = [triad.output(G * u, t, offset[k]) for u, t, k in zip(up, place, number, strict=True)]
+        n = len(up)
+        problem = Problem(
+            reading=(np.array(means) + 60e-6 * G * rng.standard_normal((n, 3))) / G,
+            covariance=np.tile(np.eye(3) * 60e-6**2, (n, 1, 1)), temperature=place, rate=np.zeros(n), step=np.zeros(n),
+            shared=np.ones(n, dtype=bool), recording=number, group=np.full(n, -1), tilt=2e-4, zero=np.zeros(3),
+        )  # fmt: skip
+        found = LAWS.design(at) @ solve(problem, LAWS, tau=tau).coefficients
+        for row, t in zip(found, at, strict=True):
+            force = reference.directions(rng, 1)[0]
+            seen = triad.output(G * force, t) / G
+            x = seen[0] / row[3] - row[0]
+            y = seen[1] / row[4] - row[1] - row[6] * x
+            z = seen[2] / row[5] - row[2] - row[7] * x - row[8] * y
+            squares.append(((np.array([x, y, z]) - force) ** 2).mean())
+    found = np.sqrt(np.array(squares).reshape(100, -1).mean(axis=0)) * 9.80665
+    stated = plan.deviation[::5]
+    assert np.sqrt((found**2).mean() / (stated**2).mean()) == pytest.approx(1, abs=0.05)
+
+
+def test_a_plan_goes_all_the_way(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["thermal", "plan", "--time", "6 h", "-o", "plan.csv", "--report", "plan.html"]
+    assert main(arguments, project=False) == 0
+    said = capsys.readouterr().out
+    assert "corrected force at -20 degC" in said
+    assert "reached by" in said
+    assert main(["thermal", "plan", "--time", "6 h", "--json"], project=False) == 0
+    made = json.loads(capsys.readouterr().out)
+    table = il.read("plan.csv")
+    assert len(table) == sum(len(soak["up"]) for soak in made["soaks"])
+    assert table.triad("up") == pytest.approx(np.vstack([soak["up"] for soak in made["soaks"]]), abs=1e-6)
+    page = (tmp_path / "plan.html").read_text(encoding="utf-8")
+    assert page.count("<h3>") == len(made["soaks"])
+    assert page.count("<svg") == len(table)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--time", "2 h"], "--time 120 min: allows 2 soaks of 45 min"),
+        (["--time", "-2 h"], "expected more than 0 s"),
+        (["--attitude", "0"], "--attitude 0 s: expected more than 0 s"),
+        (["--temperatures=60,-20"], "--temperatures '60,-20': expected the lowest and the highest"),
+        (["--temperatures=20,25"], "10 K or more apart"),
+        (["--temperatures=253,333"], "-100 to 150 degC"),
+        (["--temperatures=cold,warm"], "--temperatures 'cold,warm': expected numbers"),
+        (["--temperatures=0,20"], "would lie within 5 K of each other"),
+        (["--degrees", "auto"], "--degrees 'auto': a plan needs degrees"),
+        (["--degrees", "3,2"], "expected auto, or the degrees"),
+        (["--noise", "0"], "expected more than 0"),
+        (["--noise", "2 m"], "--noise '2 m': expected a number, or one with a unit of acceleration"),
+        (["--turn-on-scatter", "-1 mg"], "--turn-on-scatter '-1 mg': expected 0 or more"),
+        (["--from", "head:90"], "cannot separate the coefficients"),
+        (["-o", "plan.html"], "expected a name that ends in .csv"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_in_one_line(options, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["thermal", "plan", *options], project=False) == 2
+    refused = capsys.readouterr().err
+    assert said in refused
+    assert refused.count("\n") == 1
+    assert not list(tmp_path.iterdir())
