@@ -156,6 +156,36 @@ unsigned il_thermal_apply(const il_thermal *settings, il_thermal_state *state, i
 unsigned il_thermal_block(const il_thermal *settings, size_t n, const il_real *temperature,
                           const il_real *const output[3], size_t stride, il_real *const force[3], size_t force_stride);
 
+/* ---- gyroscope triad over temperature: M_i = S_i(T) (s_i + b_i(T) + (G f)_i), w = T^-1 s -------------------------- */
+
+#define IL_THERMAL_GYRO_LAWS 6
+
+typedef struct {
+    int32_t has_sensitivity;    /* 0: G is zero and no specific force is needed */
+    int32_t pieces, terms;      /* as in il_thermal */
+    il_real turn[3][3];         /* T^-1, 1 */
+    il_real sensitivity[3][3];  /* G, (rad/s)/(m/s^2) */
+    const il_real *knot;        /* [pieces + 1], as in il_thermal */
+    const il_real *coefficient; /* [piece][law][term]; the laws are b of x, y, z, rad/s; S of x, y, z, output per rad/s */
+} il_thermal_gyro;
+
+typedef struct {
+    int32_t known;       /* 0: no temperature yet */
+    unsigned flags;      /* of that temperature */
+    il_real temperature; /* the last one, degC */
+    il_gyro at;          /* the triad there */
+} il_thermal_gyro_state;
+
+/* As il_thermal_at, il_thermal_start, il_thermal_apply and il_thermal_block, from outputs and specific force [m/s^2] (may
+ * be NULL without G) to angular rate [rad/s]; rate may be output. */
+unsigned il_thermal_gyro_at(const il_thermal_gyro *settings, il_real temperature, il_gyro *at);
+void il_thermal_gyro_start(il_thermal_gyro_state *state);
+unsigned il_thermal_gyro_apply(const il_thermal_gyro *settings, il_thermal_gyro_state *state, il_real temperature,
+                               const il_real output[3], const il_real force[3], il_real rate[3]);
+unsigned il_thermal_gyro_block(const il_thermal_gyro *settings, size_t n, const il_real *temperature,
+                               const il_real *const output[3], const il_real *const force[3], size_t stride,
+                               il_real *const rate[3], size_t rate_stride);
+
 /* ---- flexible gyroscope: drift K(a) (ax cos theta + ay sin theta), K(a) = K0 (1 + c1 a + c2 a^2) ------------------ */
 
 typedef struct {
@@ -304,7 +334,7 @@ unsigned il_array_block(const il_array *settings, il_array_state *state, size_t 
 /* ---- all that one unit has, from a table ("blob") ----------------------------------------------------------------- */
 
 enum { IL_HAS_TUMBLE = 1, IL_HAS_GYRO = 2, IL_HAS_CENTRIFUGE = 4, IL_HAS_WARMUP = 8, IL_HAS_ARRAY = 16, IL_HAS_MAG = 32,
-       IL_HAS_THERMAL = 64 };
+       IL_HAS_THERMAL = 64, IL_HAS_THERMAL_GYRO = 128 };
 
 typedef struct {
     uint32_t has; /* IL_HAS_TUMBLE ... or-ed */
@@ -315,6 +345,7 @@ typedef struct {
     il_array array;
     il_mag mag;
     il_thermal thermal;
+    il_thermal_gyro thermal_gyro;
 } il_unit;
 
 /* Check a table and unpack it; arrays go to the caller's memory, which must outlive the unit; the bytes need not. On

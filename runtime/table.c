@@ -12,7 +12,7 @@
 
 enum { HEAD = 16, TAIL = 4, SECTION_HEAD = 8, MANY = 65536 };
 enum { CROSSED = 256 }; /* on top of a tumble's order: cross terms follow the polynomial */
-enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5, MAG = 6, THERMAL = 7 };
+enum { TEXT = 0, TUMBLE = 1, GYRO = 2, CENTRIFUGE = 3, WARMUP = 4, ARRAY = 5, MAG = 6, THERMAL = 7, THERMAL_GYRO = 8 };
 
 static const uint8_t MAGIC[8] = {0x89, 0x49, 0x4D, 0x55, 0x4C, 0x41, 0x42, 0x0A};
 
@@ -170,14 +170,30 @@ static void read_mag(cursor *c, il_mag *m) {
     if (m->order > 1) numbers(c, m->quadratic, 3);
 }
 
+/* Temperatures in rising order. */
+static const il_real *knots(cursor *c, int32_t pieces) {
+    const il_real *knot = kept(c, (size_t)pieces + 1);
+    for (int32_t i = 0; knot != NULL && i < pieces; i++) {
+        if (!(knot[i + 1] > knot[i])) fail(c, IL_TABLE_CONTENT);
+    }
+    return knot;
+}
+
 static void read_thermal(cursor *c, il_thermal *t) {
     t->pieces = count(c, 1, MANY);
     t->terms = count(c, 1, IL_THERMAL_TERMS);
-    t->knot = kept(c, (size_t)t->pieces + 1);
+    t->knot = knots(c, t->pieces);
     t->coefficient = kept(c, (size_t)t->pieces * IL_THERMAL_LAWS * (size_t)t->terms);
-    for (int32_t i = 0; t->knot != NULL && i < t->pieces; i++) {
-        if (!(t->knot[i + 1] > t->knot[i])) fail(c, IL_TABLE_CONTENT);
-    }
+}
+
+static void read_thermal_gyro(cursor *c, il_thermal_gyro *t) {
+    t->has_sensitivity = count(c, 0, 1);
+    t->pieces = count(c, 1, MANY);
+    t->terms = count(c, 1, IL_THERMAL_TERMS);
+    for (int i = 0; i < 3; i++) numbers(c, t->turn[i], 3);
+    for (int i = 0; i < 3 && t->has_sensitivity; i++) numbers(c, t->sensitivity[i], 3);
+    t->knot = knots(c, t->pieces);
+    t->coefficient = kept(c, (size_t)t->pieces * IL_THERMAL_GYRO_LAWS * (size_t)t->terms);
 }
 
 static void read_centrifuge(cursor *c, il_centrifuge *k) {
@@ -262,6 +278,7 @@ static void read_section(cursor *c, il_unit *unit, uint32_t kind) {
         case ARRAY: read_array(c, &unit->array); break;
         case MAG: read_mag(c, &unit->mag); break;
         case THERMAL: read_thermal(c, &unit->thermal); break;
+        case THERMAL_GYRO: read_thermal_gyro(c, &unit->thermal_gyro); break;
         default: c->at = c->end; break;
     }
     if (c->at != c->end) fail(c, IL_TABLE_CONTENT);
@@ -283,7 +300,7 @@ static il_status load(il_unit *unit, const uint8_t *bytes, size_t size, il_real 
         if (end - c.at < SECTION_HEAD) return IL_TABLE_CONTENT;
         uint32_t kind = u32(c.at), length = u32(c.at + 4);
         c.at += SECTION_HEAD;
-        if (kind > THERMAL || length > (size_t)(end - c.at)) return IL_TABLE_CONTENT;
+        if (kind > THERMAL_GYRO || length > (size_t)(end - c.at)) return IL_TABLE_CONTENT;
         c.end = c.at + length;
         read_section(&c, unit, kind);
     }

@@ -25,6 +25,11 @@ static inline void exercise(const il_unit *unit) {
             il_thermal_start(&state);
             (void)il_thermal_apply(&unit->thermal, &state, odd[k], in, out);
         }
+        if (unit->has & IL_HAS_THERMAL_GYRO) {
+            il_thermal_gyro_state state;
+            il_thermal_gyro_start(&state);
+            (void)il_thermal_gyro_apply(&unit->thermal_gyro, &state, odd[k], in, k % 2 ? odd : NULL, out);
+        }
         if (unit->has & IL_HAS_CENTRIFUGE) (void)il_centrifuge_apply(&unit->centrifuge, in, rate);
         if ((unit->has & IL_HAS_WARMUP) && unit->warmup.axes <= EXERCISE_AXES) {
             static il_real columns[EXERCISE_AXES][8];

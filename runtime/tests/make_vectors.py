@@ -272,7 +272,7 @@ def blobs():
     LINES.append(f"enum {{ V_BLOBS = {len(made)}, V_BLOB_WHOLE = 2, V_BLOB_TUMBLE = 3, V_BLOB_GYRO = 8 }};")
     LINES.append(
         "enum { V_BLOB_DRIFT = 10, V_BLOB_CROSS = 11, V_BLOB_WARMUP = 12, V_BLOB_ARRAY = 16, V_BLOB_MAG = 23,"
-        " V_BLOB_THERMAL = 25, V_BLOB_BENT = 27 };"
+        " V_BLOB_THERMAL = 25, V_BLOB_BENT = 27, V_BLOB_THERMAL_GYRO = 28 };"
     )
     letters = b"imulab " * 40
     emit_bytes("v_crc_bytes", letters)

@@ -61,9 +61,14 @@ def make_blobs(w):
         section(7, words(pieces, terms), counted(w, pieces + 1, -20), counted(w, 9 * pieces * terms, 30))
         for pieces, terms in ((1, 4), (3, 2))
     ]
+    rates = [
+        section(8, words(g, pieces, terms), counted(w, 9 + 9 * g, 1), counted(w, pieces + 1, -20),
+                counted(w, 6 * pieces * terms, 30))
+        for g, pieces, terms in ((0, 1, 4), (1, 3, 2))
+    ]  # fmt: skip
     bent = section(2, words(1, 3), counted(w, 24, 1), counted(w, 12, 60))  # of order 3: version 2
     made += [blob(w, s) for s in (*tumble_of, *gyro_of, drift, crossed, *warm, *sensors, *field, *laws)]
-    return [*made, blob(w, bent, version=2)]
+    return [*made, blob(w, bent, version=2), *(blob(w, s) for s in rates)]
 
 
 def write_seeds(folder):

@@ -46,7 +46,8 @@ static void crc_is_that_of_ieee_802_3(void) {
 }
 
 static void whole_tables_load(void) {
-    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32, 64, 64, 2};
+    static const uint32_t has[V_BLOBS] = {0, 0, 31, 1, 1, 1, 1, 1, 2, 2, 4, 1, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 32, 32, 64, 64, 2,
+                                           128, 128};
     for (int b = 0; b < V_BLOBS; b++) {
         uint32_t found = 99;
         CHECK(load_exactly(v_blob4[b], v_blob4_size[b], &found) == IL_OK && found == has[b]);
@@ -116,6 +117,17 @@ static void contents_arrive(void) {
             CHECK(unit.thermal.pieces == (k ? 3 : 1) && unit.thermal.terms == (k ? 2 : 4));
             counted(unit.thermal.knot, unit.thermal.pieces + 1, REAL(-20), 0);
             counted(unit.thermal.coefficient, 9 * unit.thermal.pieces * unit.thermal.terms, REAL(30), 0);
+        }
+        for (int g = 0; g < 2; g++) {
+            const int b = V_BLOB_THERMAL_GYRO + g;
+            CHECK(il_table_load(&unit, blobs[b], sizes[b], memory, LENGTH(memory)) == IL_OK);
+            const il_thermal_gyro *t = &unit.thermal_gyro;
+            CHECK(t->has_sensitivity == g && t->pieces == (g ? 3 : 1) && t->terms == (g ? 2 : 4));
+            counted(&t->turn[0][0], 9, REAL(1), 0);
+            if (g) counted(&t->sensitivity[0][0], 9, REAL(1), 9);
+            else CHECK(t->sensitivity[2][2] == REAL(0));
+            counted(t->knot, t->pieces + 1, REAL(-20), 0);
+            counted(t->coefficient, 6 * t->pieces * t->terms, REAL(30), 0);
         }
         CHECK(il_table_load(&unit, blobs[V_BLOB_DRIFT], sizes[V_BLOB_DRIFT], NULL, 0) == IL_OK);
         CHECK(unit.centrifuge.has[0] == 1 && unit.centrifuge.has[1] == 0 && unit.centrifuge.highest == REAL(2));
@@ -273,6 +285,17 @@ static void contents_that_cannot_be_are_refused(void) {
         EXPECT(b, BODY + 2, 0x42480000u, IL_TABLE_CONTENT); /* 50 before -19.875 */
         EXPECT(b, BODY + 3, nan_bits, IL_TABLE_NOT_FINITE);
         EXPECT(b, BODY + 12, inf_bits, IL_TABLE_NOT_FINITE);
+    }
+    for (int g = 0; g < 2; g++) {
+        const int b = V_BLOB_THERMAL_GYRO + g;
+        EXPECT(b, BODY, g ? 0u : 1u, IL_TABLE_CONTENT); /* has_sensitivity */
+        EXPECT(b, BODY, 2, IL_TABLE_CONTENT);
+        EXPECT(b, BODY + 1, 0, IL_TABLE_CONTENT); /* pieces */
+        EXPECT(b, BODY + 1, 65537, IL_TABLE_CONTENT);
+        EXPECT(b, BODY + 2, 0, IL_TABLE_CONTENT); /* terms */
+        EXPECT(b, BODY + 2, IL_THERMAL_TERMS + 1, IL_TABLE_CONTENT);
+        EXPECT(b, (size_t)(BODY + 12 + 9 * g), 0x42480000u, IL_TABLE_CONTENT); /* 50 before -19.875 */
+        EXPECT(b, BODY + 14, nan_bits, IL_TABLE_NOT_FINITE);
     }
     EXPECT(V_BLOB_DRIFT, BODY, 2, IL_TABLE_CONTENT);
     EXPECT(V_BLOB_DRIFT, BODY + 1, 2, IL_TABLE_CONTENT);

@@ -201,6 +201,30 @@ static PyObject *thermal(PyObject *self, PyObject *args) {
     return result;
 }
 
+static PyObject *thermal_gyro(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *capsule, *temperature, *outputs, *forces, *rates, *result = NULL;
+    buffers b = {.count = 0};
+    il_real *in[3], *force[3], *out[3];
+    Py_ssize_t n = -1;
+    if (!PyArg_ParseTuple(args, "OOOOO", &capsule, &temperature, &outputs, &forces, &rates)) return NULL;
+    il_unit *unit = unit_of(capsule, IL_HAS_THERMAL_GYRO);
+    int given = forces != Py_None;
+    if (unit != NULL && columns_of(&b, outputs, 3, &n, 0, 0, in) &&
+        (!given || columns_of(&b, forces, 3, &n, 0, 0, force)) && columns_of(&b, rates, 3, &n, 1, 0, out)) {
+        const il_real *at = memory_of(&b, temperature, 'd', n, 0);
+        if (at != NULL) {
+            unsigned flags;
+            Py_BEGIN_ALLOW_THREADS
+            flags = il_thermal_gyro_block(&unit->thermal_gyro, (size_t)n, at, READ(in), given ? READ(force) : NULL, 1, out, 1);
+            Py_END_ALLOW_THREADS
+            result = PyLong_FromUnsignedLong(flags);
+        }
+    }
+    release(&b);
+    return result;
+}
+
 static PyObject *centrifuge(PyObject *self, PyObject *args) {
     (void)self;
     PyObject *capsule, *forces, *rates, *result = NULL;
@@ -310,6 +334,7 @@ MODULE(_runtime, "The C core of imulab.",
        {"gyro", gyro, METH_VARARGS, "gyro(unit, outputs, forces or None, rates): flags."},
        {"mag", mag, METH_VARARGS, "mag(unit, outputs, fields): flags."},
        {"thermal", thermal, METH_VARARGS, "thermal(unit, temperatures, outputs, forces): flags."},
+       {"thermal_gyro", thermal_gyro, METH_VARARGS, "thermal_gyro(unit, temperatures, outputs, forces or None, rates): flags."},
        {"centrifuge", centrifuge, METH_VARARGS, "centrifuge(unit, forces, rates): flags; rates are changed in place."},
        {"warmup", warmup, METH_VARARGS, "warmup(unit, temperature, tick, ticks, inputs, factors, outputs): whether the table covers it."},
        {"array_start", array_start, METH_O, "array_start(unit): the state of a stream, as a bytearray."},

@@ -65,6 +65,7 @@ _COLUMNS: dict[str, type[Part]] = {
     "gyro": _Triad,
     "mag": _Triad,
     "thermal": _Thermal,
+    "thermal_gyro": _Thermal,
     "centrifuge": _Centrifuge,
     "warmup": _Warmup,
     "array": _Array,

@@ -23,7 +23,7 @@ from imulab.records.calibration import BLOB_MAGIC, Calibration
 VERSION, WITH_POWERS = 1, 2
 """Of the format; the second where gyroscopes have powers of the rate, which older cores then refuse as newer."""
 TEXT = 0
-KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7}
+KINDS = {"tumble": 1, "gyro": 2, "centrifuge": 3, "warmup": 4, "array": 5, "mag": 6, "thermal": 7, "thermal_gyro": 8}
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,15 @@ class DeviceUnit:
         (at,) = _columns([temperature])
         return force, _runtime.thermal(self._unit, at, _columns(output), tuple(force))
 
+    def thermal_gyro(
+        self, temperature: Array, output: Sequence[Array], force: Sequence[Array] | None
+    ) -> tuple[list[Array], int]:
+        """Return the angular rate, rad/s, of outputs at temperatures, degC, under a specific force as in `gyro`."""
+        rate = [np.empty(len(output[0])) for _ in range(3)]
+        (at,) = _columns([temperature])
+        under = None if force is None else _columns(force)
+        return rate, _runtime.thermal_gyro(self._unit, at, _columns(output), under, tuple(rate))
+
     def centrifuge(self, force: Sequence[Array], rate: Sequence[Array | None]) -> tuple[list[Array | None], int]:
         """Return the rates of the x and y input axes, rad/s, less their drift under the level specific force, m/s^2."""
         out = [None if column is None else np.array(column, dtype=np.float64) for column in rate]

@@ -63,6 +63,19 @@ static void run_thermal(void) {
 }
 #endif
 
+#if UNIT_HAS_THERMAL_GYRO
+static void run_thermal_gyro(void) {
+    il_thermal_gyro_state state;
+    il_thermal_gyro_start(&state);
+    for (int k = 0; k < GOLDEN_THERMAL_GYRO; k++) {
+        il_real rate[3];
+        (void)il_thermal_gyro_apply(&unit_thermal_gyro, &state, golden_thermal_gyro_temperature[k],
+                                    golden_thermal_gyro_output[k], golden_thermal_gyro_force[k], rate);
+        for (int i = 0; i < 3; i++) compare(rate[i], golden_thermal_gyro_rate[k][i], golden_thermal_gyro_scale);
+    }
+}
+#endif
+
 #if UNIT_HAS_CENTRIFUGE
 static void run_centrifuge(void) {
     for (int k = 0; k < GOLDEN_CENTRIFUGE; k++) {
@@ -129,6 +142,9 @@ int main(void) {
 #endif
 #if UNIT_HAS_THERMAL
     run_thermal();
+#endif
+#if UNIT_HAS_THERMAL_GYRO
+    run_thermal_gyro();
 #endif
 #if UNIT_HAS_CENTRIFUGE
     run_centrifuge();
