@@ -124,6 +124,10 @@ def simulate(
     turn_on: Annotated[str, typer.Option(help="Scatter of biases between power cycles, m/s^2.")] = "0.1 mg",
     duration: Annotated[str, typer.Option(help="Of a ramp, s.")] = "30 min",
     rate: Annotated[str, typer.Option(help="Samples per second of a tumble.")] = "50 Hz",
+    gyro: Annotated[bool, typer.Option("--gyro", help="Columns of gyroscopes too.")] = False,
+    gyro_turn_on: Annotated[
+        str, typer.Option(help="Scatter of their biases between power cycles, rad/s.")
+    ] = "0.01 deg/s",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate tumbles at set points of a chamber and rest ramps of one unit, a file each, into a folder."""
@@ -131,7 +135,8 @@ def simulate(
 
     made = call(
         simulate_thermal, temperatures=temperatures, attitudes=attitudes, ramps=ramps, law=law, noise=noise,
-        turn_on=turn_on, duration=duration, rate=rate, seed=seed,
+        turn_on=turn_on, duration=duration, rate=rate, gyro=gyro, gyro_turn_on=gyro_turn_on,
+        seed=seed,
     )  # fmt: skip
     made.save(output)
     print(f"{output}: {len(made)} recordings, law {law}")

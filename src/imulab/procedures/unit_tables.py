@@ -60,6 +60,11 @@ def check_order(kinds: Sequence[str]) -> None:
             "a tumble and a thermal record together: both take off bias, scale factor and misalignment; expected the "
             "thermal record alone (thermal fit --prior takes the tumble's knowledge in)"
         )
+    if "gyro" in kinds and "thermal_gyro" in kinds:
+        raise RecordError(
+            "a gyroscope record beside a thermal one that holds gyroscopes too: both take off their biases; expected "
+            "the thermal record alone, or one fitted without --with gyro"
+        )
     if "warmup" in kinds[: list(kinds).index("thermal")]:
         raise RecordError(
             "a warm-up record before a thermal one: expected the thermal record first, since the warm-up is what is "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from imulab.errors import OptionError
 
 LAWS = ("cubic", "rough")
@@ -13,6 +15,20 @@ APART = 5.0
 """K: temperatures that lie closer count as one."""
 LEAST_SPAN = 10.0
 SETTLE = 300.0
+
+
+def further_of(given: str | Sequence[str], option: str) -> tuple[str, ...]:
+    """Return the names of further triads, of which there is one, ``gyro``.
+
+    Raises
+    ------
+    OptionError
+        There is another.
+    """
+    names = tuple(name.strip() for name in given.split(",")) if isinstance(given, str) else tuple(given)
+    if not set(names) <= {"gyro"} or len(names) > 1:
+        raise OptionError(f"{option} {','.join(names)!r}: expected gyro")
+    return names
 
 
 def degrees_of(text: str, option: str) -> str | tuple[int, int, int]:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from imulab.errors import RecordError
-from imulab.procedures.thermal.model import GROUPS
-from imulab.procedures.thermal.sections import thermal_of
+from imulab.procedures.thermal.model import AXES, GROUPS, law_names
+from imulab.procedures.thermal.sections import Model, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -28,35 +28,47 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
     if high - low < _LEAST:
         ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
         raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
-    degrees = np.max([model.degrees.each for model in models], axis=0).tolist()
+    both = all(model.gyro is not None for model in models)
+    degrees = [max(of) for of in zip(*([law[2] for law in _laws(model, both)] for model in models), strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
     nodes = [np.linspace(low, high, degree + 1) if degree else np.array([0.5 * (low + high)]) for degree in degrees]
     nodes = [np.round(places, 1) for places in nodes]
-    return _at(first, nodes), _at(second, nodes)
+    return _at(first, nodes, both), _at(second, nodes, both)
 
 
-def _at(record: Calibration, nodes: list[Array]) -> Calibration:
+def _laws(model: Model, gyroscopes: bool) -> list[tuple[str, tuple[str, ...], int]]:
+    """Return the kinds of parameters that follow the temperature, with their axes and degrees."""
+    found: list[tuple[str, tuple[str, ...], int]] = [
+        (kind, axes, degree) for (kind, axes), degree in zip(GROUPS, model.degrees.each, strict=True)
+    ]
+    if gyroscopes and model.gyro is not None:
+        found.append(("gyro_bias", AXES, model.gyro.degrees.bias))
+    return found
+
+
+def _at(record: Calibration, nodes: list[Array], gyroscopes: bool) -> Calibration:
     """Return a record with the values of its laws at the temperatures of each kind, degC, in place of coefficients."""
     sections, names = thermal_of(record), record.covariance.names
-    turn_on, freedom = sections.fit.between_recordings, record.fit.get("degrees_of_freedom")
+    fit, turn_on, freedom = sections.fit, sections.fit.between_recordings, record.fit.get("degrees_of_freedom")
+    scatters = {"bias": (turn_on.bias, turn_on.rank), "scale_factor": (turn_on.scale_factor, turn_on.rank)}
+    if fit.gyro is not None:
+        scatters["gyro_bias"] = fit.gyro.between_recordings.bias, fit.gyro.between_recordings.rank
     rows, values, labels, units = [], [], [], []
     known: dict[str, float | None] = {}
-    at = 0
-    for (kind, axes), degree, own in zip(GROUPS, sections.model.degrees.each, nodes, strict=True):
+    for (kind, axes, degree), own in zip(_laws(sections.model, gyroscopes), nodes, strict=True):
         powers = (own[:, None] - sections.model.reference_temperature.value) ** np.arange(degree + 1)
-        scatter = {"bias": turn_on.bias, "scale_factor": turn_on.scale_factor}.get(kind)
         for axis in axes:
-            used = names[at : at + degree + 1]
+            used, _ = law_names(f"{kind}_{axis}", "", degree)
             row = np.zeros((len(own), len(names)))
-            row[:, at : at + degree + 1] = powers
+            row[:, [names.index(name) for name in used]] = powers
             rows.append(row)
             values.append(powers @ np.array([record.value(name) for name in used]))
             labels += [f"{kind}_{axis} at {temperature:.1f} degC" for temperature in own]
             units += [record.parameters[used[0]].unit] * len(own)
-            at += degree + 1
         # What recordings scatter by is told by few of them, and is most of what these values are uncertain by.
-        few = scatter is not None and scatter.value > 0 and turn_on.rank > 0
-        known |= dict.fromkeys(labels[-len(axes) * len(own) :], turn_on.rank if few else freedom)
+        scatter, rank = scatters.get(kind, (None, 0))
+        few = scatter is not None and scatter.value > 0 and rank > 0
+        known |= dict.fromkeys(labels[-len(axes) * len(own) :], rank if few else freedom)
     spread = np.vstack(rows)
     matrix = spread @ record.covariance.array() @ spread.T
     parameters = {
@@ -64,5 +76,5 @@ def _at(record: Calibration, nodes: list[Array]) -> Calibration:
         for label, value, u, unit in zip(labels, np.concatenate(values), np.sqrt(np.diag(matrix)), units, strict=True)
     }
     covariance = Covariance(tuple(labels), tuple(map(tuple, matrix.tolist())))
-    fit = {**record.fit, "degrees_of_freedom": known}
-    return replace(record, parameters=parameters, covariance=covariance, fit=fit)
+    said = {**record.fit, "degrees_of_freedom": known}
+    return replace(record, parameters=parameters, covariance=covariance, fit=said)

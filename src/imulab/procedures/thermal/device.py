@@ -11,6 +11,7 @@ from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
+from imulab.procedures.thermal.gyrodevice import gyro_table_of
 from imulab.procedures.thermal.model import GROUPS, Laws
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.recording import Array
@@ -53,7 +54,7 @@ def accelerometers(record: Calibration) -> AccelerometerLaws:
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
-    """Return the table of a thermal record; errors as for `laws_of`."""
+    """Return the tables of a thermal record; errors as for `laws_of`."""
     model, laws = thermal_of(record).model, laws_of(record)
     fields = (
         Field("pieces", whole(1)),
@@ -62,13 +63,9 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
         Field("coefficient", laws[None], pointed=True),
     )
     column = str(record.options.get("temperature_column") or "temperature")
-    return (
-        DeviceTable(
-            "thermal",
-            fields,
-            {"output_unit": model.output_unit, "temperature": column, "range": list(model.range)},
-        ),
-    )
+    known = {"temperature": column, "range": list(model.range)}
+    table = DeviceTable("thermal", fields, {"output_unit": model.output_unit, **known})
+    return (table,) if model.gyro is None else (table, gyro_table_of(record, known))
 
 
 def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from imulab.procedures.procedure import Row
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
-from imulab.units import STANDARD_GRAVITY
+from imulab.units import STANDARD_GRAVITY, from_si
 
 
 def shown(name: str, unit: str) -> tuple[float, str]:
@@ -13,7 +13,11 @@ def shown(name: str, unit: str) -> tuple[float, str]:
     kelvin = unit[unit.index("/K") :] if "/K" in unit else ""
     if name.startswith("bias"):
         return (1e6 if kelvin else 1e3) / STANDARD_GRAVITY, ("µg" if kelvin else "mg") + kelvin
-    if name.startswith("misalignment"):
+    if name.startswith("gyro_bias"):
+        return from_si(1.0, "deg/h" if kelvin else "deg/s"), ("deg/h" if kelvin else "deg/s") + kelvin
+    if name.startswith("gyro_g_sensitivity"):
+        return from_si(1.0, "deg/h") * STANDARD_GRAVITY, "deg/h/g"
+    if name.startswith(("misalignment", "gyro_misalignment")):
         return (1e6 if kelvin else 1e3), ("µrad" if kelvin else "mrad") + kelvin
     return 1.0, unit
 

@@ -24,6 +24,13 @@ ENTRY = Procedure(
             triad="accel",
             remarks=deferred(f"{_HERE}.apply:remarks"),
         ),
+        Section(
+            "thermal_gyro",
+            golden=deferred(f"{_HERE}.gyrodevice:golden"),
+            apply=deferred(f"{_HERE}.apply:apply_gyro"),
+            triad="gyro",
+            remarks=deferred(f"{_HERE}.apply:gyro_remarks"),
+        ),
     ),
     laws=deferred(f"{_HERE}.device:accelerometers"),
     elsewhere="{target} takes no laws over temperature",

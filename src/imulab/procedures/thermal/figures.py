@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from imulab.procedures.thermal.engineering import rows as engineering_rows
+from imulab.procedures.thermal.gyrofigures import COLOURS, gyro_exhibits
 from imulab.procedures.thermal.model import AXES, GROUPS
 from imulab.procedures.thermal.record import predicted
 from imulab.procedures.thermal.sections import Thermal, thermal_of
@@ -16,7 +17,6 @@ from imulab.report.traces import DASHES, axis, band, rounded, scatter
 from imulab.units import STANDARD_GRAVITY
 
 _POINTS = 81
-_COLOURS = (GOOD, "#b58a1b", "#7a4f9a")
 _READ = (
     ("bias", 1e3 / STANDARD_GRAVITY, "mg"),
     ("scale factor", 1e6, "ppm"),
@@ -52,6 +52,10 @@ def exhibits(record: Calibration) -> Exhibits:
         *(_over_temperature(k, temperature, values, spread) for k in range(3)),
         _residuals(found),
     ]
+    if found.model.gyro is not None:
+        gyro_facts, gyro_items = gyro_exhibits(record, temperature)
+        facts += gyro_facts
+        items += gyro_items
     if fit.left_out_temperature:
         items.append(_predicted(found))
     if fit.degrees:
@@ -107,9 +111,9 @@ def _over_temperature(group: int, temperature: Any, values: Any, spread: Any) ->
             own, u = own / middle - 1, u / middle
         label = GROUPS[group][1][k]
         traces += [
-            band(temperature, (own - u) * factor, (own + u) * factor, _COLOURS[k], showlegend=False),
+            band(temperature, (own - u) * factor, (own + u) * factor, COLOURS[k], showlegend=False),
             scatter(rounded(temperature), rounded(own * factor), "lines", name=label,
-                    line={"color": _COLOURS[k], "dash": DASHES[k]}),
+                    line={"color": COLOURS[k], "dash": DASHES[k]}),
         ]  # fmt: skip
     return Figure(
         title=f"{name.capitalize()} over temperature",

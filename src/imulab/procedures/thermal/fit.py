@@ -15,13 +15,17 @@ from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.thermal.checks import check_holds, prepared
-from imulab.procedures.thermal.choices import degrees_of
+from imulab.procedures.thermal.choices import degrees_of, further_of
 from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose
+from imulab.procedures.thermal.gyro import fit_gyroscopes
+from imulab.procedures.thermal.gyroholds import check_gyroscopes, rates_at_rest
+from imulab.procedures.thermal.gyrorecord import with_gyroscopes
 from imulab.procedures.thermal.holds import Holds, find_holds
 from imulab.procedures.thermal.lag import drift_of, moving
-from imulab.procedures.thermal.model import GROUPS, Laws
+from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record
 from imulab.procedures.thermal.rows import Problem
+from imulab.procedures.thermal.solve import Solution
 from imulab.quantities import in_si
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -67,8 +71,10 @@ def fit_thermal(
     latitude: float | str | None = None,
     height: float | str | None = None,
     prior: Record | None = None,
+    with_: str | Sequence[str] = (),
     tilt: float | str = "0.2 mrad",
     turn_on_scatter: float | str | None = None,
+    gyro_turn_on_scatter: float | str | None = None,
     settle: float | str | None = None,
     temperature_column: str | None = None,
     **reading: Unpack[Reading],
@@ -88,10 +94,14 @@ def fit_thermal(
         As for `fit_tumble`.
     prior
         A tumble record of the unit (order 1) made at a known temperature, or its file: counts as one recording.
+    with_
+        ``"gyro"``: the gyroscopes of the same recordings in the same record; their biases, at rest, over temperature.
     tilt
         Standard deviation of the direction of a hold in which the temperature drifts, rad.
     turn_on_scatter
         Standard deviation of each bias from one power cycle to the next, m/s^2; from the recordings if not given.
+    gyro_turn_on_scatter
+        The same of the gyroscopes' biases, rad/s.
     settle
         Left out at the start of each recording, s; if not given 300 s where its head has ``power_on_temperature``.
     temperature_column
@@ -119,25 +129,22 @@ def fit_thermal(
     given: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
     if not given:
         raise OptionError("fit_thermal: data: expected one recording or more, found none")
+    further = further_of(with_, "with_")
     wanted = degrees_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
-    recordings = prepared(
-        [as_recording(one, reading, fit_thermal) for one in given],
-        temperature_column,
-        None if settle is None else in_si(settle, "settle", "time", "s"),
-    )
+    settling = None if settle is None else in_si(settle, "settle", "time", "s")
+    recordings = prepared([as_recording(one, reading, fit_thermal) for one in given], temperature_column, settling)
+    if further:
+        check_gyroscopes(recordings)
     local = local_gravity(at_place(gravity, latitude, height), recordings[0])
     holds = find_holds(recordings)
-    unit = parse_unit(holds.unit)
-    nominal = conversion_factor(unit.symbol, "m/s^2") if unit.quantity == "acceleration" else None
+    nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
     check_holds(holds, local.value, nominal)
     scale, zero = _scaling(holds, local.value, nominal)
     leaning = in_si(tilt, "tilt", "angle", "mrad")
-    scatter = None
-    if turn_on_scatter is not None:
-        scatter = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "mg") / local.value
-    for name, value in (("tilt", leaning), ("turn_on_scatter", scatter)):
-        if value is not None and not (0 <= value < np.inf and (value > 0 or name != "tilt")):
-            raise OptionError(f"{name} {value:g}: expected a size above 0")
+    if not 0 < leaning < np.inf:
+        raise OptionError(f"tilt {leaning:g}: expected a size above 0")
+    scatter = _scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
+    rates = _scatter(gyro_turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
     known = None if prior is None else _known(as_record(prior, "fit_thermal: prior"), holds, local.value, scale)
     problem = _problem(holds, scale, zero, leaning, known)
     laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
@@ -151,12 +158,35 @@ def fit_thermal(
         "degrees": wanted if isinstance(wanted, str) else list(wanted),
         "gravity": local.value,
         "tilt": leaning,
-        **({} if scatter is None else {"turn_on_scatter": scatter * local.value}),
-        **({} if temperature_column is None else {"temperature_column": temperature_column}),
-        **({} if settle is None else {"settle": in_si(settle, "settle", "time", "s")}),
+        "with": list(further) or None,
+        "turn_on_scatter": None if scatter is None else scatter * local.value,
+        "gyro_turn_on_scatter": rates,
+        "temperature_column": temperature_column,
+        "settle": settling,
     }
+    options = {key: value for key, value in options.items() if value is not None}
     record = make_record(holds, problem, solution, drift, steps, held, view, local, scale, options, name)
+    if further:
+        rest = rates_at_rest(holds, _force(problem, solution))
+        gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, rates, name)
+        record = with_gyroscopes(record, holds, gyros, local.value, name)
     return ThermalFit(record, view, tuple(steps), tuple(held))
+
+
+def _force(problem: Problem, solution: Solution) -> Array:
+    """Return the specific force in each hold, in g, shape (n, 3)."""
+    laws = solution.laws
+    return forces(laws.design(problem.temperature) @ solution.coefficients[: laws.size], problem.reading)[0]
+
+
+def _scatter(given: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:
+    """Return a stated scatter between power cycles, in units of `size`, SI."""
+    if given is None:
+        return None
+    value = in_si(given, name, quantity, unit)
+    if not 0 <= value < np.inf:
+        raise OptionError(f"{name} {value:g}: expected a size of 0 or above")
+    return value / size
 
 
 def _scaling(holds: Holds, gravity: float, nominal: float | None) -> tuple[Array, Array]:

@@ -78,7 +78,7 @@ class Holds:
 
 
 @dataclass(frozen=True)
-class _Cut:
+class Cut:
     """One stretch: its means, covariance of the mean, batches behind it, temperature and change, times, attitude."""
 
     mean: Array
@@ -99,7 +99,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
     DataError
         There is no temperature, or the noise of a table's rows is not stated.
     """
-    cuts: list[_Cut] = []
+    cuts: list[Cut] = []
     owner: list[int] = []
     steps: list[float] = []
     attitudes: list[Attitudes] = []
@@ -122,7 +122,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
                 shared[members] = False
     return Holds(
         mean=np.array([cut.mean for cut in cuts]),
-        covariance=_pooled(cuts),
+        covariance=pooled(cuts),
         temperature=np.array([cut.temperature for cut in cuts]),
         rate=np.array([cut.rate for cut in cuts]),
         step=np.array(steps),
@@ -147,7 +147,7 @@ def _at_rest(found: Attitudes) -> Attitudes:
     return replace(found, pieces=np.array([[0, len(found.recording), 0]]))
 
 
-def _of_rows(found: Attitudes, temperature: Array) -> list[_Cut]:
+def _of_rows(found: Attitudes, temperature: Array) -> list[Cut]:
     """Rows of a table of attitudes, whose noise its columns std_* state."""
     if found.covariance is None:
         raise DataError(
@@ -155,12 +155,12 @@ def _of_rows(found: Attitudes, temperature: Array) -> list[_Cut]:
             "expected them, or a recording with a column time, since attitudes at several temperatures are weighed"
         )
     return [
-        _Cut(found.mean[k], found.covariance[k], np.inf, float(temperature[k]), 0.0, float(k), float(k), k)
+        Cut(found.mean[k], found.covariance[k], np.inf, float(temperature[k]), 0.0, float(k), float(k), k)
         for k in range(len(found))
     ]
 
 
-def _of_time(found: Attitudes, temperature: Array) -> list[_Cut]:
+def _of_time(found: Attitudes, temperature: Array) -> list[Cut]:
     recording, time = found.recording, found.recording.time
     assert time is not None
     assert found.pieces is not None
@@ -170,11 +170,12 @@ def _of_time(found: Attitudes, temperature: Array) -> list[_Cut]:
         drift = abs(np.polyfit(time[first:last], temperature[first:last], 1)[0]) * (time[last - 1] - time[first])
         count = int(max(1, min(np.ceil(drift / _CUT), (last - first) // _FEWEST)))
         edges = np.linspace(first, last, count + 1).astype(np.int64)
-        cuts += [_cut(outputs, temperature, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
+        cuts += [averaged(outputs, temperature, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
     return cuts
 
 
-def _cut(outputs: Array, temperature: Array, time: Array, first: int, last: int, attitude: int) -> _Cut:
+def averaged(outputs: Array, temperature: Array, time: Array, first: int, last: int, attitude: int) -> Cut:
+    """Return the means of outputs (n, 3) from sample `first` to before `last`, and how well they are known."""
     batches = max(3, min(_BATCHES, (last - first) // 4))
     edges = np.linspace(first, last, batches + 1).astype(np.int64)[:-1]
     counts = np.diff(np.append(edges, last))[:, None]
@@ -185,13 +186,13 @@ def _cut(outputs: Array, temperature: Array, time: Array, first: int, last: int,
     freedom = max(batches - functions.shape[1], 1)
     middle = time[first:last]
     rate = float(np.polyfit(middle - middle.mean(), temperature[first:last], 1)[0])
-    return _Cut(
+    return Cut(
         outputs[first:last].mean(axis=0), left.T @ left / freedom / batches, float(freedom),
         float(temperature[first:last].mean()), rate, float(middle[0]), float(middle[-1]), int(attitude),
     )  # fmt: skip
 
 
-def _pooled(cuts: Sequence[_Cut]) -> Array:
+def pooled(cuts: Sequence[Cut]) -> Array:
     """Covariance of each mean, shrunk towards what all holds have for their length: few batches are poor weights."""
     covariance = np.array([cut.covariance for cut in cuts])
     freedom = np.array([cut.freedom for cut in cuts])

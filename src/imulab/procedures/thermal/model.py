@@ -113,6 +113,12 @@ class Laws:
         ]
 
 
+def law_names(name: str, unit: str, degree: int) -> tuple[list[str], list[str]]:
+    """Return the names and units of the coefficients of one law: ``NAME`` and ``NAME_t1`` (per K) ..."""
+    names = [name, *(f"{name}_t{power}" for power in range(1, degree + 1))]
+    return names, [unit, *(f"{unit}/K" + (f"^{power}" if power > 1 else "") for power in range(1, degree + 1))]
+
+
 def forces(parameters: Array, reading: Array) -> tuple[Array, Array]:
     """Return the specific force and its derivatives by the parameters.
 

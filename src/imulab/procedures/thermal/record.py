@@ -12,7 +12,7 @@ from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
-from imulab.procedures.thermal.model import GROUPS
+from imulab.procedures.thermal.model import GROUPS, law_names
 from imulab.procedures.thermal.rows import Problem
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Solution
@@ -45,7 +45,7 @@ def make_record(
     names, units = laws.names(), laws.units(holds.unit)
     freedom = [solution.degrees_of_freedom(row) for row in laws.to_powers()]
     parameters = {
-        key: Parameter(float(value), float(u), unit, interval_95=_interval(float(value), float(u), nu))
+        key: Parameter(float(value), float(u), unit, interval_95=interval_of(float(value), float(u), nu))
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(matrix)), units, freedom, strict=True)
     }
     residual, uncertainty = _residuals(problem, solution)
@@ -128,7 +128,7 @@ def _data(holds: Holds, residual: Array, uncertainty: Array) -> dict[str, Any]:
     }
 
 
-def _interval(value: float, uncertainty: float, freedom: float) -> tuple[float, float] | None:
+def interval_of(value: float, uncertainty: float, freedom: float) -> tuple[float, float] | None:
     """Return the interval that holds a value with 95 % by Student's t; None where a normal distribution serves."""
     if not np.isfinite(freedom):
         return None
@@ -207,17 +207,21 @@ def _findings(
     return found
 
 
+def law_at(record: Calibration, name: str, degree: int, offset: Array) -> tuple[Array, Array]:
+    """Return a law and its standard uncertainty, SI, at offsets from T0, K, shapes (n,)."""
+    names, _ = law_names(name, "", degree)
+    powers = offset[:, None] ** np.arange(degree + 1)
+    values: Array = powers @ np.array([record.value(each) for each in names])
+    return values, np.sqrt(np.einsum("ni,ij,nj->n", powers, record.covariance.block(names), powers))
+
+
 def predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the nine parameters over temperature and their standard uncertainties, SI, shapes (9, n)."""
     low, high = record.model["range"]
     offset = np.clip(temperature, low, high) - float(record.model["reference_temperature"]["value"])
-    values, spread, at = [], [], 0
-    names = record.covariance.names
-    matrix = record.covariance.array()
-    for degree in np.repeat(thermal_of(record).model.degrees.each, 3).tolist():
-        powers = offset[:, None] ** np.arange(degree + 1)
-        own = slice(at, at + degree + 1)
-        values.append(powers @ np.array([record.value(name) for name in names[own]]))
-        spread.append(np.sqrt(np.einsum("ni,ij,nj->n", powers, matrix[own, own], powers)))
-        at += degree + 1
-    return np.array(values), np.array(spread)
+    found = [
+        law_at(record, f"{kind}_{axis}", degree, offset)
+        for (kind, axes), degree in zip(GROUPS, thermal_of(record).model.degrees.each, strict=True)
+        for axis in axes
+    ]
+    return np.array([values for values, _ in found]), np.array([spread for _, spread in found])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from imulab.errors import RecordError
 from imulab.records.calibration import Calibration
@@ -10,6 +10,7 @@ from imulab.records.sections import Length, Part, Positive, Quantity, Size, part
 
 T = TypeVar("T")
 PerHold = Annotated[list[T], "holds"]
+PerGyroHold = Annotated[list[T], "holds of gyroscopes"]
 Three = Annotated[list[T], 3]
 
 
@@ -33,6 +34,22 @@ class Kinds(Part):
         return self.bias, self.scale_factor, self.misalignment
 
 
+class GyroDegrees(Part):
+    """``model.gyro.degrees``."""
+
+    bias: int
+    scale_factor: int
+
+
+class GyroModel(Part):
+    """``model.gyro``: the unit of the gyroscopes' outputs, the degrees of their laws, and what else was fitted."""
+
+    output_unit: str
+    degrees: GyroDegrees
+    g_sensitivity: bool
+    scale: Literal["nominal", "turns"]
+
+
 class Model(Part):
     """``model``; the range of temperature in degC."""
 
@@ -42,6 +59,7 @@ class Model(Part):
     reference_temperature: Quantity
     gravity: Gravity
     output_unit: str
+    gyro: GyroModel | None = None
 
 
 class LeftOut(Part):
@@ -78,6 +96,25 @@ class Tested(Quantity):
     fitted: bool
 
 
+class GyroTurnOn(Part):
+    """``fit.gyro.between_recordings``: what biases move by from one power cycle to the next."""
+
+    bias: Length
+    rank: int
+    from_: str
+
+
+class GyroFit(Part):
+    """``fit.gyro``; rms in rad/s, as those of temperatures left out."""
+
+    holds: int
+    rms: Length
+    excess: Length
+    between_recordings: GyroTurnOn
+    left_out_temperature: list[LeftOut]
+    g_sensitivity_probability: float | None = None
+
+
 class Fit(Part):
     """``fit``."""
 
@@ -93,6 +130,7 @@ class Fit(Part):
     loop_x: Tested | None = None
     loop_y: Tested | None = None
     loop_z: Tested | None = None
+    gyro: GyroFit | None = None
 
 
 class Held(Part):
@@ -105,10 +143,20 @@ class Held(Part):
     standard_uncertainty: PerHold[float]
 
 
+class GyroHeld(Part):
+    """``data.gyro``: of each hold its temperature, degC, its change, K/s, and what is left of the rates, rad/s."""
+
+    recording: PerGyroHold[str]
+    temperature: PerGyroHold[float]
+    rate: PerGyroHold[float]
+    residual: PerGyroHold[Three[float]]
+
+
 class Data(Part):
     """``data``."""
 
     holds: Held
+    gyro: GyroHeld | None = None
 
 
 class Thermal(Part):

@@ -27,6 +27,9 @@ _SIZES = {
     "misalignment": (0.02, 1e-5, 0.0, 0.0),
 }
 _ROUGH = 3e-4  # g; bends of some 25 K on top of the cubic
+_GYRO_BIAS = (1.0, 0.03, 2e-4, 2e-6)  # deg/s, deg/s/K, ...
+_GYRO_SCALE, _GYRO_G, _GYRO_NOISE = (0.02, 1e-4), 0.02, np.radians(0.05)  # 1 and 1/K; deg/s/g; rad/s
+_SOON = 1e-3  # s
 _AXES = {"bias": "xyz", "scale_factor": "xyz", "misalignment": ("yx", "zx", "zy")}
 _HOLD, _MOVE, _THERMOMETER = 6.0, 2.0, 0.03  # s, s, K
 
@@ -41,6 +44,8 @@ def simulate_thermal(
     turn_on: float | str = "0.1 mg",
     duration: float | str = "30 min",
     rate: float | str = "50 Hz",
+    gyro: bool = False,
+    gyro_turn_on: float | str = "0.01 deg/s",
     seed: int | str = 1,
 ) -> ThermalRecordings:
     """Simulate the recordings of a unit over temperature, a power cycle each.
@@ -61,6 +66,10 @@ def simulate_thermal(
         Standard deviation of each bias from one power cycle to the next, m/s^2.
     duration, rate
         Of each ramp, s, and samples per second of a tumble, Hz (a tenth of it in ramps).
+    gyro
+        Whether the recordings have columns of gyroscopes too.
+    gyro_turn_on
+        Standard deviation of each of their biases from one power cycle to the next, rad/s.
     seed
         Of the random numbers.
 
@@ -81,6 +90,7 @@ def simulate_thermal(
         law,
         in_si(noise, "noise", "acceleration", "m/s^2"), in_si(turn_on, "turn_on", "acceleration", "m/s^2"),
         in_si(duration, "duration", "time", "s"), in_si(rate, "rate", "frequency", "Hz"), whole(seed, "seed"),
+        gyro, in_si(gyro_turn_on, "gyro_turn_on", "rate", "rad/s"),
     )  # fmt: skip
     if law not in LAWS:
         raise OptionError(f"law {law!r}: expected one of {listed(LAWS, law)}")
@@ -90,6 +100,7 @@ def simulate_thermal(
         ("ramps", made.ramps, 0, 20),
         ("noise", made.noise, 0.0, 10.0),
         ("turn_on", made.turn_on, 0.0, 10.0),
+        ("gyro_turn_on", made.gyro_turn_on, 0.0, 1.0),
         ("duration", made.duration, 60.0, 86400.0),
         ("rate", made.rate, 10.0, 1000.0),
         ("seed", made.seed, 0, 2**31),
@@ -109,7 +120,7 @@ class ThermalRecordings(Shown, Sequence[Recording]):
     ----------
     temperatures
         Set points, degC.
-    attitudes, ramps, law, noise, turn_on, duration, rate, seed
+    attitudes, ramps, law, noise, turn_on, duration, rate, seed, gyro, gyro_turn_on
         As for `simulate_thermal`, in SI.
     """
 
@@ -122,6 +133,8 @@ class ThermalRecordings(Shown, Sequence[Recording]):
     duration: float
     rate: float
     seed: int
+    gyro: bool
+    gyro_turn_on: float
 
     def __len__(self) -> int:
         return (len(self.temperatures) if self.attitudes else 0) + self.ramps
@@ -179,7 +192,7 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
     rng = np.random.default_rng([made.seed, 1, index])
     tumbles = len(made) - made.ramps
     if index < tumbles:
-        time, force = _tumble(made, rng)
+        time, force, turning = _tumble(made, rng)
         temperature = made.temperatures[index] + 0.3 * np.sin(time / 300.0 + rng.uniform(0, 6.28))
         name = f"tumble_{made.temperatures[index]:g}.csv"
     else:
@@ -189,6 +202,7 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
         temperature = low + (high - low) * (1 - np.exp(-2 * time / time[-1])) / (1 - np.exp(-2))
         up = np.eye(3)[number % 3] * (1 if number % 6 < 3 else -1) + 0.05 * rng.standard_normal(3)
         force = np.tile(STANDARD_GRAVITY * up / np.linalg.norm(up), (len(time), 1))
+        turning = np.zeros_like(force)
         name = f"ramp_{number + 1}.csv"
     sensor = thermal_truth(temperature, made.law, made.seed)
     sensed = [
@@ -202,13 +216,55 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
         seen = sensed[k] + sensor[f"bias_{axis}"] + offset[k] + made.noise * rng.standard_normal(len(time))
         columns[f"accel_{axis}"] = sensor[f"scale_factor_{axis}"] * seen
     columns["temperature"] = np.round(temperature + _THERMOMETER * rng.standard_normal(len(time)), 2)
-    units = {"time": "s", **{f"accel_{a}": "m/s^2" for a in "xyz"}, "temperature": "degC"}
+    if made.gyro:
+        columns |= _gyroscopes(made, index, temperature, turning, force)
+    units = {
+        "time": "s",
+        **{f"gyro_{a}": "deg/s" for a in "xyz" if made.gyro},
+        **{f"accel_{a}": "m/s^2" for a in "xyz"},
+        "temperature": "degC",
+    }
     metadata = {"serial": f"SIM-{made.seed:04d}", "gravity": f"{STANDARD_GRAVITY!r} m/s^2"}
     return Recording(columns=columns, units=units, metadata=metadata, name=name)
 
 
-def _tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return time, and the specific force: attitudes spread over the sphere, with a swayed turn between two."""
+def _gyroscopes(
+    made: ThermalRecordings, index: int, temperature: Array, turning: Array, force: Array
+) -> dict[str, Array]:
+    """Return the gyroscopes' outputs, deg/s, at the body's rates, rad/s, and specific forces, m/s^2, (n, 3) each."""
+    rng = np.random.default_rng([made.seed, 2, index])
+    truth = thermal_gyro_truth(temperature, made.seed)
+    offset = made.gyro_turn_on * rng.standard_normal(3)
+    found = {}
+    for k, axis in enumerate("xyz"):
+        sensed = turning[:, k] + sum(
+            truth[f"gyro_misalignment_{axis}{b}"] * turning[:, j] for j, b in enumerate("xyz") if j != k
+        )
+        felt = sum(truth[f"gyro_g_sensitivity_{axis}{b}"] * force[:, j] for j, b in enumerate("xyz"))
+        noise = _GYRO_NOISE * rng.standard_normal(len(temperature))
+        output = truth[f"gyro_scale_factor_{axis}"] * (sensed + truth[f"gyro_bias_{axis}"] + offset[k] + felt + noise)
+        found[f"gyro_{axis}"] = np.degrees(output)
+    return found
+
+
+def thermal_gyro_truth(temperature: Array, seed: int = 1) -> dict[str, Array]:
+    """Return the true parameters of the simulated gyroscopes, SI, by a record's names; scale factors as if in rad/s."""
+    rng = np.random.default_rng([seed, 3])
+    t, found = temperature - _ZERO, {}
+    for axis in "xyz":
+        b, s = rng.standard_normal(4) * _GYRO_BIAS, rng.standard_normal(2) * _GYRO_SCALE
+        found[f"gyro_bias_{axis}"] = np.radians(b[0] + b[1] * t + b[2] * t**2 + b[3] * t**3)
+        found[f"gyro_scale_factor_{axis}"] = 1 + s[0] + s[1] * t
+        for other in "xyz":
+            sensitivity = np.radians(_GYRO_G) / STANDARD_GRAVITY * rng.standard_normal()
+            found[f"gyro_g_sensitivity_{axis}{other}"] = np.full(len(t), sensitivity)
+            if other != axis:
+                found[f"gyro_misalignment_{axis}{other}"] = np.full(len(t), 0.01 * rng.standard_normal())
+    return found
+
+
+def _tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Return time, specific force, and rate: attitudes spread over the sphere, with a swayed turn between two."""
     k = np.arange(made.attitudes) + 0.5
     polar, azimuth = np.arccos(1 - 2 * k / made.attitudes), np.pi * (1 + 5**0.5) * k
     points = np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
@@ -216,11 +272,18 @@ def _tumble(made: ThermalRecordings, rng: np.random.Generator) -> tuple[Array, A
     resting, moving = round(_HOLD * made.rate), round(_MOVE * made.rate)
     place = np.arange(made.attitudes * (resting + moving))
     number, phase = place // (resting + moving), place % (resting + moving)
-    share = np.clip((phase - resting) / moving, 0.0, 1.0)
-    share = (share**2 * (3 - 2 * share))[:, None]
     after = points[np.minimum(number + 1, made.attitudes - 1)]
-    upward = points[number] * (1 - share) + after * share
-    upward /= np.maximum(np.linalg.norm(upward, axis=1), 1e-3)[:, None]
+
+    def upward(later: float) -> Array:
+        share = np.clip((phase - resting + later * made.rate) / moving, 0.0, 1.0)
+        share = (share**2 * (3 - 2 * share))[:, None]
+        between = points[number] * (1 - share) + after * share
+        found: Array = between / np.maximum(np.linalg.norm(between, axis=1), 1e-3)[:, None]
+        return found
+
+    up = upward(0.0)
+    # The least turn that moves the upward direction so, as the body sees it: du/dt = u x w.
+    turning = np.cross((upward(_SOON) - upward(-_SOON)) / (2 * _SOON), up)
     sway = 0.5 * np.sin(2 * np.pi * 3.0 * place / made.rate)[:, None] * np.array([1.0, -0.7, 0.5])
     time = place / made.rate
-    return time, STANDARD_GRAVITY * upward + np.where((phase >= resting)[:, None], sway, 0.0)
+    return time, STANDARD_GRAVITY * up + np.where((phase >= resting)[:, None], sway, 0.0), turning

@@ -91,21 +91,28 @@ def solve(problem: Problem, laws: Laws, *, tau: float | None = None) -> Solution
             break
         before = excess, scatter.tau
         if number < _PASSES - 1:
-            excess, excess_freedom = _excess(rows, excess)
+            excess, excess_freedom = excess_of(rows, excess)
             if tau is None:
                 scatter = between(rows, excess)
         if number and np.allclose([excess, *scatter.tau**2], [before[0], *before[1] ** 2], rtol=1e-3, atol=1e-16):
             break
-    white = whitener(rows, excess, scatter.tau)
+    return concluded(laws, coefficients, rows, (excess, excess_freedom), scatter, converged=converged)
+
+
+def concluded(
+    laws: Laws, coefficients: Array, rows: Rows, excess: tuple[float, float], scatter: Scatter, *, converged: bool
+) -> Solution:
+    """Return what coefficients and rows at the end of a fit say; `excess` is a variance and its degrees of freedom."""
+    white = whitener(rows, excess[0], scatter.tau)
     jacobian, residual = white(rows.jacobian), white(rows.residual)
     inverse = np.linalg.pinv(jacobian, rcond=1e-13)
     loading = inverse @ white(rows.offsets[0])
     count = len(coefficients)
     left = residual - jacobian @ (inverse @ residual)
     return Solution(
-        laws, coefficients, (inverse @ inverse.T)[:count, :count], rows, float(np.sqrt(excess)), excess_freedom,
-        scatter,
-        (loading @ loading.T)[:count, :count], float(left @ left), len(residual) - jacobian.shape[1], converged,
+        laws, coefficients, (inverse @ inverse.T)[:count, :count], rows, float(np.sqrt(excess[0])), excess[1],
+        scatter, (loading @ loading.T)[:count, :count], float(left @ left), len(residual) - jacobian.shape[1],
+        converged,
     )  # fmt: skip
 
 
@@ -159,7 +166,7 @@ def _iterate(
     return coefficients, directions, rows, False
 
 
-def _excess(rows: Rows, excess: float) -> tuple[float, float]:
+def excess_of(rows: Rows, excess: float) -> tuple[float, float]:
     """Return the variance that magnitudes scatter with beyond their own, whatever power cycles did, and its freedom."""
     white = whitener(rows, excess, np.zeros(2))
     columns = white(np.hstack([rows.jacobian, rows.offsets[0]]))

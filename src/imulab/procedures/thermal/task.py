@@ -16,7 +16,7 @@ from imulab.procedures.options import (
     text_option,
 )
 from imulab.procedures.procedure import Files, Task
-from imulab.procedures.thermal.choices import degrees_of
+from imulab.procedures.thermal.choices import degrees_of, further_of
 
 if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
@@ -47,10 +47,14 @@ OPTIONS = (
     ),
     *GRAVITY,
     file_option("prior", "Tumble record of this unit at a known temperature: counts as one recording.", "RECORD"),
+    Option("with", "Further triads of the recordings, in one record.", further_of, shows="gyro", choices=("gyro",)),
     measure("tilt", "How far a hold tips while it warms or cools, mrad.", "angle", "mrad", "0.2 mrad"),
     measure(
         "turn_on_scatter", "What biases move by from one power cycle to the next, mg, if known.", "acceleration", "mg",
         shows="SIZE",
+    ),
+    measure(
+        "gyro_turn_on_scatter", "The same of the gyroscopes' biases, deg/s, if known.", "rate", "deg/s", shows="SIZE"
     ),
     measure("settle", "Left out at the start of a recording, s; 300 s where time is from power-on.", "time", "s",
             shows="TIME"),
@@ -58,16 +62,17 @@ OPTIONS = (
     *READING,
     ELEMENT,
 )  # fmt: skip
-_OF_THE_FIT = ("degrees", "tilt", "turn_on_scatter", "settle", "temperature_column")
+_OF_THE_FIT = ("degrees", "tilt", "turn_on_scatter", "gyro_turn_on_scatter", "settle", "temperature_column")
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
     from imulab.gravity import gravity_option
 
     values = read_options(OPTIONS, texts, label)
+    values["with"] = values["with"] or ()
     gravity = gravity_option(values["gravity"], values["latitude"], values["height"], label)
     fit = {name: values[name] for name in _OF_THE_FIT}
-    return {**values, "fit": {**fit, "gravity": gravity}, "part": part_of(values)}
+    return {**values, "fit": {**fit, "gravity": gravity, "with_": values["with"]}, "part": part_of(values)}
 
 
 TASK = Task(

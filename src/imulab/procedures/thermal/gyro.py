@@ -1,0 +1,227 @@
+"""The gyroscopes over temperature: the bias from all holds at rest, linear, with the accelerometers' nuisances.
+
+    M / S = b(T) + G f + W + offset of the power cycle,   b(T) as in `imulab.procedures.thermal.model`
+
+W is the Earth's rate, of which only the size is known: in each attitude it is taken as random, its three parts as
+independent. Errors of the temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise
+are those of `imulab.procedures.thermal.solve`. The g-sensitivity G, the same at all temperatures, is fitted where it is
+significant at 1 % (F).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imulab.errors import ObservabilityError
+from imulab.estimation.ranked import MAD_TO_SIGMA
+from imulab.procedures.thermal.choices import DEGREES
+from imulab.procedures.thermal.degrees import Degrees, LeftOut, clusters_of, left_out, tail
+from imulab.procedures.thermal.gyroholds import RatesAtRest
+from imulab.procedures.thermal.model import Laws
+from imulab.procedures.thermal.rows import Rows, whitener
+from imulab.procedures.thermal.solve import Scatter, Solution, between, concluded, excess_of
+from imulab.recording import Array
+
+EARTH = 7.292115e-5
+"""rad/s."""
+_PASSES = 4
+_SIGNIFICANT = 0.01
+_NO_WORSE = 1.0
+_FAR = 8.0
+"""Standard deviations beyond which a hold differs from the others of its recording by a turn."""
+_TELL = 4
+"""Holds of a recording that tell which of them differs."""
+_RANK = 1e-7
+
+
+@dataclass(frozen=True)
+class Gyroscopes:
+    """What was found: the holds, and the solution whose coefficients are those of the biases and then G, rad/s per g.
+
+    `probability` is that of so large a G if there were none, None where the attitudes do not tell it; `aside` are the
+    holds, of all, that differ from the others of their recording by a turn.
+    """
+
+    held: RatesAtRest
+    solution: Solution
+    sensitivity: bool
+    probability: float | None
+    left_out: tuple[LeftOut, ...]
+    aside: NDArray[np.int64]
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients of the biases."""
+        return 3 * (self.solution.laws.degrees[0] + 1)
+
+
+def fit_gyroscopes(
+    held: RatesAtRest, low: float, high: float, wanted: str | Degrees, tau: float | None, name: str
+) -> Gyroscopes:
+    """Fit the biases over the range of temperature, degC; `tau` is their scatter between power cycles, rad/s, if known.
+
+    Raises
+    ------
+    ObservabilityError
+        The holds are at too few temperatures.
+    """
+    cluster = clusters_of(held.temperature)
+    count = int(cluster.max(initial=0)) + 1
+    if wanted == "auto":
+        degree = min(DEGREES[0], max(count - 2, 0))
+    elif int(wanted[0]) < count:
+        degree = int(wanted[0])
+    else:
+        raise ObservabilityError(
+            f"{name}: the gyroscopes are at rest at {count} temperatures (5 K apart), too few for a bias of degree "
+            f"{wanted[0]}: record at more temperatures, or lower --degrees"
+        )
+    laws = Laws(low, high, (degree, 0, 0))
+    held, aside = _without_turns(held, laws)
+    cluster = clusters_of(held.temperature)
+    solution, sensitivity, probability = _solved(held, laws, tau)
+    while wanted == "auto" and laws.degrees[0]:
+        lower = _lower(solution, laws, cluster)
+        if lower is None:
+            break
+        laws = lower
+        solution, sensitivity, probability = _solved(held, laws, tau)
+    found = left_out(solution, np.ones(len(solution.coefficients), dtype=np.bool_), cluster)
+    places = [
+        replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
+        for e in found
+    ]
+    return Gyroscopes(held, solution, sensitivity, probability, tuple(places), aside)
+
+
+def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> tuple[Solution, bool, float | None]:
+    """Solve with the g-sensitivity where it is told and significant, else without."""
+    whole = solve(held, laws, tau, sensitivity=True)
+    probability = None
+    if whole is not None:
+        gone = np.arange(len(whole.coefficients) - 9, len(whole.coefficients))
+        probability = wald(whole, gone)
+        if probability < _SIGNIFICANT:
+            return whole, True, probability
+    plain = solve(held, laws, tau, sensitivity=False)
+    if plain is None:
+        raise ObservabilityError(f"{len(held)} holds do not determine the biases of the gyroscopes")
+    return plain, False, probability
+
+
+def wald(solution: Solution, which: NDArray[np.intp]) -> float:
+    """Return the probability of coefficients as large as these if they were zero."""
+    value = solution.coefficients[which]
+    square = float(value @ np.linalg.solve(solution.covariance[np.ix_(which, which)], value)) / len(value)
+    freedom = min(solution.degrees_of_freedom(row) for row in np.eye(len(solution.coefficients))[which])
+    return tail(square, len(value), freedom)
+
+
+def _lower(solution: Solution, laws: Laws, cluster: NDArray[np.int64]) -> Laws | None:
+    """Return laws of a degree less, or None where that step is significant or temperatures left out are told worse."""
+    degree = laws.degrees[0]
+    top = np.arange(3) * (degree + 1) + degree
+    kept = np.ones(len(solution.coefficients), dtype=np.bool_)
+    if not wald(solution, top) > _SIGNIFICANT:
+        return None
+    before = _rms(left_out(solution, kept, cluster))
+    kept[top] = False
+    after = _rms(left_out(solution, kept, cluster))
+    if before is not None and after is not None and after > _NO_WORSE * before:
+        return None
+    return replace(laws, degrees=(degree - 1, 0, 0))
+
+
+def _rms(found: list[LeftOut]) -> float | None:
+    total = sum(each.holds for each in found)
+    return float(np.sqrt(sum(each.holds * each.rms**2 for each in found) / total)) if total else None
+
+
+def solve(held: RatesAtRest, laws: Laws, tau: float | None, *, sensitivity: bool) -> Solution | None:
+    """Return the least-squares solution, None where the holds do not determine the coefficients."""
+    coefficients = np.zeros(3 * (laws.degrees[0] + 1) + 9 * sensitivity)
+    excess, freedom, scatter = 0.0, np.inf, Scatter() if tau is None else Scatter(np.array([tau, 0.0]))
+    for _ in range(_PASSES):
+        rows = rows_of(held, laws, coefficients)
+        white = whitener(rows, excess, scatter.tau)
+        columns = white(rows.jacobian)
+        size = np.linalg.norm(columns, axis=0)
+        if not size.min() > 0 or np.linalg.matrix_rank(columns / size, tol=_RANK * np.sqrt(len(size))) < len(size):
+            return None
+        step = np.linalg.lstsq(columns / size, white(rows.residual), rcond=None)[0] / size
+        coefficients = coefficients - step
+        excess, freedom = excess_of(rows, excess)
+        if tau is None:
+            scatter = between(rows, excess)
+    rows = rows_of(held, laws, coefficients)
+    return concluded(laws, coefficients, rows, (excess, freedom), scatter, converged=True)
+
+
+def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array) -> Rows:
+    """Return the rows at these coefficients, three for each hold."""
+    n, size = len(held), 3 * (laws.degrees[0] + 1)
+    jacobian = laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size)
+    slope = laws.slope(held.temperature)[:, :3, :size] @ coefficients[:size]
+    if len(coefficients) > size:
+        felt = np.einsum("nj,ik->nikj", held.force, np.eye(3)).reshape(3 * n, 9)
+        jacobian = np.hstack([jacobian, felt])
+    noise = np.zeros((n, 3, n, 3))
+    noise[range(n), :, range(n), :] = held.covariance
+    number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
+    heat = _spread(number) * (slope * held.step[:, None]).ravel()[:, None]
+    earth = EARTH / np.sqrt(3) * _by_axis(held.attitude)
+    drift = np.zeros((n, 3, 4))
+    drift[:, :, 0] = -held.rate[:, None] * slope
+    turn = np.sign(held.rate) * (1 - laws.place(held.temperature) ** 2)
+    drift[:, range(3), range(1, 4)] = turn[:, None]
+    return Rows(
+        residual=jacobian @ coefficients - held.mean.ravel(),
+        jacobian=jacobian,
+        noise=noise.reshape(3 * n, 3 * n),
+        offsets=(_by_axis(held.recording), np.zeros((3 * n, 3))),
+        errors=np.hstack([heat, earth]),
+        drift=drift.reshape(3 * n, 4),
+        owner=np.repeat(np.arange(n), 3),
+        magnitude=np.ones(3 * n, dtype=np.bool_),
+    )
+
+
+def _one_hot(number: NDArray[np.int64]) -> Array:
+    which, index = np.unique(number, return_inverse=True)
+    found = np.zeros((len(number), len(which)))
+    found[np.arange(len(number)), index] = 1.0
+    return found
+
+
+def _by_axis(number: NDArray[np.int64]) -> Array:
+    """Return a column for each axis of each number, shape (3 n, 3 k)."""
+    found: Array = np.asarray(np.kron(_one_hot(number), np.eye(3)), dtype=np.float64)
+    return found
+
+
+def _spread(number: NDArray[np.int64]) -> Array:
+    return np.repeat(_one_hot(number), 3, axis=0)
+
+
+def _without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
+    """Leave out holds whose outputs lie far from those of the others in their recording: a slow turn the whole time."""
+    n, size = len(held), 3 * (laws.degrees[0] + 1)
+    columns = np.hstack([
+        laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size),
+        _by_axis(held.recording),
+    ])  # fmt: skip
+    weight: Array = np.ones(n)
+    for _ in range(_PASSES):
+        root = np.repeat(np.sqrt(weight), 3)
+        found = np.linalg.lstsq(columns * root[:, None], held.mean.ravel() * root, rcond=1e-9)[0]
+        left = (held.mean.ravel() - columns @ found).reshape(n, 3)
+        sigma = MAD_TO_SIGMA * float(np.median(np.abs(left))) + 1e-12
+        far = np.abs(left).max(axis=1) / sigma
+        weight = 1 / (1 + (far / 2) ** 2)
+    many = np.bincount(held.recording)[held.recording] >= _TELL
+    own = np.sqrt(np.einsum("nii->ni", held.covariance)).max(axis=1)
+    out = (far > _FAR) & many & (np.abs(left).max(axis=1) > np.maximum(_FAR * own, EARTH))
+    return held.part(~out), held.index[out]

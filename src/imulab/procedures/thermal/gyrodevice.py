@@ -1,0 +1,99 @@
+"""The gyroscopes of a thermal record as the table that the C core runs, and the vectors of a unit's self-test."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from imulab.device.golden import VECTORS
+from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
+from imulab.device.unit import DeviceUnit
+from imulab.errors import RecordError
+from imulab.procedures.thermal.gyrorecord import SENSITIVITIES
+from imulab.procedures.thermal.model import AXES, law_names
+from imulab.procedures.thermal.sections import thermal_of
+from imulab.recording import Array
+from imulab.records.calibration import Calibration
+from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
+
+_PAIRS = tuple((i, j) for i in range(3) for j in range(3) if i != j)
+_NODES = np.linspace(-1.0, 1.0, 65)
+
+
+def gyro_laws_of(record: Calibration) -> Array:
+    """Return biases (rad/s) and scale factors (output per rad/s) in powers of theta, -1 to 1, shape (6, terms).
+
+    Raises
+    ------
+    RecordError
+        The record lacks a coefficient, has one in another unit, or a scale factor is 0 within the range.
+    """
+    model = thermal_of(record).model
+    gyro = model.gyro
+    assert gyro is not None
+    low, high = model.range
+    place = Polynomial([0.5 * (low + high) - model.reference_temperature.value, 0.5 * (high - low)])
+    found = np.zeros((6, max(gyro.degrees.bias, gyro.degrees.scale_factor) + 1))
+    for i, axis in enumerate(AXES):
+        for row, kind, unit, degree in (
+            (i, "bias", "rad/s", gyro.degrees.bias),
+            (3 + i, "scale_factor", f"{gyro.output_unit}/(rad/s)", gyro.degrees.scale_factor),
+        ):
+            if kind == "scale_factor" and gyro.scale == "nominal":
+                if parse_unit(gyro.output_unit).quantity != "rate":
+                    raise RecordError(
+                        f"the record has outputs of gyroscopes in {gyro.output_unit}, and no scale factor"
+                    )
+                found[row, 0] = from_si(1.0, gyro.output_unit)
+                continue
+            names, units = law_names(f"gyro_{kind}_{axis}", unit, degree)
+            values = [values_of(record, [name], per)[0] for name, per in zip(names, units, strict=True)]
+            law = Polynomial(values)(place)
+            found[row, : len(law.coef)] = law.coef
+    scale = np.polynomial.polynomial.polyval(_NODES, found[3:].T)
+    if not (np.sign(scale) == np.sign(scale[:, :1])).all() or not scale.all():
+        raise RecordError("the record has a scale factor of 0 within its range of temperature")
+    return found
+
+
+def gyro_table_of(record: Calibration, columns: Mapping[str, Any]) -> DeviceTable:
+    """Return the table of the gyroscopes; errors as for `gyro_laws_of`."""
+    model = thermal_of(record).model
+    assert model.gyro is not None
+    laws, turn = gyro_laws_of(record), np.eye(3)
+    for i, j in _PAIRS:
+        if model.gyro.scale == "turns":
+            turn[i, j] = values_of(record, [f"gyro_misalignment_{AXES[i]}{AXES[j]}"], "rad")[0]
+    fields = [
+        Field("has_sensitivity", whole(model.gyro.g_sensitivity)),
+        Field("pieces", whole(1)),
+        Field("terms", whole(laws.shape[1])),
+        Field("turn", np.linalg.inv(turn)),
+    ]
+    if model.gyro.g_sensitivity:
+        fields.append(Field("sensitivity", values_of(record, SENSITIVITIES, "rad/s/(m/s^2)").reshape(3, 3)))
+    fields += [Field("knot", np.array(model.range), pointed=True), Field("coefficient", laws[None], pointed=True)]
+    return DeviceTable("thermal_gyro", tuple(fields), {"output_unit": model.gyro.output_unit, **columns})
+
+
+def golden(table: DeviceTable, rng: np.random.Generator) -> dict[str, Any]:
+    """Return outputs within 5 rad/s under 2 g, at temperatures within the range and beyond it, and their rates."""
+    low, high = field_of(table, "knot")[[0, -1]]
+    temperature = np.repeat(rng.uniform(low - 5.0, high + 5.0, VECTORS // 2), 2)
+    rates = rng.uniform(-5, 5, (VECTORS, 3))
+    force = rng.uniform(-2 * STANDARD_GRAVITY, 2 * STANDARD_GRAVITY, (VECTORS, 3))
+    laws = field_of(table, "coefficient").reshape(-1, 6, int(field_of(table, "terms")))
+    output = (rates + laws[0, :3, 0]) * laws[0, 3:6, 0]
+    temperature[5], output[1, 1] = np.nan, np.nan
+    found, _ = DeviceUnit.of(table).thermal_gyro(temperature, list(output.T), list(force.T))
+    return {
+        "": VECTORS,
+        "scale": 5.0,
+        "temperature": temperature,
+        "output": output,
+        "force": force,
+        "rate": np.column_stack(found),
+    }

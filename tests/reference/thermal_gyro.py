@@ -1,0 +1,95 @@
+"""Recordings of six axes over temperature, written apart from the package: attitudes at rest and turns between them.
+
+Gyroscopes: M = S(T) (T w + b(T) + G f), IEEE Std 528 for the acceleration-sensitive drift.
+"""
+
+import numpy as np
+
+from reference.thermal import Triad, directions
+
+G = 9.81
+
+
+class Gyros:
+    """Bias (rad/s) and scale factor as polynomials of (T - 20 degC), misalignment and g-sensitivity constant."""
+
+    def __init__(self, rng, scale_per_kelvin=0.0, sensitivity=3.6e-5):
+        sizes = np.radians([1.0, 0.03, 2e-4, 2e-6])
+        self.bias = sizes[:, None] * rng.standard_normal((4, 3))
+        self.scale = np.array([1 + 0.02 * rng.standard_normal(3), scale_per_kelvin * rng.standard_normal(3)])
+        self.matrix = np.eye(3) + 0.01 * rng.standard_normal((3, 3)) * (1 - np.eye(3))
+        self.sensitivity = sensitivity * rng.standard_normal((3, 3))
+
+    def bias_at(self, temperature):
+        """(n, 3)."""
+        t = np.atleast_1d(temperature)[:, None] - 20.0
+        return sum(self.bias[k] * t**k for k in range(4))
+
+    def scale_at(self, temperature):
+        """(n, 3)."""
+        return self.scale[0] + self.scale[1] * (np.atleast_1d(temperature)[:, None] - 20.0)
+
+    def output(self, rate, force, temperature, offset=0.0):
+        """Outputs (n, 3) for rates and specific forces (n, 3)."""
+        sensed = rate @ self.matrix.T + force @ self.sensitivity.T
+        return self.scale_at(temperature) * (sensed + self.bias_at(temperature) + offset)
+
+    def correct(self, output, force, temperature):
+        """Rate (3,) of one output: the model inverted by hand."""
+        scaled = output / self.scale_at(temperature)[0] - self.bias_at(temperature)[0] - self.sensitivity @ force
+        return np.linalg.solve(self.matrix, scaled)
+
+
+def turned(up, axis, angle):
+    """Directions `up` (3,) turned about a unit vector by angles (n,): Rodrigues' formula."""
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    return up * c + np.cross(axis, up) * s + axis * (axis @ up) * (1 - c)
+
+
+def motion(rng, count, hold=6.0, turn=2.0, rate=50.0, earth=0.0):
+    """Time, upward direction (n, 3) and rate of the body (n, 3), rad/s: attitudes with a smooth turn between two."""
+    points = directions(rng, count)
+    points = points[rng.permutation(count)]
+    up, rates = [], []
+    resting, moving = round(hold * rate), round(turn * rate)
+    for k in range(count):
+        about = earth * rng.standard_normal(3) / np.sqrt(3)
+        up.append(np.tile(points[k], (resting, 1)))
+        rates.append(np.tile(about, (resting, 1)))
+        if k + 1 < count:
+            axis = np.cross(points[k], points[k + 1])
+            angle = np.arctan2(np.linalg.norm(axis), points[k] @ points[k + 1])
+            axis /= np.linalg.norm(axis)
+            share = np.arange(moving) / moving
+            angles = angle * (share - np.sin(2 * np.pi * share) / (2 * np.pi))
+            speed = angle / turn * (1 - np.cos(2 * np.pi * share))
+            up.append(turned(points[k], axis, angles))
+            rates.append(-speed[:, None] * axis)
+    up, rates = np.vstack(up), np.vstack(rates)
+    return np.arange(len(up)) / rate, up, rates
+
+
+def columns(triad, gyros, rng, temperature, time, up, rates, noise=0.0, accel_noise=0.0, offset=0.0, accel_offset=0.0):
+    """Columns of one recording, SI; the temperature (n,) or a number."""
+    temperature = np.broadcast_to(np.asarray(temperature, dtype=float), (len(time),))
+    places, where = np.unique(temperature, return_inverse=True)
+    b, s, m = (np.array([triad.at(t)[k] for t in places])[where] for k in range(3))
+    shaken = (np.linalg.norm(rates, axis=1) > 1e-3)[:, None] * 0.4 * np.sin(37.0 * time)[:, None]
+    f = G * up + shaken
+    sensed = np.stack([f[:, 0], m[:, 0] * f[:, 0] + f[:, 1], m[:, 1] * f[:, 0] + m[:, 2] * f[:, 1] + f[:, 2]], axis=1)
+    accel = s * (sensed + b + accel_offset) + accel_noise * rng.standard_normal(f.shape)
+    gyro = gyros.output(rates, f, temperature, offset) + noise * rng.standard_normal(f.shape)
+    found = {"time": time, "temperature": temperature}
+    found |= {f"accel_{a}": accel[:, k] for k, a in enumerate("xyz")}
+    return found | {f"gyro_{a}": gyro[:, k] for k, a in enumerate("xyz")}
+
+
+def chamber(rng, temperatures, count=8, gyros=None, turn_on=0.0, earth=0.0, noise=0.0, accel_noise=1e-5, **sizes):
+    """The triads and the columns of a recording at each temperature; `turn_on` in rad/s."""
+    triad, gyros = Triad(rng), gyros or Gyros(rng)
+    made = []
+    for temperature in temperatures:
+        time, up, rates = motion(rng, count, earth=earth, **sizes)
+        offset = turn_on * rng.standard_normal(3)
+        made.append(columns(triad, gyros, rng, temperature, time, up, rates, noise, accel_noise, offset))
+    return triad, gyros, made

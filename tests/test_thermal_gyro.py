@@ -1,0 +1,208 @@
+"""Gyroscopes over temperature: exact data, the record at work, and what a person can get wrong."""
+
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from imulab.procedures.apply import apply_blocks
+from imulab.procedures.thermal.gyrorecord import gyro_predicted
+from reference import thermal_gyro as reference
+
+G = reference.G
+AT = (-20.0013, 0.0021, 25.0034, 45.0017, 60.0042)  # of a thermometer that reads finely
+UNITS = {
+    "time": "s",
+    "temperature": "degC",
+    **{f"accel_{a}": "m/s^2" for a in "xyz"},
+    **{f"gyro_{a}": "rad/s" for a in "xyz"},
+}
+
+
+def recordings(made):
+    return [
+        il.Recording(columns=columns, units=UNITS, name=f"soak_{k + 1}.csv", metadata={})
+        for k, columns in enumerate(made)
+    ]
+
+
+@pytest.fixture(scope="module")
+def chamber():
+    """Gyroscopes without scale or alignment errors, whose g-sensitivity is all that the holds differ by."""
+    rng = np.random.default_rng(5)
+    gyros = reference.Gyros(rng)
+    gyros.scale[:], gyros.matrix = [[1.0] * 3, [0.0] * 3], np.eye(3)
+    return reference.chamber(rng, AT, gyros=gyros, noise=1e-6)
+
+
+@pytest.fixture(scope="module")
+def fitted(chamber):
+    return il.fit_thermal(recordings(chamber[2]), gravity=G, with_="gyro", gyro_turn_on_scatter=0.0).calibration
+
+
+def test_laws_and_sensitivities_of_exact_data_come_back(chamber, fitted):
+    _, gyros, _ = chamber
+    places = np.linspace(-20, 60, 9)
+    values, spread = gyro_predicted(fitted, places)
+    # A sample's noise of 1e-6 rad/s leaves some 1e-8 of a law; the Earth's rate, which is not there, is allowed for.
+    assert np.abs(values - gyros.bias_at(places).T).max() < 2e-7
+    assert spread.max() < 3 * 7.3e-5 / np.sqrt(3 * 8)
+    found = np.array([[fitted.value(f"gyro_g_sensitivity_{a}{b}") for b in "xyz"] for a in "xyz"])
+    assert np.abs(found - gyros.sensitivity).max() < 1e-7
+
+
+def test_the_accelerometers_stay_the_same(chamber, fitted):
+    alone = il.fit_thermal(recordings(chamber[2]), gravity=G).calibration
+    assert {n: p for n, p in fitted.parameters.items() if not n.startswith("gyro")} == dict(alone.parameters)
+
+
+def test_corrected_as_by_the_model_inverted_by_hand(chamber, fitted):
+    rng = np.random.default_rng(2)
+    n = 200
+    given = il.Recording(
+        columns={
+            "time": np.arange(n) / 10.0,
+            "temperature": np.repeat(rng.uniform(-40, 80, n // 4), 4),
+            **{f"accel_{a}": rng.uniform(-20, 20, n) for a in "xyz"},
+            **{f"gyro_{a}": rng.uniform(-4, 4, n) for a in "xyz"},
+        },
+        units=UNITS,
+        name="flight.csv",
+    )
+    held = np.clip(given.column("temperature"), *fitted.model["range"])
+    law = reference.Gyros(rng)
+    zero = fitted.model["reference_temperature"]["value"]
+    powers = np.array([[fitted.value(f"gyro_bias_{a}" + (f"_t{k}" if k else "")) for a in "xyz"] for k in range(4)])
+    law.bias, law.scale, law.matrix = powers, np.array([[1.0] * 3, [0.0] * 3]), np.eye(3)
+    law.sensitivity = np.array([[fitted.value(f"gyro_g_sensitivity_{a}{b}") for b in "xyz"] for a in "xyz"])
+    found = il.apply(fitted, given)
+    force = found.triad("accel")
+    expected = [law.correct(m, f, t - zero + 20.0) for m, f, t in zip(given.triad("gyro"), force, held, strict=True)]
+    assert np.abs(found.triad("gyro") - expected).max() < 1e-13
+    for size in (1, 7):
+        pieces = [slice(k, k + size) for k in range(0, n, size)]
+        blocks = [replace(given, columns={k: v[part] for k, v in given.columns.items()}) for part in pieces]
+        joined = np.vstack([block.triad("gyro") for block in apply_blocks([fitted], blocks)])
+        assert joined.tobytes() == found.triad("gyro").tobytes()
+
+
+def test_the_exported_unit_agrees_to_the_last_bit_and_the_blob_to_single_precision(chamber, fitted, tmp_path):
+    il.export("c", fitted, tmp_path / "unit")
+    run = subprocess.run(["make", "-C", str(tmp_path / "unit"), "test"], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert "pass, worst 0 of full scale" in run.stdout
+    (file,) = il.export("blob", fitted, tmp_path)
+    given = recordings(chamber[2])[1]
+    found, expected = (il.apply(one, given).triad("gyro") for one in (file, fitted))
+    assert 0 < np.abs(found - expected).max() < 1e-6
+
+
+def test_the_report_draws_the_biases_and_comparison_holds_them_against_each_other(fitted, tmp_path):
+    il.write_report(fitted, tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Bias of the gyroscopes over temperature" in page
+    changes = {change.name: change for change in il.compare_records(fitted, fitted).changes}
+    assert sum(name.startswith("gyro_bias_x at ") for name in changes) == 4
+    assert all(change.difference == 0 for change in changes.values())
+
+
+def broken(chamber, **change):
+    """The recordings with columns of the second changed: NAME=function of its values, or None to leave it out."""
+    made = [dict(columns) for columns in chamber[2]]
+    for name, how in change.items():
+        if how is None:
+            del made[1][name]
+        else:
+            made[1][name] = how(made[1][name].copy())
+    return [
+        replace(one, units={name: UNITS[name] for name in one.columns})
+        for one in (
+            il.Recording(columns=c, units={n: UNITS[n] for n in c}, name=f"soak_{k + 1}.csv")
+            for k, c in enumerate(made)
+        )
+    ]
+
+
+def nan_at(values):
+    values[1000] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"gyro_y": None}, r"^soak_2.csv: no column gyro_y; found .*: expected the gyroscopes in every recording"),
+        ({"gyro_y": lambda v: v + 57.3}, r"^soak_1.csv|^soak_2.csv"),
+        (
+            {"gyro_z": lambda v: 0 * v + 0.01},
+            r"^soak_2.csv: column gyro_z: the same output in every sample at rest: a dead",
+        ),
+        ({"gyro_x": nan_at}, r"^soak_2.csv: row 1001, column gyro_x"),
+    ],
+)
+def test_what_gyroscopes_cannot_be_is_refused_in_one_line(chamber, change, said):
+    if "gyro_y" in change and change["gyro_y"] is not None:
+        made = [{**c, "gyro_y": c["gyro_y"] + 57.3} for c in chamber[2]]
+        given, said = (
+            recordings(made),
+            r"^soak_1.csv: column gyro_y: 3\.28e\+03 deg/s at rest.*is the unit rad/s wrong\?$",
+        )
+    else:
+        given = broken(chamber, **change)
+    with pytest.raises(il.ImulabError, match=said) as error:
+        il.fit_thermal(given, gravity=G, with_="gyro")
+    assert "\n" not in str(error.value)
+
+
+def test_a_hold_that_turns_about_the_vertical_is_left_out_and_named(chamber, fitted):
+    """The accelerometers do not see it: for half of a hold, by jerks, and for the whole of another, slowly."""
+    made = [dict(columns) for columns in chamber[2]]
+    up = np.array([made[2][f"accel_{a}"] for a in "xyz"])
+    up = up / np.linalg.norm(up, axis=0)
+    speed = np.zeros(up.shape[1])
+    speed[60:240] = 0.3 * np.sin(np.arange(180) / 9.0)  # the first hold ends at sample 300
+    speed[1600:1900] = 0.02  # the fifth
+    for k, a in enumerate("xyz"):
+        made[2][f"gyro_{a}"] = made[2][f"gyro_{a}"] + speed * up[k]
+    record = il.fit_thermal(recordings(made), gravity=G, with_="gyro", gyro_turn_on_scatter=0.0).calibration
+    said = [each for each in record.warnings if "left out" in each]
+    assert len(said) == 2
+    assert all(each.startswith("gyro: soak_3.csv, ") for each in said)
+    assert record.fit["gyro"]["holds"] == fitted.fit["gyro"]["holds"] - 2
+    places = np.linspace(-20, 60, 9)
+    assert np.abs(gyro_predicted(record, places)[0] - chamber[1].bias_at(places).T).max() < 4e-7
+
+
+def test_too_few_recordings_need_the_turn_on_scatter_stated(chamber):
+    given = recordings(chamber[2][::4])
+    record = il.fit_thermal(given, gravity=G, degrees="1,0,0", with_="gyro").calibration
+    assert record.fit["gyro"]["between_recordings"]["from"] == "unknown"
+    assert any("gyro: soak_1.csv and 1 more: too few" in each for each in record.warnings)
+    stated = il.fit_thermal(given, gravity=G, degrees="1,0,0", with_="gyro", gyro_turn_on_scatter="0.01 deg/s")
+    found = stated.calibration.fit["gyro"]["between_recordings"]
+    assert found["from"] == "argument"
+    assert found["bias"]["value"] == pytest.approx(np.radians(0.01))
+    assert not any("gyro: soak_1.csv and 1 more: too few" in each for each in stated.calibration.warnings)
+
+
+def test_the_command_writes_shows_and_refuses_what_it_does_not_know(chamber, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for k, one in enumerate(recordings(chamber[2])):
+        il.write(one, f"soak_{k + 1}.csv")
+    files = [f"soak_{k + 1}.csv" for k in range(5)]
+    assert main(["thermal", "fit", *files, "--gravity", "9.81", "--with", "mag", "-o", "t.json"], project=False) == 2
+    assert "--with 'mag': expected gyro" in capsys.readouterr().err
+    assert main(["thermal", "fit", *files, "--gravity", "9.81", "--with", "gyro", "-o", "t.json"], project=False) == 0
+    assert main(["show", "t.json"], project=False) == 0
+    assert "gyro_bias_x_t1" in capsys.readouterr().out
+
+
+def test_gyroscopes_of_two_records_are_refused_together(chamber, fitted, tmp_path):
+    rate = il.fit_rate(il.simulate_rate()).calibration
+    with pytest.raises(il.ImulabError, match="a gyroscope record beside a thermal one that holds gyroscopes too"):
+        next(apply_blocks([fitted, rate], recordings(chamber[2])[:1]))
+    alone = il.fit_thermal(recordings(chamber[2]), gravity=G).calibration
+    assert il.export("blob", [alone, rate], tmp_path / "out")
