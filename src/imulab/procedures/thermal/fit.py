@@ -125,10 +125,7 @@ def fit_thermal(
     >>> fit.calibration.model["degrees"]["bias"]
     3
     """
-    single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
-    given: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
-    if not given:
-        raise OptionError("fit_thermal: data: expected one recording or more, found none")
+    given = _several(data)
     further = further_of(with_, "with_")
     wanted = degrees_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
@@ -171,6 +168,15 @@ def fit_thermal(
         gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, rates, name)
         record = with_gyroscopes(record, holds, gyros, local.value, name)
     return ThermalFit(record, view, tuple(steps), tuple(held))
+
+
+def _several(data: Data | Sequence[Data]) -> list[Any]:
+    """Return the recordings as a list."""
+    single = not isinstance(data, Sequence) or isinstance(data, str | os.PathLike)
+    given: list[Any] = [data] if single else list(data)  # type: ignore[arg-type]
+    if not given:
+        raise OptionError("fit_thermal: data: expected one recording or more, found none")
+    return given
 
 
 def _force(problem: Problem, solution: Solution) -> Array:
