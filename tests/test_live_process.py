@@ -151,20 +151,24 @@ def test_the_magnetometers_follow_too_or_are_left_out_with_the_reason(tmp_path, 
     assert ("the magnetometers are not calibrated: rec.csv: column mag_x" in process.text) == dead
 
 
-def test_the_view_has_the_gyroscopes_while_the_session_lasts(tmp_path, monkeypatch):
+def test_the_view_has_gyroscopes_and_magnetometers_while_the_session_lasts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    recording = tumble(14, gyro=True)
+    recording = tumble(18, gyro=True, field="48 uT")
     il.write_csv(recording, "given.csv")
-    session = Session(1, Gravity(9.81, "test"), (), 14)
+    session = Session(1, Gravity(9.81, "test"), (), 18)
     runner = Runner.open(lambda: open_source("replay:given.csv@40"), session, "rec.csv", None, resume=False)
     end, said = time.monotonic() + 40, []
     try:
-        while time.monotonic() < end and not said:
-            said += [event.text for event in runner.step(0.05) if event.kind == "gyro"]
+        while time.monotonic() < end and len(said) < 2:
+            said += [event.text for event in runner.step(0.05) if event.kind == "further"]
         rows = {row.name: row for row in session.view().parameters}
     finally:
         runner.close()
-    assert said == ["the gyroscopes are calibrated from the turns so far; each attitude makes them better"]
+    assert said == [
+        f"the {triad} are calibrated from the attitudes so far; each further one makes them better"
+        for triad in ("gyroscopes", "magnetometers")
+    ]
+    assert abs(rows["dip"].value - 67) < 6 * rows["dip"].standard_uncertainty
     for axis in "xyz":
         bias, truth = rows[f"gyro_bias_{axis}"], float(recording.metadata[f"truth_gyro_bias_{axis}"])
         assert abs(bias.value - np.degrees(truth)) < 6 * bias.standard_uncertainty

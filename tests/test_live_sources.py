@@ -167,9 +167,33 @@ def test_simulated_gyroscopes_stay_the_same_from_turn_to_turn():
         np.testing.assert_allclose(part.mean(axis=0), truth, atol=0.03)
 
 
+def test_the_field_of_a_simulated_unit_goes_on_from_turn_to_turn():
+    """One dip in every attitude, and a field that no hold jumps in."""
+    source = open_source("simulate:seed=4,speed=0,field=48uT,dip=60deg", follow=True)
+    up, field = [], []
+    for wanted in np.vstack([np.eye(3), -np.eye(3)]):
+        source.turn_to(wanted)
+        blocks = [source.get(0.0)[0].data for _ in range(100)]
+        up.append(wanted)
+        field.append(np.concatenate([block.triad("mag") for block in blocks]))
+    known = {key.removeprefix("truth_"): float(text) for key, text in blocks[0].metadata.items() if "truth_" in key}
+    gain = 1e-6 * np.array([known[f"mag_scale_factor_{a}"] for a in "xyz"])
+    soft = gain[:, None] * [[known.get(f"mag_misalignment_{a}{b}", 1.0) for b in "xyz"] for a in "xyz"]
+    hard = gain * [known[f"mag_bias_{a}"] for a in "xyz"]
+    for wanted, outputs in zip(up, field, strict=True):
+        m = np.linalg.solve(soft, (1e-6 * outputs - hard).T).T
+        assert abs(np.linalg.norm(m[-100:].mean(axis=0)) / 48e-6 - 1) < 0.002
+        dip = np.degrees(np.arcsin(-m[-100:].mean(axis=0) @ wanted / 48e-6))
+        assert abs(dip - 60) < 0.3
+        steps = np.linalg.norm(np.diff(outputs, axis=0), axis=1)
+        assert steps.max() < 2.5  # uT: 0.14 of noise an axis, and turns of 2 s
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("simulate:field=2T", "field 2: expected its magnitude in T"),
+        ("simulate:field=48uT,dip=95deg", "dip 1.65.*within 90 deg"),
         ("serail:/dev/ttyUSB0", r"source 'serail:.*expected one of serial:PORT"),
         ("tcp:localhost", "expected tcp:HOST:PORT"),
         ("tcp:localhost:0", "port of 1 to 65535"),

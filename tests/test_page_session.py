@@ -158,7 +158,7 @@ def test_a_simulated_unit_is_turned_with_the_mouse_and_its_gyroscopes_are_calibr
     page.get_by_role("button", name="Make the record").click()
     page.wait_for_selector(".result")
     page.wait_for_selector(".result .caption:text-matches('deg/s corrected')")
-    assert "imulab tumble gyro rec.csv --accel accel.json" in page.locator(".result pre").inner_text()
+    assert "--with gyro -o both.json" in page.locator(".result pre").inner_text()
     assert "gyro_misalignment_yx" in content(tmp_path / "both.json")["parameters"]
 
 

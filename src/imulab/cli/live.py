@@ -13,7 +13,7 @@ import typer
 from imulab.cli.fit_options import with_options
 from imulab.cli.live_page import NoBrowser, PageHost, PagePort, again, checked_page, on_page
 from imulab.cli.options import GivenFiles, OutputFile, ReportFile, check_outputs, note, whole_number
-from imulab.errors import ImulabError, OptionError
+from imulab.errors import OptionError
 from imulab.procedures.options import FLAG, LAYOUT
 from imulab.procedures.tumble.task import GRAVITY, ORDER, TASK
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 _WAIT = 0.05
 _EVERY = 0.1
-_FURTHER = {"gyro": "gyroscopes", "mag": "magnetometers"}
 
 
 @with_options((ORDER, *GRAVITY, LAYOUT))
@@ -106,27 +105,14 @@ def _make_record(save: str, fitted: dict[str, str | None], output: str | None, r
 
 def _all_triads(save: str, fitted: dict[str, str | None]) -> tuple[Calibration, list[str], list[str]]:
     """Fit a recording; a further triad that is refused is left out, so that no session is in vain. Return why, too."""
-    from imulab.columns import triad
+    from imulab.live.further import fit_triads, further_of
     from imulab.procedures.run import run_task
     from imulab.readers import read
 
     def fit(further: list[str]) -> Calibration:
         return run_task("tumble", [save], {**fitted, "with": ",".join(further) or None}, GivenFiles())
 
-    recording = read(save)
-    there = [name for name in _FURTHER if all(column in recording for column in triad(name))]
-    try:
-        return fit(there), there, []
-    except ImulabError:
-        if not there:
-            raise
-    record, further, why = fit([]), list[str](), list[str]()
-    for name in there:
-        try:
-            record, further = fit([*further, name]), [*further, name]
-        except ImulabError as error:
-            why.append(f"the {_FURTHER[name]} are not calibrated: {error}")
-    return record, further, why
+    return fit_triads(fit, further_of(read(save).columns))
 
 
 def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool, typed: bool) -> None:

@@ -60,14 +60,13 @@ def checked_page(page: bool, port: str | None, host: str | None, *, no_browser: 
 
 
 def again(save: str, texts: Mapping[str, str | None], output: str | None, record: Calibration) -> str:
-    """Return the command that makes the same record from the recording, or the two where it has gyroscopes."""
+    """Return the command that makes the same record from the recording."""
+    from imulab.live.further import FURTHER
+
     given = [word for key, text in texts.items() if text is not None for word in (f"--{key}", text)]
-    to = ["-o", output] if output else []
-    fit = ["imulab", "tumble", "fit", save, *given]
-    if "gyro_bias_x" not in record.parameters:
-        return shlex.join([*fit, *to])
-    gyro = ["imulab", "tumble", "gyro", save, "--accel", "accel.json", *to]
-    return f"{shlex.join([*fit, '-o', 'accel.json'])} && {shlex.join(gyro)}"
+    further = [name for name in FURTHER if f"{name}_bias_x" in record.parameters]
+    others = ["--with", ",".join(further)] if further else []
+    return shlex.join(["imulab", "tumble", "fit", save, *given, *others, *(["-o", output] if output else [])])
 
 
 def workbench(given: Sequence[str] = (), later: Sequence[str] = ()) -> tuple[Workbench, Files]:

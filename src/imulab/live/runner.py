@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from imulab.columns import triad
 from imulab.errors import OptionError, ReadError
 from imulab.live.formats import Stream
-from imulab.live.gyros import GyroFits
+from imulab.live.further import FurtherFits, further_of
 from imulab.live.recorder import Recorder
 from imulab.live.session import Event, Session
 from imulab.live.sources import Source
@@ -27,7 +26,7 @@ class Runner:
         self._stream = Stream(source.name, layout, polled=source.polled)
         self._last_arrival = source.now()
         self._silent = False
-        self._gyros: GyroFits | None = None
+        self._further: FurtherFits | None = None
         self._fit_due = False
         session.source = source.name
         for block in recorder.before():
@@ -83,7 +82,7 @@ class Runner:
         events += self._check_silence(bool(arrived), now)
         if self.source.lost:
             raise ReadError(f"{self.source.lost} {self.kept()}")
-        events += self._gyroscopes(events)
+        events += self._further_triads(events)
         if self.session.state == "accepted" and not self.session.enough and self.session.next is not None:
             self.source.turn_to(self.session.next)
         return events
@@ -122,8 +121,8 @@ class Runner:
 
     def close(self) -> None:
         """End the source, and write out the recording."""
-        if self._gyros is not None:
-            self._gyros.close()
+        if self._further is not None:
+            self._further.close()
         self.source.close()
         self.recorder.close()
 
@@ -132,23 +131,23 @@ class Runner:
         for block in blocks:
             lies = self.session.dropping
             placed = self.recorder.placed(block)
-            if self._gyros is None and all(name in block for name in triad("gyro")):
-                self._gyros = GyroFits(self.recorder.path, self.session.order, self.session.gravity)
+            if self._further is None and further_of(block.columns):
+                self._further = FurtherFits(self.recorder.path, self.session.order, self.session.gravity)
             events += self.session.feed(placed, self._stream.counts)
             if not lies:  # in an attitude that was dropped nothing is recorded until it is left
                 self.recorder.write(placed, now)
         return events
 
-    def _gyroscopes(self, events: list[Event]) -> list[Event]:
-        """Fit the gyroscopes after an attitude once there is a fit of the accelerometers to stand on."""
-        if self._gyros is None:
+    def _further_triads(self, events: list[Event]) -> list[Event]:
+        """Fit gyroscopes and magnetometers after an attitude once there is a fit of the accelerometers to stand on."""
+        if self._further is None:
             return []
         self._fit_due |= self.session.guide.fit is not None and any(event.kind == "accepted" for event in events)
-        if self._fit_due and self._gyros.ready:
+        if self._fit_due and self._further.ready:
             self._fit_due = False
             self.recorder.flush()
-            self._gyros.begin()
-        found = self._gyros.found()
+            self._further.begin()
+        found = self._further.found()
         return [] if found is None else self.session.know(*found)
 
     def _answer(self) -> None:

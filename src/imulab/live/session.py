@@ -13,6 +13,7 @@ import numpy as np
 from imulab.columns import triad
 from imulab.errors import DataError, OptionError
 from imulab.gravity import Gravity
+from imulab.live.further import FURTHER
 from imulab.live.guide import Attitude, Guide
 from imulab.live.holds import SHORTEST, SURE, Hold, Moment, Stillness
 from imulab.live.stamps import Counts
@@ -75,7 +76,7 @@ class Session:
     _next: Array | None = None
     _enough: str = ""
     _aside: frozenset[int] = frozenset()
-    _gyros: tuple[Known, ...] = ()
+    _further: tuple[Known, ...] = ()
     _magnetometers: bool = False
 
     def feed(self, block: Recording, counts: Counts | None = None) -> list[Event]:
@@ -156,14 +157,18 @@ class Session:
         self._plan()
         return gone.start, gone.stop
 
-    def know(self, gyros: tuple[Known, ...], why: str) -> list[Event]:
-        """Take the parameters of the gyroscopes that the recording so far gives, or why there are none."""
+    def know(self, further: tuple[Known, ...], why: Sequence[str]) -> list[Event]:
+        """Take the parameters of further triads that the recording so far gives, or why some have none."""
         self.events = []
-        if gyros and not self._gyros:
-            self._say("gyro", "the gyroscopes are calibrated from the turns so far; each attitude makes them better")
-        elif why and not gyros and self._enough:
-            self._say("gyro", why)
-        self._gyros = gyros or self._gyros
+        for name, words in FURTHER.items():
+            had, has = (any(row.name.startswith(f"{name}_") for row in rows) for rows in (self._further, further))
+            if has and not had:
+                text = f"the {words} are calibrated from the attitudes so far; each further one makes them better"
+                self._say("further", text)
+        if self._enough:
+            for each in why:
+                self._say("further", each)
+        self._further = further or self._further
         return self.events
 
     def view(self) -> View:
@@ -200,7 +205,7 @@ class Session:
             hold=self._seconds,
             attitudes=held,
             wanted=guide.wanted() if guide.kept else (guide.planned or 0),
-            parameters=known + (self._gyros if known else ()),
+            parameters=known + (self._further if known else ()),
             targets=tuple(zip((f"{t.stem} {t.text}" for t in self.targets), guide.shares(), strict=True)),
             next=None if self._next is None else tuple(self._next.tolist()),
             next_words="" if self._next is None else self._in_words(self._next),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from typing import Any
 
 import numpy as np
@@ -17,13 +19,15 @@ from imulab.units import STANDARD_GRAVITY, from_si
 _LONGEST = 60.0
 _STRUCK, _SHIFT = 0.5, 5e-3 * STANDARD_GRAVITY
 """When an attitude is knocked, s after it is put down: before it is accepted; and by how much, m/s^2."""
-_KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "gyro", "speed")
+_KEYS = ("seed", "order", "rate", "noise", "hold", "move", "unit", "gravity", "knock", "gyro", "field", "dip", "speed")
 _KINDS = {
     "rate": ("frequency", "Hz"),
     "noise": ("acceleration", "mg"),
     "hold": ("time", "s"),
     "move": ("time", "s"),
     "gravity": ("acceleration", "m/s^2"),
+    "field": ("magnetic field", "uT"),
+    "dip": ("angle", "deg"),
 }
 
 
@@ -41,6 +45,8 @@ class SimulatedUnit:
         Number of an attitude, from 1, that is knocked as soon as it is put down, or None.
     gyro
         Whether it has gyroscopes, too.
+    field, dip
+        Magnitude of the magnetic field, T, and its dip, rad, for magnetometers; None without them.
     follow
         Whether `turn_to` turns it; otherwise it turns by itself, until `turn_by_hand` does.
     """
@@ -55,9 +61,12 @@ class SimulatedUnit:
     gravity: float = STANDARD_GRAVITY
     knock: int | None = None
     gyro: bool = False
+    field: float | None = None
+    dip: float = math.radians(67.0)
     follow: bool = False
-    _held: bool = field(default=False, init=False)
-    _wanted: Array | None = field(default=None, init=False)
+    _held: bool = dataclass_field(default=False, init=False)
+    _wanted: Array | None = dataclass_field(default=None, init=False)
+    _field_here: Array | None = dataclass_field(default=None, init=False)
 
     def turn_to(self, direction: Array) -> None:
         """Turn until this direction of the body is up, where it follows."""
@@ -115,8 +124,13 @@ class SimulatedUnit:
             noise=self.noise,
             unit=self.unit,
             gyro=self.gyro,
+            field=self.field if self._field_here is None else self._field_here,
+            dip=self.dip,
             seed=self.seed if not number else 1000 * (self.seed + 1) + number,
         )
+        if self.field is not None:
+            # The next turn begins with the field where this one leaves it.
+            self._field_here = np.array([recording.si(f"truth_mag_{axis}")[-1] for axis in "xyz"])
         resting = round(_LONGEST * self.rate)
         # The first attitude, and one that lasts longer than expected, are lain in without having been turned to.
         first = 0 if not number or np.allclose(here, there) else resting
@@ -159,7 +173,7 @@ def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
     if not 0 <= speed <= 1e6:
         raise OptionError(f"simulate: speed {speed:g}; expected 0 (as fast as it goes) to 1e6")
     unit = SimulatedUnit(**given, follow=follow)
-    unit._leg(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), {}, 0)  # refuses what cannot be
+    replace(unit)._leg(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), {}, 0)  # refuses what cannot be
     return unit, speed
 
 

@@ -55,7 +55,7 @@ def simulate_tumble(
     knock: int | str | None = None,
     knock_shift: float = 5e-3 * STANDARD_GRAVITY,
     gyro: bool = True,
-    field: float | str | None = None,
+    field: float | str | Array | None = None,
     dip: float | str = "67 deg",
     temperature: float = 24.0,
     seed: int | str = 1,
@@ -92,7 +92,8 @@ def simulate_tumble(
     gyro
         Whether the recording has gyroscope columns.
     field, dip
-        Magnitude of the magnetic field, T, and its dip, rad, for columns mag_*; none without a field.
+        Magnitude of the magnetic field, T, and its dip, rad, for columns mag_* and truth_mag_*; or the field in the
+        body frame in the first attitude, shape (3,), which has a dip of its own. None without a field.
     temperature
         degC.
     seed
@@ -139,10 +140,10 @@ def simulate_tumble(
         sensor |= gyro_truth
         _put(columns, units, "gyro", rates, "deg/s")
     if field is not None:
-        magnitude, sloped = in_si(field, "field", "magnetic field", "uT"), in_si(dip, "dip", "angle", "deg")
-        outputs, mag_truth = simulate_field(path.turns, directions[0], magnitude, sloped, seed)
-        sensor |= mag_truth
-        _put(columns, units, "mag", outputs, "uT")
+        seen = simulate_field(path.turns, directions[0], field, dip, sensor, seed)
+        sensor |= seen.truth
+        _put(columns, units, "mag", seen.outputs, "uT")
+        _put(columns, units, "truth_mag", seen.field, "uT")
     columns["temperature"] = np.round(temperature + 0.05 * rng.standard_normal(len(path.time)), 2)
     units["temperature"] = "degC"
     _put(columns, units, "truth_accel", force, "m/s^2")
