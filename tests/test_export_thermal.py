@@ -47,7 +47,13 @@ def corrected_by(target, file):
         _, accel, _ = programs.px4(file)
         return accel
     values, _, _ = programs.ardupilot(file)
-    return programs.ardupilot_thermal(values)
+    return programs.ardupilot_thermal(values)[0]
+
+
+def rates_by(target, file):
+    if target == "px4":
+        return programs.px4(file)[2]
+    return programs.ardupilot_thermal(programs.ardupilot(file)[0])[1]
 
 
 def in_mg(text):
@@ -115,3 +121,39 @@ def test_a_thermal_record_goes_alone(target, chamber, tmp_path):
 def test_other_programs_take_no_laws(chamber, tmp_path):
     with pytest.raises(OptionError, match="takes no laws over temperature"):
         il.export("kalibr", chamber, tmp_path, lossy=True)
+
+
+@pytest.fixture(scope="module")
+def six_axes():
+    """A record of both triads."""
+    return il.fit_thermal(il.simulate_thermal(seed=3, turn_on=0.0, gyro=True), with_="gyro").calibration
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_offsets_of_gyroscopes_follow_the_temperature_in_the_programs_formula(target, six_axes, tmp_path):
+    told = []
+    file = il.export(target, six_axes, tmp_path, lossy=True, device_id=77, tell=told.append)[0]
+    correct = rates_by(target, file)
+    zero, (low, high) = six_axes.model["reference_temperature"]["value"], six_axes.model["range"]
+    for temperature in np.linspace(low - 10, high + 10, 41):
+        t = min(max(temperature, low), high) - zero
+        bias = [sum(six_axes.value(f"gyro_bias_{a}" + (f"_t{k}" if k else "")) * t**k for k in range(4)) for a in "xyz"]
+        # Half of what single precision resolves of the largest coefficient, 1e6 times that per K, at 45 K from 35 degC.
+        assert np.abs(correct(np.array(bias), temperature)).max() < np.radians(0.3 / 3600)
+    felt = [sum(abs(six_axes.value(f"gyro_g_sensitivity_{a}{b}")) for b in "xyz") for a in "xyz"]
+    (drift,) = re.findall(r"gyro_g_sensitivity, which changes outputs by up to (\S+) deg/s within", told[0])
+    assert float(drift) == pytest.approx(np.degrees(max(felt)) * G, rel=0.01)
+    assert re.search(r"the offset of the gyroscopes changes by up to \S+ deg/h per K", file.read_text())
+
+
+def test_px4_needs_all_of_the_gyroscopes_too(six_axes, tmp_path):
+    values, _, _ = programs.px4(il.export("px4", six_axes, tmp_path, lossy=True, device_id=77)[0])
+    assert values["TC_G0_ID"] == values["CAL_GYRO0_ID"] == 77
+    assert values["TC_G_ENABLE"] == 1
+    assert [values[f"TC_G0_X0_{axis}"] for axis in range(3)] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_accelerometers_alone_leave_the_programs_gyroscopes_as_they_are(target, chamber, tmp_path):
+    text = il.export(target, chamber, tmp_path, lossy=True)[0].read_text()
+    assert not re.search("TC_G|GYR", text)

@@ -32,36 +32,37 @@ def px4(path: Path):
         thermal = 0.0 if temperature is None else px4_thermal_offset(values, temperature)
         return (raw - thermal - off) * scale
 
-    def gyro(raw):
-        return raw - np.array([values[f"CAL_GYRO0_{a}OFF"] for a in "XYZ"], dtype=np.float64)
+    def gyro(raw, temperature=None):
+        thermal = 0.0 if temperature is None else px4_thermal_offset(values, temperature, "G")
+        return raw - thermal - np.array([values[f"CAL_GYRO0_{a}OFF"] for a in "XYZ"], dtype=np.float64)
 
     return values, accel, gyro
 
 
-def px4_thermal_offset(values, temperature):
-    """TemperatureCompensation::calc_thermal_offsets_3D, with the accelerometers' parameters of sensor 0."""
-    assert values["TC_A_ENABLE"] == 1
-    temperature = min(max(temperature, values["TC_A0_TMIN"]), values["TC_A0_TMAX"])
-    delta = float(temperature) - float(values["TC_A0_TREF"])
+def px4_thermal_offset(values, temperature, sensor="A"):
+    """TemperatureCompensation::calc_thermal_offsets_3D, with the parameters of sensor 0: A, or G for gyroscopes."""
+    assert values[f"TC_{sensor}_ENABLE"] == 1
+    temperature = min(max(temperature, values[f"TC_{sensor}0_TMIN"]), values[f"TC_{sensor}0_TMAX"])
+    delta = float(temperature) - float(values[f"TC_{sensor}0_TREF"])
     offset = []
     for axis in range(3):
         temp_var = delta
-        total = float(values[f"TC_A0_X0_{axis}"]) + float(values[f"TC_A0_X1_{axis}"]) * temp_var
+        total = float(values[f"TC_{sensor}0_X0_{axis}"]) + float(values[f"TC_{sensor}0_X1_{axis}"]) * temp_var
         temp_var *= delta
-        total += float(values[f"TC_A0_X2_{axis}"]) * temp_var
+        total += float(values[f"TC_{sensor}0_X2_{axis}"]) * temp_var
         temp_var *= delta
-        offset.append(total + float(values[f"TC_A0_X3_{axis}"]) * temp_var)
+        offset.append(total + float(values[f"TC_{sensor}0_X3_{axis}"]) * temp_var)
     return np.array(offset)
 
 
 def ardupilot_thermal(values):
-    """AP_InertialSensor_TCal::correct_accel of the first sensor: (raw, temperature, calibrated at) -> corrected."""
+    """AP_InertialSensor_TCal::correct_accel and correct_gyro of the first sensor: (raw, temperature) -> corrected."""
     assert values["INS_TCAL1_ENABLE"] == 1
 
-    def polynomial(temperature):
+    def polynomial(temperature, sensor="ACC"):
         low, high = float(values["INS_TCAL1_TMIN"]), float(values["INS_TCAL1_TMAX"])
         t = min(max(temperature, low), high) - 35.0
-        c = [np.array([float(values[f"INS_TCAL1_ACC{k}_{a}"]) for a in "XYZ"]) for k in (1, 2, 3)]
+        c = [np.array([float(values[f"INS_TCAL1_{sensor}{k}_{a}"]) for a in "XYZ"]) for k in (1, 2, 3)]
         return (c[0] + (c[1] + c[2] * t) * t) * t * 1.0e-6
 
     def corrected(raw, temperature):
@@ -69,7 +70,11 @@ def ardupilot_thermal(values):
         offset, scale = (np.array([float(values[f"INS_{what}_{a}"]) for a in "XYZ"]) for what in ("ACCOFFS", "ACCSCAL"))
         return (accel - offset) * scale
 
-    return corrected
+    def rate(raw, temperature):
+        moved = raw - polynomial(temperature, "GYR") + polynomial(float(values["INS_GYR1_CALTEMP"]), "GYR")
+        return moved - np.array([float(values[f"INS_GYROFFS_{a}"]) for a in "XYZ"])
+
+    return corrected, rate
 
 
 def ardupilot(path: Path):

@@ -29,6 +29,10 @@ _THERMAL = (
     " T in degC held within TMIN to TMAX",
     "ArduPilot's logs are corrected outputs: record the test with INS_TCAL1_ENABLE 0",
 )
+_RATES = (
+    "gyroscopes: the same with GYR, GYR1_CALTEMP and GYROFFS, rad/s, without SCAL; ArduPilot measures GYROFFS again at "
+    "each start unless INS_GYR_CAL is 0"
+)
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
@@ -41,7 +45,9 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
     """
     law = offset_law(records, "ardupilot", options, _REFERENCE)
     if law is not None:
-        return _write(folder, law.origin, _thermal_rows(law), [*_THERMAL, *law.lost])
+        return _write(
+            folder, law.origin, _thermal_rows(law), [*_THERMAL, *([] if law.rest is None else [_RATES]), *law.lost]
+        )
     held = corrections(records, "ardupilot", options, _check)
     rows: list[tuple[str, float]] = [(f"INS_ACCOFFS_{a}", v) for a, v in zip("XYZ", held.offset, strict=True)]
     rows += [(f"INS_ACCSCAL_{a}", v) for a, v in zip("XYZ", held.scale, strict=True)]
@@ -67,14 +73,24 @@ def _thermal_rows(law: OffsetLaw) -> list[tuple[str, float]]:
     offset = (caltemp - law.reference) ** np.arange(4.0) @ law.offset
     _check(offset, law.scale)
     rows = [("INS_TCAL1_ENABLE", 1.0), ("INS_TCAL1_TMIN", law.low), ("INS_TCAL1_TMAX", law.high)]
-    rows += [
-        (f"INS_TCAL1_ACC{power}_{a}", 1e6 * value)
-        for power in (1, 2, 3)
-        for a, value in zip("XYZ", law.offset[power], strict=True)
-    ]
+    rows += _coefficients("ACC", law.offset)
     rows.append(("INS_ACC1_CALTEMP", caltemp))
     rows += [(f"INS_ACCOFFS_{a}", v) for a, v in zip("XYZ", offset, strict=True)]
-    return rows + [(f"INS_ACCSCAL_{a}", v) for a, v in zip("XYZ", law.scale, strict=True)]
+    rows += [(f"INS_ACCSCAL_{a}", v) for a, v in zip("XYZ", law.scale, strict=True)]
+    if law.rest is None:
+        return rows
+    rows += _coefficients("GYR", law.rest)
+    rows.append(("INS_GYR1_CALTEMP", caltemp))
+    rest = (caltemp - law.reference) ** np.arange(4.0) @ law.rest
+    return rows + [(f"INS_GYROFFS_{a}", v) for a, v in zip("XYZ", rest, strict=True)]
+
+
+def _coefficients(sensor: str, powers: Array) -> list[tuple[str, float]]:
+    return [
+        (f"INS_TCAL1_{sensor}{power}_{a}", 1e6 * value)
+        for power in (1, 2, 3)
+        for a, value in zip("XYZ", powers[power], strict=True)
+    ]
 
 
 def _write(folder: Path, origin: Sequence[str], rows: Sequence[tuple[str, float]], said: Sequence[str]) -> list[Path]:

@@ -28,6 +28,7 @@ _THERMAL = (
     "corrected = (raw - X1 d - X2 d^2 - X3 d^3 - OFF) * SCALE, m/s^2, d = T - TREF, T in degC held within TMIN to TMAX",
     "PX4 takes a new temperature only where it has moved by more than 1 K; TC_A_ENABLE needs a reboot",
 )
+_RATES = "gyroscopes: the same with TC_G, TC_G0 and CAL_GYRO0, rad/s, without SCALE"
 
 
 def export(records: Sequence[Calibration], folder: Path, options: ExportOptions) -> list[Path]:
@@ -42,7 +43,13 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
         raise OptionError(f"px4: device id {options.device_id}; expected at most {_LARGEST_ID}")
     law = offset_law(records, "px4", options)
     if law is not None:
-        return _write(folder, law.origin, _thermal_rows(law, options), [*_THERMAL, *law.lost], options)
+        return _write(
+            folder,
+            law.origin,
+            _thermal_rows(law, options),
+            [*_THERMAL, *([] if law.rest is None else [_RATES]), *law.lost],
+            options,
+        )
     held = corrections(records, "px4", options, _check)
     device = str(options.device_id)
     values: list[tuple[str, float | str]] = [("CAL_ACC0_ID", device)]
@@ -61,13 +68,22 @@ def export(records: Sequence[Calibration], folder: Path, options: ExportOptions)
 def _thermal_rows(law: OffsetLaw, options: ExportOptions) -> list[tuple[str, float | str]]:
     _check(law.offset[0], law.scale)
     device = str(options.device_id)
-    rows: list[tuple[str, float | str]] = [("TC_A_ENABLE", "1"), ("TC_A0_ID", device)]
-    rows += [("TC_A0_TREF", law.reference), ("TC_A0_TMIN", law.low), ("TC_A0_TMAX", law.high)]
-    powers = np.vstack([np.zeros(3), law.offset[1:]])
-    rows += [(f"TC_A0_X{power}_{axis}", powers[power, axis]) for power in range(4) for axis in range(3)]
+    rows = _over_temperature("A", law, law.offset, device)
     rows.append(("CAL_ACC0_ID", device))
     rows += [(f"CAL_ACC0_{a}OFF", v) for a, v in zip("XYZ", law.offset[0], strict=True)]
-    return rows + [(f"CAL_ACC0_{a}SCALE", v) for a, v in zip("XYZ", law.scale, strict=True)]
+    rows += [(f"CAL_ACC0_{a}SCALE", v) for a, v in zip("XYZ", law.scale, strict=True)]
+    if law.rest is None:
+        return rows
+    rows += [*_over_temperature("G", law, law.rest, device), ("CAL_GYRO0_ID", device)]
+    return rows + [(f"CAL_GYRO0_{a}OFF", v) for a, v in zip("XYZ", law.rest[0], strict=True)]
+
+
+def _over_temperature(sensor: str, law: OffsetLaw, offset: Array, device: str) -> list[tuple[str, float | str]]:
+    """Return ``TC_A0_*`` or ``TC_G0_*``, whose offset at the reference is in the calibration at one temperature."""
+    rows: list[tuple[str, float | str]] = [(f"TC_{sensor}_ENABLE", "1"), (f"TC_{sensor}0_ID", device)]
+    rows += [(f"TC_{sensor}0_{k}", v) for k, v in (("TREF", law.reference), ("TMIN", law.low), ("TMAX", law.high))]
+    powers = np.vstack([np.zeros(3), offset[1:]])
+    return rows + [(f"TC_{sensor}0_X{power}_{axis}", powers[power, axis]) for power in range(4) for axis in range(3)]
 
 
 def _check(offset: Array, scale: Array) -> None:

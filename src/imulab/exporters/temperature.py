@@ -15,7 +15,7 @@ import numpy as np
 
 from imulab.errors import OptionError
 from imulab.exporters import ExportOptions
-from imulab.exporters.model import origin_of
+from imulab.exporters.model import gyro_terms, origin_of
 from imulab.procedures.registry import procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -32,7 +32,8 @@ _FORCES = STANDARD_GRAVITY * _CORNERS / np.linalg.norm(_CORNERS, axis=1)[:, None
 class OffsetLaw:
     """``(raw - offset(T)) * scale``, m/s^2: offsets as cubics of ``T - reference``, rows of powers, (4, 3).
 
-    `lost`: comments on what is left out; `origin`: where the numbers come from.
+    `rest`: the same of the gyroscopes, rad/s, ``raw - rest(T)``, None without; `lost`: comments on what is left out;
+    `origin`: where the numbers come from.
     """
 
     low: float
@@ -40,6 +41,7 @@ class OffsetLaw:
     reference: float
     offset: Array
     scale: Array
+    rest: Array | None
     lost: list[str]
     origin: list[str]
 
@@ -80,23 +82,61 @@ def offset_law(
     scale = 2 / (held[:, 3:6].max(axis=0) + held[:, 3:6].min(axis=0))
     error = (laws.output(_FORCES, temperature) - (design @ offset)[:, None, :]) * scale - _FORCES
     slope = np.abs(np.diff(design @ offset, axis=0) / np.diff(temperature)[:, None]).max() * scale.max()
-    lost = _settle(target, laws, error, float(slope), options)
-    powers = offset / half ** np.arange(4.0)[:, None]
-    return OffsetLaw(laws.low, laws.high, about, powers, scale, lost, origin_of(over[0]))
+    size = half ** np.arange(4.0)[:, None]
+    rest, costs, follows = _rest(over[0], target, temperature, design)
+    lost = _settle(target, laws, error, float(slope), costs, options) + follows
+    return OffsetLaw(
+        laws.low,
+        laws.high,
+        about,
+        offset / size,
+        scale,
+        None if rest is None else rest / size,
+        lost,
+        origin_of(over[0]),
+    )
 
 
-def _settle(target: str, laws: AccelerometerLaws, error: Array, slope: float, options: ExportOptions) -> list[str]:
-    """Refuse what would be lost, or return the comments that say so, and tell them."""
+def _rest(
+    record: Calibration, target: str, temperature: Array, design: Array
+) -> tuple[Array | None, list[str], list[str]]:
+    """Return the gyroscopes' offset as coefficients of a design, what its lack of all else costs, and a comment."""
+    laws_of = procedure_of(record).gyro_laws
+    laws = None if laws_of is None else laws_of(record)
+    if laws is None:
+        return None, [], []
+    if laws.unit != "rad/s":
+        raise OptionError(
+            f"{target}: corrects rates in rad/s, but the record is for gyroscopes with outputs in {laws.unit}; fit "
+            "without --with gyro"
+        )
+    triads = laws.at(temperature)
+    rest = np.linalg.lstsq(design, np.array([triad.scale * triad.bias for triad in triads]))[0]
+    slope = np.abs(np.diff(design @ rest, axis=0) / np.diff(temperature)[:, None]).max()
+    worst = max(triads, key=lambda triad: float(np.abs(triad.gain - np.eye(3)).sum(axis=1).max()))
+    names, costs = gyro_terms(worst, bias=False)
+    lost = [f"{' '.join(names)}, which changes outputs by {', '.join(costs)}"] if names else []
+    follows = f"the offset of the gyroscopes changes by up to {np.degrees(slope) * 3600:.3g} deg/h per K"
+    return rest, lost, [follows]
+
+
+def _settle(
+    target: str, laws: AccelerometerLaws, error: Array, slope: float, gyro: list[str], options: ExportOptions
+) -> list[str]:
+    """Refuse what would be lost, that of gyroscopes included, or return the comments that say so, and tell them."""
     span = f"from {laws.low:g} to {laws.high:g} degC"
     follows = [f"the offset changes by up to {text_in_g(slope)} per K {span}"]
-    worst = float(np.abs(error).max())
-    if worst <= _NEGLIGIBLE * STANDARD_GRAVITY:
+    worst, left = float(np.abs(error).max()), list(gyro)
+    if worst > _NEGLIGIBLE * STANDARD_GRAVITY:
+        rms = float(np.sqrt(np.mean(error**2)))
+        left.insert(
+            0,
+            "scale factor over temperature and misalignment, which changes outputs at 1 g by "
+            f"{text_in_g(rms)} rms, up to {text_in_g(worst)}, {span}",
+        )
+    if not left:
         return follows
-    rms = float(np.sqrt(np.mean(error**2)))
-    what = (
-        "scale factor over temperature and misalignment, which changes outputs at 1 g by "
-        f"{text_in_g(rms)} rms, up to {text_in_g(worst)}, {span}"
-    )
+    what = "; ".join(left)
     if not options.lossy:
         raise OptionError(f"{target} cannot hold {what}; add --lossy to leave it out")
     options.tell(f"{target}: left out (lossy): {what}")

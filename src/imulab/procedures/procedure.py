@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from imulab.recording import Recording, Source
     from imulab.records.calibration import Calibration
     from imulab.records.comparison import Change
-    from imulab.records.triads import AccelerometerLaws, LinearFit, Triads
+    from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, LinearFit, Triads
     from imulab.report.elements import Exhibits
 
 
@@ -164,6 +164,8 @@ class Procedure:
     laws
         Record to the laws of its accelerometers over temperature, which autopilots take as offsets; None where it
         states none.
+    gyro_laws
+        The same of its gyroscopes, None for a record without.
     linear_fit
         Record (and whether to keep the misalignment) to its accelerometers fitted anew without nonlinearity, for
         programs that hold none; None where they cannot be.
@@ -205,6 +207,7 @@ class Procedure:
     noise: Callable[[Calibration], Mapping[str, Any]] | None = None
     triads: Callable[[Calibration], Triads] | None = None
     laws: Callable[[Calibration], AccelerometerLaws] | None = None
+    gyro_laws: Callable[[Calibration], GyroscopeLaws | None] | None = None
     linear_fit: Callable[..., LinearFit] | None = None
     elsewhere: str | None = None
     not_applied: str | None = None

@@ -66,6 +66,27 @@ class AccelerometerLaws:
 
 
 @dataclass(frozen=True)
+class GyroscopeLaws:
+    """``M = S(T) (T w + G f + b(T))`` over temperature; low, high, coefficient (6, terms) as in `AccelerometerLaws`.
+
+    The rows are b_x b_y b_z, rad/s, and S_x S_y S_z, unit of M per rad/s; matrix T (3, 3) and sensitivity G (3, 3).
+    """
+
+    low: float
+    high: float
+    coefficient: Array
+    matrix: Array
+    sensitivity: Array
+    unit: str
+
+    def at(self, temperature: Array) -> list[Gyroscopes]:
+        """Return the triad at temperatures (n,)."""
+        theta = (np.clip(temperature, self.low, self.high) - 0.5 * (self.low + self.high)) * 2 / (self.high - self.low)
+        law = np.asarray(np.polynomial.polynomial.polyval(theta, self.coefficient.T).T, dtype=np.float64)
+        return [Gyroscopes(row[3:], self.matrix, self.sensitivity, row[:3], self.unit) for row in law]
+
+
+@dataclass(frozen=True)
 class Accelerometers:
     """``M = S (A + b)``: scale factor (3,), lower-triangular T (3, 3), bias (3,), k2 .. ke (e - 1, 3), unit of M.
 

@@ -33,6 +33,7 @@ ENTRY = Procedure(
         ),
     ),
     laws=deferred(f"{_HERE}.device:accelerometers"),
+    gyro_laws=deferred(f"{_HERE}.gyrodevice:gyroscopes"),
     elsewhere="{target} takes no laws over temperature",
     rows=deferred(f"{_HERE}.engineering:rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),

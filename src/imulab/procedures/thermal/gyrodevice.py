@@ -14,9 +14,10 @@ from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
 from imulab.procedures.thermal.gyrorecord import SENSITIVITIES
 from imulab.procedures.thermal.model import AXES, law_names
-from imulab.procedures.thermal.sections import thermal_of
+from imulab.procedures.thermal.sections import GyroModel, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
+from imulab.records.triads import GyroscopeLaws, output_to_si
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 _PAIRS = tuple((i, j) for i in range(3) for j in range(3) if i != j)
@@ -59,22 +60,45 @@ def gyro_laws_of(record: Calibration) -> Array:
     return found
 
 
+def _matrix(record: Calibration, gyro: GyroModel) -> Array:
+    """Return T, the identity where turns did not tell it."""
+    matrix = np.eye(3)
+    for i, j in _PAIRS:
+        if gyro.scale == "turns":
+            matrix[i, j] = values_of(record, [f"gyro_misalignment_{AXES[i]}{AXES[j]}"], "rad")[0]
+    return matrix
+
+
+def _sensitivity(record: Calibration) -> Array:
+    return values_of(record, SENSITIVITIES, "rad/s/(m/s^2)").reshape(3, 3)
+
+
+def gyroscopes(record: Calibration) -> GyroscopeLaws | None:
+    """Return the laws as exporters take them, None where there are none; errors as for `gyro_laws_of`."""
+    model = thermal_of(record).model
+    if model.gyro is None:
+        return None
+    low, high = model.range
+    laws = gyro_laws_of(record)
+    factor, unit = output_to_si(model.gyro.output_unit, "rad/s")
+    laws[3:] *= factor
+    felt = _sensitivity(record) if model.gyro.g_sensitivity else np.zeros((3, 3))
+    return GyroscopeLaws(low, high, laws, _matrix(record, model.gyro), felt, unit)
+
+
 def gyro_table_of(record: Calibration, columns: Mapping[str, Any]) -> DeviceTable:
     """Return the table of the gyroscopes; errors as for `gyro_laws_of`."""
     model = thermal_of(record).model
     assert model.gyro is not None
-    laws, turn = gyro_laws_of(record), np.eye(3)
-    for i, j in _PAIRS:
-        if model.gyro.scale == "turns":
-            turn[i, j] = values_of(record, [f"gyro_misalignment_{AXES[i]}{AXES[j]}"], "rad")[0]
+    laws = gyro_laws_of(record)
     fields = [
         Field("has_sensitivity", whole(model.gyro.g_sensitivity)),
         Field("pieces", whole(1)),
         Field("terms", whole(laws.shape[1])),
-        Field("turn", np.linalg.inv(turn)),
+        Field("turn", np.linalg.inv(_matrix(record, model.gyro))),
     ]
     if model.gyro.g_sensitivity:
-        fields.append(Field("sensitivity", values_of(record, SENSITIVITIES, "rad/s/(m/s^2)").reshape(3, 3)))
+        fields.append(Field("sensitivity", _sensitivity(record)))
     fields += [Field("knot", np.array(model.range), pointed=True), Field("coefficient", laws[None], pointed=True)]
     return DeviceTable("thermal_gyro", tuple(fields), {"output_unit": model.gyro.output_unit, **columns})
 
