@@ -285,3 +285,11 @@ def test_a_magnitude_that_the_earth_does_not_have_is_said_without_a_field(factor
     assert any("the field's magnitude was not stated" in one for one in record.warnings) != said
     if said:
         assert record.verdict.state != "good"
+
+
+def test_attitudes_that_leave_nothing_to_tell_the_noise_from_are_refused():
+    rng = np.random.default_rng(5)
+    accel, mag = outputs(unit(rng), attitudes(rng, 12), world_field(12), rng)
+    with pytest.raises(il.ImulabError, match="12 attitudes for the 12 parameters of the accelerometers leave nothing"):
+        il.fit_mag(table(accel, mag), gravity=G, order=2)
+    il.fit_mag(table(accel, mag), gravity=G, order=1)

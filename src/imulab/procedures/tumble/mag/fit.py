@@ -162,6 +162,8 @@ def fit_mag(
         with np.errstate(all="ignore"):  # what runs away ends in no solution
             joint, aside = _solved(ready, loss, str(mag_order))
             what = seen(joint.pair, joint.theta)
+        if same_direction and not what.enough:  # it was where the fit began
+            raise np.linalg.LinAlgError
     except np.linalg.LinAlgError:
         raise DataError(
             f"{name}: the fit of both triads finds no solution: are both of the same attitudes, by one clock"

@@ -140,6 +140,11 @@ class Seen:
     blind: Array
     heading: tuple[int, ...]
 
+    @property
+    def enough(self) -> bool:
+        """Whether everything is determined, and well enough to be of use."""
+        return self.rank == self.size and self.condition < WORST_CONDITION
+
 
 def seen(pair: Pair, theta: Array) -> Seen:
     """Judge what the attitudes can tell, at start parameters or at the solution."""

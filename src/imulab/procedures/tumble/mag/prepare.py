@@ -16,7 +16,7 @@ from imulab.procedures.tumble.checks import check_attitudes, check_prior, made_f
 from imulab.procedures.tumble.estimate import estimate_triad, nominal_scaling
 from imulab.procedures.tumble.findings import Estimate
 from imulab.procedures.tumble.mag.field import FEWEST, FieldMeans, check_magnitude, field_means
-from imulab.procedures.tumble.mag.judge import WORST_CONDITION, Seen, seen
+from imulab.procedures.tumble.mag.judge import Seen, seen
 from imulab.procedures.tumble.mag.model import ACCELEROMETERS, MAGNETOMETERS, triad
 from imulab.procedures.tumble.mag.pointing import find_held
 from imulab.procedures.tumble.mag.scaling import MagScaling, Ready, nominal_mag
@@ -173,8 +173,13 @@ def _pair(
     n, size = problem.reading.shape[1], solution.theta.shape[1]
     variance, freedom = solution.variance[0], float(solution.freedom[0])
     if problem.covariance is None:
+        if n <= size:
+            raise DataError(
+                f"{estimate.attitudes.recording.name}: {n} attitudes for the {size} parameters of the accelerometers "
+                f"leave nothing to tell their noise from; expected {size + 1} or more, a lower order, or std_ columns"
+            )
         freedom = float(n - size)
-        variance = np.full(n, float((solution.residuals[0] ** 2).sum()) / max(freedom, 1.0))
+        variance = np.full(n, float((solution.residuals[0] ** 2).sum()) / freedom)
     noise = None
     if problem.covariance is not None and means.covariance is not None:
         noise = np.zeros((n, 6, 6))
@@ -193,7 +198,7 @@ def _pair(
 
 def check_seen(what: Seen, kept: NDArray[np.intp], name: str) -> None:
     """Refuse attitudes that leave something blind, and say what would help."""
-    if what.rank == what.size and what.condition < WORST_CONDITION:
+    if what.enough:
         return
     blind = " and ".join(f"({', '.join(f'{part:+.2f}' for part in axis)})" for axis in what.blind)
     cannot = (

@@ -15,9 +15,7 @@ Sources: Patterson and Thompson, Biometrika 58 (1971) 545 (REML); Satterthwaite,
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,10 @@ from imulab.recording import Array
 
 _STEPS = 60
 _TOLERANCE = 1e-11
-_DAMPING = 1e-4
+_CLOSE = 0.03
+"""Standard deviations of the residuals to which parameters need to be known for a pass over the variances."""
+_DAMPING, _NEAR = 1e-4, 1e-9
+"""Where a minimisation starts, and where one that was near."""
 _PASSES = 50
 _RESTS = 1e-3
 _BEYOND_BY_CHANCE = 0.05
@@ -143,18 +144,22 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
 
     Where both are unknown, the dip's standard deviation is no smaller than the field's: magnitudes alone could
     otherwise be bent until a few attitudes have no dip residuals at all.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The parameters run away, or end where they are not determined.
     """
     theta, down = start, np.ones(len(pair.mag))
     unknown = pair.noise is None
     first = float(np.median(pair.accel_variance))
     extra = np.array([first if unknown else 0.0] * 2 + [first])
     free = np.array([unknown, unknown, pair.held is not None])
-    converged = False
+    rested = False
+    found = pair.evaluate(theta)
     for number in range(_PASSES):
-        known = _known(pair, pair.evaluate(theta))
-        weigh = _root(_information(pair, known, extra, down))
-        theta, settled = _minimise(partial(_rows_at, pair, weigh), theta)
-        found = pair.evaluate(theta)
+        weigh = _root(_information(pair, _known(pair, found), extra, down))
+        theta, found, settled = _minimise(pair, weigh, theta, found, _NEAR if number else _DAMPING, _CLOSE)
         known = _known(pair, found)
         before, weights_before = extra, down
         if number == 0 and not unknown:
@@ -165,11 +170,16 @@ def solve(pair: Pair, start: Array, *, robust: bool = False) -> Joint:
             down = _huber(found, known, extra)
         rests = np.abs(extra - before) <= _RESTS * extra + _LEAST
         if settled and rests.all() and np.abs(down - weights_before).max() < _RESTS:
-            converged = True
+            rested = True
             break
+    weigh = _root(_information(pair, known, extra, down))
+    theta, found, settled = _minimise(pair, weigh, theta, found)
+    known = _known(pair, found)
     information = _information(pair, known, extra, np.ones(len(down)))
     covariance, freedom = _uncertainty(pair, found, _information(pair, known, extra, down), extra, free)
-    return Joint(pair, theta, found, information, covariance, freedom, np.sqrt(extra), down, converged)
+    if not (np.diag(covariance) > 0).all():
+        raise np.linalg.LinAlgError("the fit ends where parameters are not determined")
+    return Joint(pair, theta, found, information, covariance, freedom, np.sqrt(extra), down, rested and settled)
 
 
 def _known(pair: Pair, found: Invariants) -> Array:
@@ -217,20 +227,21 @@ def _rows(pair: Pair, found: Invariants, theta: Array, weigh: Array) -> tuple[Ar
     return np.concatenate([residuals, rows @ (theta[pair.layout.of_accel] - mean)]), np.vstack([jacobian, own])
 
 
-def _rows_at(pair: Pair, weigh: Array, theta: Array) -> tuple[Array, Array]:
-    return _rows(pair, pair.evaluate(theta), theta, weigh)
+def _minimise(
+    pair: Pair, weigh: Array, theta: Array, found: Invariants, damping: float = _NEAR, close: float = 0.0
+) -> tuple[Array, Invariants, bool]:
+    """Levenberg-Marquardt with columns scaled to length 1, until a step is below the tolerance.
 
-
-def _minimise(rows: Callable[[Array], tuple[Array, Array]], theta: Array) -> tuple[Array, bool]:
-    """Levenberg-Marquardt with columns scaled to length 1; whether the last step was below the tolerance.
+    Or until it changes the whitened residuals by less than `close`. Returns parameters, residuals there, and whether it
+    came to rest.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         The parameters run away.
     """
-    residuals, jacobian = rows(theta)
-    cost, damping = float(residuals @ residuals), _DAMPING
+    residuals, jacobian = _rows(pair, found, theta, weigh)
+    cost = float(residuals @ residuals)
     for _ in range(_STEPS):
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
         scaled = np.vstack([jacobian / scale, np.sqrt(damping) * np.eye(len(theta))])
@@ -238,16 +249,18 @@ def _minimise(rows: Callable[[Array], tuple[Array, Array]], theta: Array) -> tup
             raise np.linalg.LinAlgError("the fit runs away")
         step = np.linalg.lstsq(scaled, -np.append(residuals, np.zeros(len(theta))), rcond=None)[0] / scale
         with np.errstate(all="ignore"):
-            new, slope = rows(theta + step)
+            there = pair.evaluate(theta + step)
+            new, slope = _rows(pair, there, theta + step, weigh)
         reached = float(new @ new)
-        small = np.abs(step).max() < _TOLERANCE
+        small = np.abs(step).max() < _TOLERANCE or np.linalg.norm(jacobian @ step) < close
         if reached <= cost * (1 + 1e-12):
-            theta, residuals, jacobian, cost, damping = theta + step, new, slope, reached, damping / 10
+            theta, found, residuals, jacobian = theta + step, there, new, slope
+            cost, damping = reached, damping / 10
         else:
             damping *= 10
         if small or damping > 1e12:
-            return theta, bool(small)
-    return theta, False
+            return theta, found, bool(small)
+    return theta, found, False
 
 
 def weighted_jacobian(joint: Joint) -> Array:
@@ -258,7 +271,8 @@ def weighted_jacobian(joint: Joint) -> Array:
 def _covariance(pair: Pair, found: Invariants, information: Array) -> Array:
     """Return ``(J' V^-1 J)^-1``, shape (p, p)."""
     size = found.by_parameters.shape[2]
-    normal = np.einsum("nip,nij,njq->pq", found.by_parameters, information, found.by_parameters, optimize=True)
+    carried = information @ found.by_parameters
+    normal = found.by_parameters.reshape(-1, size).T @ carried.reshape(-1, size)
     if pair.prior is not None:
         own = np.zeros((size, size))
         own[pair.layout.of_accel, pair.layout.of_accel] = pair.prior[1].T @ pair.prior[1]
@@ -272,7 +286,7 @@ def _blocks(information: Array, found: Invariants, covariance: Array) -> tuple[A
     """Return ``tr_k P``, shape (4,), and S, shape (4, 4), without forming P."""
     k = found.residuals.shape[1]
     carried = information @ found.by_parameters  # V^-1 J
-    inside = np.einsum("nip,pq,njq->nij", carried, covariance, carried, optimize=True)
+    inside = carried @ covariance @ carried.transpose(0, 2, 1)
     gram = np.zeros((4, *covariance.shape))
     trace, squares = np.zeros(4), np.zeros((4, 4))
     for i, block in enumerate(_BLOCKS[:k]):
@@ -281,7 +295,7 @@ def _blocks(information: Array, found: Invariants, covariance: Array) -> tuple[A
         for j, other in enumerate(_BLOCKS[:k]):
             squares[block, other] += (information[:, i, j] * (information[:, i, j] - 2 * inside[:, i, j])).sum()
     spread = gram @ covariance
-    squares += np.einsum("kpq,lqp->kl", spread, spread, optimize=True)
+    squares += spread.reshape(4, -1) @ spread.transpose(0, 2, 1).reshape(4, -1).T
     return trace, squares
 
 
@@ -291,9 +305,9 @@ def _likelihood_pass(
     """One pass of restricted maximum likelihood for the variances of |m|, dip and directions held."""
     covariance = _covariance(pair, found, information)
     trace, squares = _blocks(information, found, covariance)
-    weighted = np.einsum("nij,nj->ni", information, found.residuals)
-    shift = covariance @ np.einsum("nip,ni->p", found.by_parameters, weighted)
-    felt = weighted - np.einsum("nij,njp,p->ni", information, found.by_parameters, shift, optimize=True)
+    carried = information @ found.by_parameters
+    weighted = (information @ found.residuals[:, :, None])[:, :, 0]
+    felt = weighted - carried @ (covariance @ np.tensordot(carried, found.residuals, ((0, 1), (0, 1))))
     weights = np.ones_like(felt)
     weights[:, 1:3] = 1 / np.maximum(down, 1e-12)[:, None]
     square = np.bincount(_BLOCKS[: felt.shape[1]], (weights * felt**2).sum(axis=0), 4)
