@@ -150,6 +150,9 @@ def test_the_address_that_a_browser_is_started_with_opens_once(tmp_path, monkeyp
 @pytest.mark.parametrize(("listened", "host", "status"), [
     ("0.0.0.0", "192.168.1.5:8000", 200), ("0.0.0.0", "evil.example:8000", 421), ("box", "BOX:8000", 200),
     ("10.0.0.2", "10.0.0.2:8000", 200), ("10.0.0.2", "10.0.0.3:8000", 421), ("10.0.0.2", "10.0.0.2:1", 421),
+    ("::1", "[::1]:8000", 200), ("::1", "[::2]:8000", 421), ("::1", "[::1]:1", 421), ("::1", "::1:8000", 421),
+    ("::1", "[::1]", 421), ("::1", "[::1]8000", 421), ("::", "[fe80::5]:8000", 200), ("::", "evil.example:8000", 421),
+    ("10.0.0.2", "[::1]:8000", 421), ("::1", "[::1]evil:8000", 421),
 ])  # fmt: skip
 def test_a_page_for_others_still_answers_to_its_own_address_alone(listened, host, status):
     assert guarded(8000, host, listened) == status
@@ -304,6 +307,19 @@ def test_a_page_for_others_tells_an_address_that_they_reach():
     assert server._address_for_others("10.1.2.3") == "10.1.2.3"
     with pytest.raises(OptionError, match=r"--host 192\.0\.2\.7: cannot be listened at"):
         server.serve([], host="192.0.2.7", browser=False)
+
+
+@pytest.mark.parametrize("host", ["::1", "::"])
+def test_a_page_listens_at_addresses_of_version_six(host):
+    try:
+        listening = server._listen(0, host)
+    except OptionError:
+        pytest.skip("this machine has no IPv6")
+    address = server._address_for_others(host)
+    assert address.startswith("[") and address.endswith("]")
+    with socket.create_connection((address[1:-1], listening.getsockname()[1]), timeout=5):
+        pass
+    listening.close()
 
 
 def test_a_port_that_is_taken_is_one_sentence():

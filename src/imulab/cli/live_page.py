@@ -24,7 +24,9 @@ _NOT_OFFERED = ("live", "open", "demo", "fleet ")
 PagePort = Annotated[str | None, typer.Option("--port", metavar="N", help="Port of the page; a free one if not given.")]
 PageHost = Annotated[
     str | None,
-    typer.Option("--host", metavar="ADDRESS", help="Address of this machine to listen at, for others; 0.0.0.0: all."),
+    typer.Option(
+        "--host", metavar="ADDRESS", help="Address of this machine to listen at, for others; 0.0.0.0 or ::, all."
+    ),
 ]
 NoBrowser = Annotated[bool, typer.Option("--no-browser", help="Print the address of the page, and open no browser.")]
 
@@ -39,7 +41,7 @@ def port_number(text: str | None) -> int:
 
 def checked_host(text: str | None) -> str | None:
     """Return the address to listen at, with a warning where others reach it; None, this machine alone, of None."""
-    if text is not None and text != "localhost" and not text.startswith("127."):
+    if text is not None and text not in ("localhost", "::1") and not text.startswith("127."):
         warn(f"whoever reaches {text} and has the address below can use the page; it is not encrypted")
     return text
 

@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from imulab.errors import OptionError, quoted
 
 TOKEN_HEADER = "x-imulab-token"
-LOCAL, ANY = "127.0.0.1", "0.0.0.0"
+LOCAL, EVERY = "127.0.0.1", ("0.0.0.0", "::")
 _NAMES = (LOCAL, "localhost")
 _HTTP_PORT = 80
 POLICY = (
@@ -43,6 +43,18 @@ _FOREIGN = "Another page has asked for this: refused."
 def new_token() -> str:
     """Return a token that nobody can guess."""
     return secrets.token_urlsafe(24)
+
+
+def in_address(host: str) -> str:
+    """Return a host as it stands in an address: IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _parted(host: str) -> tuple[str, str, str]:
+    """Return name, colon and port of the header Host; the colons of IPv6 stand in brackets."""
+    name, bracket, rest = host.rpartition("]")
+    before, colon, port = rest.partition(":")
+    return name + bracket + before, colon, port
 
 
 class Guard:
@@ -96,7 +108,7 @@ class Guard:
         """Return the answer to a request that goes no further; None for the others."""
         headers, port = Headers(scope=scope), scope["server"][1]
         host = headers.get("host", "")
-        name, colon, given = host.partition(":")
+        name, colon, given = _parted(host)
         if not self._is_here(name) or given != ("" if port == _HTTP_PORT and not colon else str(port)):
             return PlainTextResponse(_STRANGER, 421)
         if headers.get("origin", f"http://{host}") != f"http://{host}" or (
@@ -119,9 +131,9 @@ class Guard:
 
     def _is_here(self, name: str) -> bool:
         """Whether a name is one of the address that is listened at: a foreign name may lead here, too."""
-        if self._host == ANY and name.replace(".", "").isdigit():
+        if self._host in EVERY and (name.replace(".", "").isdigit() or name.startswith("[")):
             return True
-        return name.lower() in (*_NAMES, self._host.lower())
+        return name.lower() in (*_NAMES, in_address(self._host).lower())
 
     def _opens(self, given: str) -> bool:
         """Whether what an address holds lets its browser in."""

@@ -31,7 +31,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from imulab._version import VERSION
 from imulab.errors import ImulabError, OptionError
 from imulab.live.page.parts import Hub, Line, Message, Part, to_json
-from imulab.live.page.security import ANY, LOCAL, Guard, new_token
+from imulab.live.page.security import EVERY, LOCAL, Guard, in_address, new_token
 
 UPLOAD_LIMIT = 4 << 30
 """Bytes of one request, 4 GiB."""
@@ -173,16 +173,21 @@ def _open(address: str) -> None:
 
 def _address_for_others(host: str) -> str:
     """Return the address by which others reach a server that listens at `host`."""
-    if host != ANY:
-        return host
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-        probe.connect(("192.0.2.1", 9))  # of documents; nothing is sent, but the way there has an address of this end
-        return str(probe.getsockname()[0])
-    return LOCAL
+    if host not in EVERY:
+        return in_address(host)
+    with socket.socket(_family(host), socket.SOCK_DGRAM) as probe, suppress(OSError):
+        # Addresses of documents; nothing is sent, but the way there has an address of this end.
+        probe.connect(("2001:db8::1" if ":" in host else "192.0.2.1", 9))
+        return in_address(str(probe.getsockname()[0]))
+    return "[::1]" if ":" in host else LOCAL
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def _listen(port: int, host: str = LOCAL) -> socket.socket:
-    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listening = socket.socket(_family(host), socket.SOCK_STREAM)
     if sys.platform != "win32":  # there it would let two programs listen at once
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
