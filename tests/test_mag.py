@@ -1,6 +1,5 @@
 """Magnetometers on the attitudes of a tumble test: exact data, the bound, coverage, disturbances, and refusals."""
 
-import json
 import subprocess
 from dataclasses import replace
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 
 import imulab as il
-from conftest import sap5_table
 from imulab.cli import main
 from imulab.columns import triad
 from imulab.errors import ObservabilityError
@@ -113,78 +111,6 @@ def test_two_thousand_trials_are_at_the_bound(request):
     assert np.sqrt(np.mean(ratios**2, axis=0)).max() < 1.08 + 3 / np.sqrt(2 * count)
     assert 0.93 - 3 * np.sqrt(0.05 / count) < covered.mean() < 0.97
     assert (covered.mean(axis=0) > 0.93 - 3 * np.sqrt(0.0475 / count)).all()
-
-
-SAP5 = {  # rms and leave-one-out of |m|, %, and of the dip, deg; dip, deg: ../shared/methods/magnetometer.md
-    "ab": (0.310, 0.468, 0.195, 0.272, 66.73),
-    "ai": (0.112, 0.167, 0.164, 0.215, 66.65),
-    "bh": (0.534, 0.714, 0.290, 0.425, 66.60),
-    "fb": (0.221, 0.319, 0.161, 0.234, 66.62),
-    "hj": (0.172, 0.260, 0.237, 0.321, 66.56),
-    "hj2": (0.243, 0.350, 0.221, 0.297, 66.60),
-}
-POINTING = (range(9, 17), range(17, 25))
-
-
-def sap5_recording(path):
-    mag = [v for v in json.loads(path.read_text())["shots"]["mag"] if v is not None and v == v]
-    return table(sap5_table(path), np.array(mag).reshape(-1, 3))
-
-
-def world(record, recording):
-    """East, north and up of each attitude in body components, from the corrected recording alone."""
-    corrected = il.apply(record, recording)
-    f, m = corrected.triad("accel"), corrected.triad("mag")
-    up = f / np.linalg.norm(f, axis=1)[:, None]
-    east = np.cross(m, up)
-    east /= np.linalg.norm(east, axis=1)[:, None]
-    return np.stack([east, np.cross(up, east), up], axis=1)
-
-
-def scatter(axes, group, by):
-    """Scatter of the direction in the world of the body axis that keeps it best in `by`, deg."""
-    spread = np.zeros((3, 3))
-    for other in by:
-        off = axes[other] - axes[other].mean(axis=0)
-        spread += np.einsum("nij,nik->jk", off, off)
-    directions = axes[group] @ np.linalg.eigh(spread)[1][:, 0]
-    return np.degrees(np.sqrt(directions.var(axis=0, ddof=1).sum()))
-
-
-@pytest.mark.parametrize("name", SAP5)
-def test_sap5_gives_the_figures_of_the_document(real_data, name):
-    recording = sap5_recording(real_data / "sap5" / f"{name}.json")
-    record = il.fit_mag(recording, gravity=G, order=2).calibration
-    found = record.fit["mag"]
-    magnitude, dip = found["magnitude"], found["dip"]
-    figures = [
-        100 * magnitude["rms"], 100 * magnitude["leave_one_out"],
-        np.degrees(dip["rms"]), np.degrees(dip["leave_one_out"]),
-    ]  # fmt: skip
-    np.testing.assert_allclose(figures, SAP5[name][:4], rtol=0.05)
-    assert abs(-np.degrees(record.value("dip")) - SAP5[name][4]) < 0.02  # these accelerometers read minus f
-    assert found["set_aside"] == []
-
-
-def test_sap5_predicts_directions_that_the_fit_did_not_see(real_data):
-    inside, outside, helped = [], [], []
-    for name in SAP5:
-        recording = sap5_recording(real_data / "sap5" / f"{name}.json")
-        every = world(il.fit_mag(recording, gravity=G, order=2).calibration, recording)
-        groups = [np.array(group) - 1 for group in POINTING]
-        inside.append(np.mean([scatter(every, group, groups) for group in groups]))
-        for group, other in (groups, groups[::-1]):
-            drop = [int(i) + 1 for i in group]
-            plain = il.fit_mag(recording, gravity=G, order=2, loss="square", drop=drop).calibration
-            outside.append(scatter(world(plain, recording), group, [other]))
-            same = [int(i) + 1 for i in other]
-            held = il.fit_mag(
-                recording, gravity=G, order=2, loss="square", drop=drop, same_direction=[same]
-            ).calibration
-            helped.append(scatter(world(held, recording), group, [other]))
-    assert np.median(inside) <= 0.45
-    assert np.median(outside) <= 0.58
-    assert np.median(helped) <= 0.40
 
 
 def disturbed(seed, by, attitude=7):
