@@ -50,6 +50,7 @@ FUNCTIONS = {
     "thermal plan": il.plan_thermal,
     "thermal simulate": il.simulate_thermal,
     "thermal fit": il.fit_thermal,
+    "thermal check": il.check_thermal,
     "rate plan": il.plan_rate,
     "rate simulate": il.simulate_rate,
     "rate fit": il.fit_rate,

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from imulab.procedures.rate.turns import TurnsFit as TurnsFit
     from imulab.procedures.rate.turns import fit_turns as fit_turns
     from imulab.procedures.reports import write_report as write_report
+    from imulab.procedures.thermal.check import check_thermal as check_thermal
     from imulab.procedures.thermal.fit import ThermalFit as ThermalFit
     from imulab.procedures.thermal.fit import fit_thermal as fit_thermal
     from imulab.procedures.thermal.plan import plan_thermal as plan_thermal
@@ -100,6 +101,7 @@ _HOME = {
     "allan_deviation": "procedures.allan",
     "calibrate_array": "procedures.gyro_array.public",
     "check_noise": "procedures.noise.check",
+    "check_thermal": "procedures.thermal.check",
     "check_tumble": "procedures.tumble.compare",
     "compare_methods": "procedures.gyro_array.public",
     "fuse": "procedures.gyro_array.public",

@@ -1,4 +1,4 @@
-"""``imulab thermal``: plan, simulate and fit."""
+"""``imulab thermal``: plan, simulate, fit and check."""
 
 from __future__ import annotations
 
@@ -7,8 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import one_of, with_options
-from imulab.cli.options import AsJson, GivenFiles, OutputFile, ReportFile, call, check_outputs
+from imulab.cli.fit_options import one_of, reading, with_options
+from imulab.cli.options import (
+    AsJson,
+    GivenFiles,
+    OutputFile,
+    RecordFile,
+    ReportFile,
+    call,
+    check_outputs,
+    note,
+    read_recording,
+    warn,
+)
 from imulab.procedures.thermal.choices import LAWS, TEMPERATURES
 from imulab.procedures.thermal.task import OPTIONS
 from imulab.procedures.tumble.choices import STARTS
@@ -20,7 +31,7 @@ if TYPE_CHECKING:
 def commands(settings: dict[str, Any]) -> typer.Typer:
     """Return the group of commands."""
     group = typer.Typer(**settings)
-    for function in (plan, simulate, fit):
+    for function in (plan, simulate, fit, check):
         group.command(function.__name__)(function)
     return group
 
@@ -160,3 +171,61 @@ def fit(
     given = [name for name in (options["layout"], options["prior"]) if name]
     check_outputs([output, report], [*files, *given])
     finish(run_task("thermal", files, options, GivenFiles()), output, report, json=json)
+
+
+_OF_THE_CHECK = ("gravity", "latitude", "height", "tilt", "turn_on_scatter", "settle", "temperature_column")
+
+
+@with_options([option for option in OPTIONS if option.name not in ("degrees", "prior")])
+def check(
+    record: RecordFile,
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="New recordings, one power cycle each.")],
+    *,
+    options: dict[str, str | None],
+    limit: Annotated[str | None, typer.Option(help="Largest | |f| - g | that passes, mg, beside the test.")] = None,
+    report: ReportFile = None,
+    json: AsJson = False,
+) -> int:
+    """Test whether new recordings still agree with a record, without refitting; exit status 0: pass, 1: fail.
+
+    Attitudes at any temperature within the record's range, or rest ramps. A record that still holds fails once in
+    twenty tests.
+    """
+    from imulab.cli.speech import coloured
+    from imulab.errors import RecordError
+    from imulab.procedures.apply import warnings_of
+    from imulab.procedures.loading import load
+    from imulab.procedures.thermal.check import check_thermal
+    from imulab.procedures.thermal.checkfigures import as_json, as_text, check_page
+    from imulab.verdict import Note
+
+    check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
+    held = load(record)
+    given = [read_recording(file, **reading(options)) for file in files]
+    chosen = {name: options[name] for name in _OF_THE_CHECK if options[name] is not None}
+    try:
+        found = call(check_thermal, held, given, limit=limit, **chosen)
+    except RecordError as error:
+        raise RecordError(f"{record}: {error}") from None
+    notes = [*(each for one in given for each in warnings_of(held, one)), *found.notes]
+    for one in given:
+        notes += [
+            f"{one.name}: was corrected before, by {entry}; a record is checked by what the unit puts out, so the test "
+            "means nothing here"
+            for entry in one.corrected_by
+        ]
+    if report:
+        from imulab.atomic_write import write_text
+
+        write_text(report, check_page(found, held, record=record, files=files, warnings=notes))
+    if json:
+        from imulab.records.json_text import json_text
+
+        print(json_text(as_json(found)), end="")
+    else:
+        print(as_text(found, coloured("pass" if found.passed else "fail")))
+    for message in notes:
+        (note if isinstance(message, Note) else warn)(message)
+    if report and not json:
+        print(f"report: {report}")
+    return 0 if found.passed else 1

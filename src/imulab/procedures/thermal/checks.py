@@ -18,8 +18,10 @@ _KELVIN = 150.0  # degC; no unit is calibrated above it, and every kelvin above 
 _JUMP, _QUICK = 5.0, 2.0  # K; s
 
 
-def prepared(recordings: Sequence[Recording], column: str | None, settle: float | None) -> list[Recording]:
-    """Return recordings with a column temperature, without what lies inside the settling time.
+def prepared(
+    recordings: Sequence[Recording], column: str | None, settle: float | None, *, span: float = LEAST_SPAN
+) -> list[Recording]:
+    """Return recordings with a column temperature that spans `span` K, without what lies inside the settling time.
 
     Raises
     ------
@@ -32,11 +34,11 @@ def prepared(recordings: Sequence[Recording], column: str | None, settle: float 
         _check_temperature(recording)
     low = min(float(recording.si("temperature").min()) for recording in given)
     high = max(float(recording.si("temperature").max()) for recording in given)
-    if high - low < LEAST_SPAN:
+    if high - low < span:
         where = given[0].name if len(given) == 1 else f"{given[0].name} and {len(given) - 1} more"
         raise DataError(
             f"{where}: column temperature: spans {high - low:.1f} K ({low:.1f} to {high:.1f} degC); expected at least "
-            f"{LEAST_SPAN:g} K: imulab tumble fit calibrates at one temperature"
+            f"{span:g} K: imulab tumble fit calibrates at one temperature"
         )
     return [_settled(recording, settle) for recording in given]
 

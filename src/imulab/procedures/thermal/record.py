@@ -12,7 +12,7 @@ from imulab.gravity import Gravity, gravity_findings
 from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
-from imulab.procedures.thermal.model import GROUPS, law_names
+from imulab.procedures.thermal.model import AXES, GROUPS, Laws, law_names
 from imulab.procedures.thermal.rows import Problem
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Solution
@@ -23,6 +23,8 @@ from imulab.verdict import Note
 _STANDS_OUT = 5.0
 _MOST_NAMED = 6
 _WORSE = 3.0
+_SAME = 1e-9
+"""Of two values of gravity that are one."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
 
 
@@ -154,6 +156,31 @@ def in_si_powers(solution: Solution, gravity: Gravity, scale: Array) -> tuple[Ar
     return values, covariance
 
 
+def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[Laws, Array, Array, Array, float]:
+    """Return the laws of a record with coefficients and covariance in units of g, the outputs' scale, per g.
+
+    Last is the variance that an error of `gravity` adds to every ``|f| / g``: none where the record rests on the same,
+    whose part is taken out of the covariance then.
+    """
+    model = thermal_of(record).model
+    laws = Laws(model.range[0], model.range[1], model.degrees.each)
+    names, factor, share = laws.names(), list[float](), list[float]()
+    scale = [gravity * abs(record.value(f"scale_factor_{axis}")) for axis in AXES]
+    for group, degree in enumerate(laws.degrees):
+        for axis in range(3):
+            factor += [(gravity, scale[axis] / gravity, 1.0)[group]] * (degree + 1)
+            share += [(1.0, -1.0, 0.0)[group]] * (degree + 1)
+    inverse = np.linalg.inv(np.array(factor)[:, None] * laws.to_powers())
+    values, covariance = np.array([record.value(name) for name in names]), record.cov(*names)
+    stated = float(record.model["gravity"].get("standard_uncertainty") or 0.0) / model.gravity.value
+    same = abs(model.gravity.value / gravity - 1) < _SAME
+    if same:
+        shared = np.array(share) * values * stated
+        covariance = covariance - np.outer(shared, shared)
+    common = 0.0 if same else (uncertainty / gravity) ** 2
+    return laws, inverse @ values, inverse @ covariance @ inverse.T, np.array(scale), common
+
+
 def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
     """Return |f| - 1 less the lengthening by noise, and its standard uncertainty, of each hold, in g."""
     rows = solution.rows
@@ -169,6 +196,7 @@ def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[s
         "bias": {"value": g * float(scatter.tau[0]), "unit": "m/s^2"},
         "scale_factor": {"value": float(scatter.tau[1]), "unit": "1"},
         "rank": scatter.rank,
+        "resolution": {"value": g * float(np.sqrt(max(scatter.spread[0] - scatter.tau[0] ** 2, 0.0))), "unit": "m/s^2"},
         "from": "argument" if known else "recordings" if scatter.rank else "unknown",
     }
 

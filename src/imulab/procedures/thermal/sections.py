@@ -81,12 +81,16 @@ class Degrees(Part):
 
 
 class TurnOn(Part):
-    """``fit.between_recordings``: what biases and scale factors move by from one power cycle to the next."""
+    """``fit.between_recordings``: what biases and scale factors move by from one power cycle to the next.
+
+    `resolution` is the standard uncertainty of one such offset; None in records that do not say it.
+    """
 
     bias: Length
     scale_factor: Length
     rank: int
     from_: str
+    resolution: Length | None = None
 
 
 class Tested(Quantity):

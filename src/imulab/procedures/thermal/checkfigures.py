@@ -1,0 +1,155 @@
+"""What a check of a record over temperature shows: the verdict, and each residual beside its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from imulab._version import VERSION
+from imulab.records.calibration import Calibration
+from imulab.report import render_page
+from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, ReportTable
+from imulab.report.traces import axis, rounded, scatter
+from imulab.units import from_si
+from imulab.verdict import Bad, Note, verdict_of
+
+if TYPE_CHECKING:
+    from imulab.procedures.thermal.check import ThermalCheck
+
+_BEYOND = 2.0
+
+
+def _ug(value: float, sign: str = "+") -> str:
+    return f"{from_si(float(value), 'ug'):{sign}.3g}"
+
+
+def _p(value: float | None) -> str:
+    return "not tested" if value is None else f"p = {value:.2g}" if value >= 1e-12 else "p below 1e-12"
+
+
+def meaning(check: ThermalCheck) -> str:
+    """Return what the test says, in words."""
+    if check.passed:
+        return "the recordings agree with the record"
+    if check.probability >= 0.05:
+        return "no change of the unit is shown, but a hold is beyond the limit"
+    common = check.between is not None and (check.within is None or check.between < check.within)
+    what = (
+        "an offset that whole recordings have in common is larger than power cycles explain"
+        if common
+        else "|f| differs from g between attitudes or temperatures by more than the record explains"
+    )
+    return f"{what}: the unit has changed since the record was made, or gravity, unit or temperature are not as assumed"
+
+
+def as_text(check: ThermalCheck, verdict: str) -> str:
+    """Return the verdict with its p, what to do next, and the residual of every hold."""
+    lines = [f"{verdict}: {meaning(check)}"]
+    if not check.passed:
+        lines.append(
+            "measure again; 'imulab thermal fit' of the old recordings with this one says where they disagree, and a "
+            "record that follows the change takes recordings over temperature anew"
+        )
+    worst = check.worst
+    lines.append(
+        f"{_p(check.probability)} over {len(check.holds)} holds (within recordings {_p(check.within)}, common to each "
+        f"{_p(check.between)}), largest |f| - g {_ug(check.residuals[worst])} ug ({check.holds.label(worst)})"
+    )
+    pairs = zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True)
+    for index, (value, u) in enumerate(pairs):
+        beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
+        lines.append(f"{check.holds.label(index)}: {_ug(value)} ± {_ug(u, '')} ug{beyond}")
+    return "\n".join(lines)
+
+
+def as_json(check: ThermalCheck) -> dict[str, Any]:
+    """Return the same for scripts, in SI."""
+    rows = zip(
+        check.holds.temperature.tolist(), check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True
+    )
+    return {
+        "verdict": "pass" if check.passed else "fail",
+        "p": check.probability,
+        "p_within": check.within,
+        "p_between": check.between,
+        "limit": None if check.limit is None else {"value": check.limit, "unit": "m/s^2"},
+        "gravity": check.gravity.entry(),
+        "holds": [
+            {"label": check.holds.label(k), "temperature": at, "residual": value, "standard_uncertainty": u}
+            for k, (at, value, u) in enumerate(rows)
+        ],
+        "notes": [str(note) for note in check.notes],
+    }
+
+
+def exhibits_of_check(check: ThermalCheck) -> Exhibits:
+    """Return what the report shows."""
+    worst = f"{_ug(check.residuals[check.worst])} µg"
+    facts = [
+        *(
+            (name, _p(value).removeprefix("p ").removeprefix("= "))
+            for name, value in (
+                ("p, if nothing changed", check.probability),
+                ("p within recordings", check.within),
+                ("p of what each has in common", check.between),
+            )
+        ),
+        ("largest |f| − g", worst),
+    ]
+    rows = [
+        [check.holds.label(k), _ug(value), _ug(u, ""), f"{value / u:+.1f}"]
+        for k, (value, u) in enumerate(zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True))
+    ]
+    table = ReportTable(
+        "Holds",
+        "Residual |f| − g under the record, its standard uncertainty u, and their ratio. The test weighs all together, "
+        "with what their errors share.",
+        ["hold", "|f| − g, µg", "u, µg", "(|f| − g) / u"],
+        rows,
+    )
+    return Exhibits(f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}.", facts, [_figure(check), table])
+
+
+def _figure(check: ThermalCheck) -> Figure:
+    residual, u = (from_si(values, "ug") for values in (check.residuals, check.standard_uncertainty))
+    far = np.abs(residual) > _BEYOND * u
+    traces = []
+    for which, colour, symbol in ((~far, GOOD, "circle"), (far, BAD, "diamond")):
+        if which.any():
+            bars = {"type": "data", "array": rounded(_BEYOND * u[which]), "color": QUIET, "thickness": 1, "width": 3}
+            traces.append(
+                scatter(rounded(check.holds.temperature[which]), rounded(residual[which]), "markers", error_y=bars,
+                        marker={"size": 8, "color": colour, "symbol": symbol},
+                        text=[check.holds.label(k) for k in np.flatnonzero(which).tolist()],
+                        hovertemplate="%{text}<br>%{y:.1f} µg<extra></extra>")
+            )  # fmt: skip
+    return Figure(
+        title="Residual |f| − g of each hold under the record, over temperature",
+        message=f"{int(far.sum())} of {len(far)} holds lie beyond twice the standard uncertainty.",
+        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature and noise; the holds of a "
+        "recording have most of it in common. Red diamonds lie beyond.",
+        traces=traces,
+        layout={"xaxis": axis("temperature, degC"), "yaxis": axis("|f| − g, µg", zeroline=True), "showlegend": False},
+    )
+
+
+def check_page(
+    check: ThermalCheck, held: Calibration, *, record: str, files: Sequence[str], warnings: Sequence[str]
+) -> str:
+    """Return the report; `warnings` are those of the command."""
+    failed = [] if check.passed else [Bad(meaning(check))]
+    return render_page(
+        f"Thermal check: {'pass' if check.passed else 'fail'}",
+        held.sensor.get("serial", "unit without serial number"),
+        exhibits_of_check(check),
+        verdict=verdict_of([*failed, *warnings]),
+        notes=[note for note in warnings if isinstance(note, Note)],
+        provenance=[
+            ("record", f"{record}, created {held.created}"),
+            *(("recording", file) for file in files),
+            ("gravity", f"{check.gravity.value:.9g} m/s^2"),
+            ("software", f"imulab {VERSION}"),
+        ],
+    )
