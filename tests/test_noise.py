@@ -102,14 +102,16 @@ def behind_a_filter(n: int, rate: float, corner: float, rng: np.random.Generator
 def test_a_low_pass_filter_does_not_spoil_the_coefficients(corner):
     # From all averaging times the fit gives ARW 0 and a bias instability ten times too large, both without a doubt.
     rng = np.random.default_rng(8)
-    within = []
+    within, u = [], []
     for _ in range(15):
         found = coefficients(behind_a_filter(100_000, 200.0, corner, rng), 200.0)
         assert found.filtered
         for c, truth in ((found.angle_random_walk, ARW), (found.bias_instability, BI)):
             within.append(abs(c.value - truth) < 2 * c.standard_uncertainty)
-        assert found.angle_random_walk.standard_uncertainty < 0.05 * ARW
+        u.append(found.angle_random_walk.standard_uncertainty / ARW)
     assert np.mean(within) > 0.85
+    assert np.median(u) < 0.035
+    assert max(u) < 0.07  # where octaves agree at 1.6 Hz only
 
 
 def test_a_curve_that_is_of_no_such_noise_gives_no_number():

@@ -62,7 +62,7 @@ def usable_band(spectra: Sequence[Spectrum]) -> Band:
     highest = nyquist
     if not _same_level(f, p, d, highest, 2) and _rising(f, p, d, nyquist):
         return Band(nyquist, True)
-    while highest == nyquist or d[f <= highest / 4].sum() > 2 * _MANY:
+    while highest == nyquist or d[f <= highest / 4].sum() > _MANY:
         if _same_level(f, p, d, highest, 2):
             far, u = _apart(f, p, d, highest, 2)
             full = highest > _FULL * nyquist
