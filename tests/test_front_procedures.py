@@ -208,9 +208,33 @@ def test_the_allan_deviation_takes_samples_or_a_column(array):
     np.testing.assert_allclose(by_name.deviation, plain.deviation, rtol=1e-9)
 
 
+def test_samples_without_a_column_have_the_coefficients_of_one():
+    """White noise of 1 at 10 Hz has N = 1/sqrt(10); two missing samples are bridged and counted, 2 % are refused."""
+    samples = np.random.default_rng(3).standard_normal(20_000)
+    holed = samples.copy()
+    holed[[70, 9000]] = np.nan
+    plain, found = (il.allan_deviation(each, 10.0) for each in (samples, holed))
+    of_column = il.allan_deviation({"gyro_x": samples}, 10.0, unit="rad/s")
+    np.testing.assert_allclose(plain.deviation, of_column.deviation, rtol=1e-9)
+    for curve in (plain, found, of_column, il.allan_deviation(holed, 10.0, "dense")):
+        white = curve.coefficients.angle_random_walk
+        assert abs(white.value - 10**-0.5) < 3 * white.standard_uncertainty
+        assert white.value == pytest.approx(of_column.coefficients.angle_random_walk.value, rel=1e-3)
+    assert plain.notes == ()
+    assert found.notes == ("samples: 2 rows without numbers (the first row 71) bridged from their neighbours",)
+    assert "white noise" in [row[1] for row in found.exhibits().items[0].rows]
+    holed[:400] = np.nan
+    with pytest.raises(ImulabError, match=r"^samples: row 1, column samples: expected a finite number, found nan"):
+        il.allan_deviation(holed, 10.0)
+    tiny = il.allan_deviation(1e-300 * samples, 10.0).coefficients
+    assert tiny.angle_random_walk.reason == "the samples differ by too little to be squared"
+    assert il.allan_deviation(samples[:40], 10.0).coefficients is None
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
+        (lambda s: il.allan_deviation(s.si("gyro_1"), 1e300), "sampling rate 1e.300: expected a positive number"),
         (lambda s: il.allan_deviation(s), "several columns; expected column=, one of gyro_1"),
         (lambda s: il.allan_deviation(s, column="gyro_9"), "no column 'gyro_9'; expected column=, one of gyro_1"),
         (lambda s: il.allan_deviation(s.si("gyro_1")), "samples without a time: expected rate=, in Hz"),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import INERTIAL, kind_of
-from imulab.errors import DataError
+from imulab.errors import DataError, OptionError
 from imulab.estimation.allan import AllanCurve, allan_deviation
 from imulab.estimation.noise.analysis import Analysis, analyses
 from imulab.estimation.noise.choice import CANDIDATES, average
@@ -144,6 +144,34 @@ def curves_and_noise(
     """
     names = list(noise_columns(recording))  # rows are left out by what all sensors show
     recording, rate, notes = _mended(recording, names)
+    noises, more = _noises(recording, rate, names, wanted, taus)
+    return recording, rate, noises, [*notes, *more]
+
+
+def samples_noise(samples: Array, rate: float, taus: str | Array) -> tuple[ColumnNoise, list[str]]:
+    """Return the noise of samples of no known sensor, shape (n,), n >= 50, at a rate, Hz, and what is to say.
+
+    Up to 1 % of them may be no numbers and are bridged; all others stay as they are.
+
+    Raises
+    ------
+    DataError, OptionError
+        As for `curves_and_noise`.
+    """
+    if not 1 / _LARGEST < rate < _LARGEST:
+        raise OptionError(f"sampling rate {rate:g}: expected a positive number of Hz, such as sensors have")
+    name = "samples"
+    recording, notes = bridged(Recording({name: samples}, {name: "1"}, name=name), [name])
+    _check_squares(recording, [name])
+    noises, more = _noises(recording, rate, [], [name], taus)
+    return noises[name], [*notes, *more]
+
+
+def _noises(
+    recording: Recording, rate: float, names: list[str], wanted: Sequence[str], taus: str | Array
+) -> tuple[dict[str, ColumnNoise], list[str]]:
+    """The noise of the columns `wanted`, none of which may have moved of the sensors' `names`, and what is to say."""
+    notes = []
     moved = moved_columns(recording, names, rate)
     values = (recording.si(name) for name in wanted)  # one at a time: a long log is large
     noises = dict(zip(wanted, columns_noise(values, rate, [moved.get(name, "") for name in wanted]), strict=True))
@@ -153,8 +181,7 @@ def curves_and_noise(
             notes.append(_step_line(recording, name, step))
         if not isinstance(taus, str) or taus != "octave":
             noises[name] = replace(noises[name], curve=allan_deviation(samples, rate, taus))
-    notes += [type(line)(f"{recording.name}: {line}") for line in noise_lines(noises)]
-    return recording, rate, noises, notes
+    return noises, notes + [type(line)(f"{recording.name}: {line}") for line in noise_lines(noises)]
 
 
 def _mended(recording: Recording, names: list[str]) -> tuple[Recording, float, list[str]]:
@@ -226,6 +253,8 @@ def _unfit(samples: Array, noise: float) -> str:
     """Why no model of noise can be fitted to samples whose deviation from one to the next is `noise`; else nothing."""
     if not np.ptp(samples):
         return "all samples are the same: a dead sensor"
+    if not noise:
+        return "the samples differ by too little to be squared"
     step = resolution(samples)
     if step > _COARSE * noise:
         return f"the samples take steps that are {step / noise:.1f} times as large as their noise"

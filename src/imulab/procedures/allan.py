@@ -11,7 +11,7 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import allan
-from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns
+from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns, samples_noise
 from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients_dict
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
@@ -37,7 +37,8 @@ class AllanCurve(Drawn, allan.AllanCurve):
     name, unit
         Of the samples.
     coefficients
-        Noise coefficients of a sensor's column, as ``imulab allan`` prints them; None of other samples.
+        Noise coefficients of a sensor's column, as ``imulab allan`` prints them, or of samples without a column; None
+        of other columns, and of fewer than 50 samples.
     notes
         What is to say of the column and its rows, a sentence each.
     """
@@ -88,7 +89,8 @@ def allan_deviation(
     ``sigma^2(m / rate) = sum_k (x_{k+2m} - 2 x_{k+m} + x_k)^2 / (2 (m / rate)^2 (N - 2m))``, x the integral of the
     samples less their mean, N its length (NIST SP 1065). Of a column of 50 samples or more of a gyroscope or an
     accelerometer, rows that are no readings are bridged, and coefficients come with the curve, as ``imulab allan`` does
-    it.
+    it. With 50 samples or more without a column come coefficients, too; of these samples the few that are no numbers
+    are bridged, and counted in the notes.
 
     Parameters
     ----------
@@ -110,7 +112,8 @@ def allan_deviation(
     Raises
     ------
     DataError
-        Fewer than 3 samples, or samples that are not finite; of a sensor's column, more than 1 % of them.
+        Fewer than 3 samples, or samples that are not finite; of 50 or more of them, of a sensor's column or without
+        one, more than 1 %.
     OptionError
         `taus` or `rate` cannot be used, or which column is meant is not said.
 
@@ -138,7 +141,7 @@ def allan_deviation(
         for name, value in {**reading, "column": column, "window": window}.items():
             if value is not None:
                 raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
-        return AllanCurve(**vars(allan.allan_deviation(unmasked(data).astype(np.float64), rate, taus)))
+        return _of_samples(unmasked(data).astype(np.float64), rate, taus)
     given: dict[str, Any] = {**reading, "rate": rate, "window": window}
     recording = as_recording(data, given, allan_deviation)
     names = [name for name in recording.columns if name != "time"]
@@ -156,6 +159,13 @@ def allan_deviation(
     check_finite(recording, [chosen])
     curve = allan.allan_deviation(recording.si(chosen), sampling_rate(recording)[0], taus)
     return AllanCurve(**vars(curve), name=chosen, unit=unit)
+
+
+def _of_samples(samples: Array, rate: float, taus: str | Array) -> AllanCurve:
+    if len(samples) < FEWEST:
+        return AllanCurve(**vars(allan.allan_deviation(samples, rate, taus)))
+    noise, notes = samples_noise(samples, rate, taus)
+    return AllanCurve(**vars(noise.curve), coefficients=noise.coefficients, notes=tuple(notes))
 
 
 def _is_line(data: object) -> bool:

@@ -51,7 +51,7 @@ def exhibits_of_noise(found: dict[str, Any], recording: Recording) -> Exhibits:
     for name, column in found["columns"].items():
         kinds.setdefault(column["unit"], []).append(name)
     rows = coefficient_rows(found)
-    white = [row for row in rows if row[1] in ("angle random walk", "velocity random walk")]
+    white = [row for row in rows if row[1] in ("angle random walk", "velocity random walk", "white noise")]
     known = [f"{row[0]} {row[2]} ± {row[3]} {row[4]}" for row in white if row[2] != "not determined"]
     more = f" and {len(known) - _MOST_NAMED} more columns in the table" if len(known) > _MOST_NAMED else ""
     lost = f"; not determined for {len(white) - len(known)} of {len(white)} columns" if len(known) < len(white) else ""
@@ -214,11 +214,11 @@ def coefficient_rows(found: dict[str, Any]) -> list[list[str]]:
             texts = ("not determined", "")
             if column[key]["value"] is not None:
                 texts = format_uncertain(*(column[key][part] * factor for part in ("value", "standard_uncertainty")))
-            label = (
-                title
-                if column["unit"] != "m/s^2"
-                else title.replace("angle", "velocity").replace("rate", "acceleration")
-            )
+            label = title
+            if column["unit"] == "m/s^2":
+                label = title.replace("angle", "velocity").replace("rate", "acceleration")
+            elif column["unit"] != "rad/s":
+                label = title.replace("angle random walk", "white noise").removeprefix("rate ")
             rows.append([name, label, *texts, unit])
     return rows
 
