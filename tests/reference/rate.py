@@ -52,3 +52,34 @@ def mounted(table, frequency, axis, arm, tilt=0.0):
     rate = np.asarray(table)[:, None] * axis
     force = 9.80665 * up / np.linalg.norm(up, axis=1)[:, None] + np.cross(rate, np.cross(rate, arm))
     return rate, force
+
+
+def hand_turns(axes, counts, frequency, arm, tilt=0.0, speed=120.0, stops=None):
+    """Body rate and specific force of a unit turned `counts` times each on faces z, x and y, with rests of 3 s.
+
+    `axes` (3, 3): rows are the vertical in the body on each of these faces; between them the unit is tipped by 90 deg.
+    """
+    rates, forces = [], []
+    rest, number = np.zeros(round(3 * frequency)), 0
+    for face, axis in enumerate(axes):
+        parts = [rest]
+        for count in counts:
+            angle = 360.0 * count + (0.0 if stops is None else stops[number])
+            number += 1
+            length = round(abs(angle) / speed * frequency)
+            shape = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+            parts += [angle * DEGREE * shape / shape.sum() * frequency, rest]
+        table = np.concatenate(parts)
+        rate, force = mounted(table, frequency, axis, arm, tilt)
+        unit = np.asarray(axis) / np.linalg.norm(axis)
+        force = force + np.gradient(table)[:, None] * frequency * np.cross(unit, arm)
+        rates.append(rate)
+        forces.append(force)
+        if face < 2:
+            tip, length = np.array([0.0, -1.0, 0.0] if face == 0 else [0.0, 0.0, -1.0]), round(frequency)
+            shape = np.sin(np.pi * (np.arange(length) + 0.5) / length)
+            rates.append(np.pi / 2 * (shape / shape.sum() * frequency)[:, None] * tip)
+            share = np.linspace(0, 1, length)[:, None]
+            between = (1 - share) * np.asarray(axes[face]) + share * np.asarray(axes[face + 1])
+            forces.append(9.80665 * between / np.linalg.norm(between, axis=1)[:, None])
+    return np.vstack(rates), np.vstack(forces)

@@ -154,6 +154,9 @@ def turn(
     clock: Annotated[
         str | None, typer.Option(metavar="FRACTION", help="Uncertainty of the sample rate, such as 50ppm.")
     ] = None,
+    accel: Annotated[
+        str | None, typer.Option(metavar="RECORD", help="Tumble record, whose accelerometers tell the turns' axes.")
+    ] = None,
     prior: Annotated[
         str | None, typer.Option(metavar="RECORD", help="Earlier record of the same gyroscopes, as prior knowledge.")
     ] = None,
@@ -165,10 +168,10 @@ def turn(
     from imulab.cli.result import finish
     from imulab.procedures.rate.turns import fit_turns
 
-    check_outputs([output, report], [name for name in (file, options["layout"], prior) if name])
+    check_outputs([output, report], [name for name in (file, options["layout"], accel, prior) if name])
     recording = read_recording(file, **reading(options))
     finish(
-        call(fit_turns, recording, fence=fence, turns=turns, clock=clock, prior=prior).calibration,
+        call(fit_turns, recording, fence=fence, turns=turns, clock=clock, accel=accel, prior=prior).calibration,
         output,
         report,
         json=json,

@@ -6,7 +6,7 @@ that the intercept of the mean of f over w^2 is along a. Source: rotation about 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,10 +75,7 @@ def find_axes(
     runs = np.repeat(np.arange(len(dwells)), [len(found.rate) for found in dwells])
 
     def axes_by(record: Calibration) -> list[tuple[Array, Array, float]]:
-        columns = {"time": np.arange(len(outputs), dtype=np.float64), **dict(zip(_TRIAD, outputs.T, strict=True))}
-        units = {name: "s" if name == "time" else unit for name in columns}
-        corrected = record.apply(Recording(columns, units, {}, name="accelerometers"))
-        force = np.column_stack([corrected.si(name) for name in _TRIAD])
+        force = corrected_means(record, outputs, unit)
         return [_intercept(force[runs == k], found, test.place(k)) for k, found in enumerate(dwells)]
 
     found = axes_by(accel)
@@ -87,24 +84,46 @@ def find_axes(
     for k, run in enumerate(test.runs):
         if run.sign * direction[k, run.axis] < _FACE:
             raise DataError(f"{test.place(k)}: by the accelerometers {_up(direction[k])} points up: is mounting wrong?")
-    names = [name for name in accel.covariance.names if not name.startswith(("gyro_", "mag_", "dip", "k"))]
-    matrix = accel.covariance.block(names)
-    sigma = np.sqrt(np.diag(matrix))
-    changes = []
-    for name, u in zip(names, sigma.tolist(), strict=True):
-        one = accel.parameters[name]
-        other = replace(accel, parameters={**accel.parameters, name: replace(one, value=one.value + u)})
-        moved = np.array([each[0] for each in axes_by(other)])
-        changes.append(moved / np.linalg.norm(moved, axis=1)[:, None] - direction)
-    known = np.maximum(sigma, 1e-300)
+
+    def directions(record: Calibration) -> Array:
+        moved = np.array([each[0] for each in axes_by(record)])
+        return np.asarray(moved / np.linalg.norm(moved, axis=1)[:, None])
+
+    changes, correlation = moved_by_parameters(accel, directions)
     return TableAxes(
         direction=direction,
         force=force,
         arm=np.array([each[1] for each in found]),
         spread=np.array([each[2] for each in found]) / np.linalg.norm(force, axis=1),
-        changes=np.array(changes).reshape(len(names), len(dwells), 3),
-        correlation=matrix / np.outer(known, known),
+        changes=changes,
+        correlation=correlation,
     )
+
+
+def corrected_means(record: Calibration, outputs: Array, unit: str) -> Array:
+    """Return mean outputs of the accelerometers as specific force by their record, m/s^2, shape (n, 3)."""
+    columns = {"time": np.arange(len(outputs), dtype=np.float64), **dict(zip(_TRIAD, outputs.T, strict=True))}
+    units = {name: "s" if name == "time" else unit for name in columns}
+    corrected = record.apply(Recording(columns, units, {}, name="accelerometers"))
+    return np.column_stack([corrected.si(name) for name in _TRIAD])
+
+
+def moved_by_parameters(accel: Calibration, directions: Callable[[Calibration], Array]) -> tuple[Array, Array]:
+    """Return what one standard uncertainty of each of p parameters does to m directions, and the correlation.
+
+    Shapes (p, m, 3) and (p, p).
+    """
+    names = [name for name in accel.covariance.names if not name.startswith(("gyro_", "mag_", "dip", "k"))]
+    matrix = accel.covariance.block(names)
+    sigma = np.sqrt(np.diag(matrix))
+    at = directions(accel)
+    changes = []
+    for name, u in zip(names, sigma.tolist(), strict=True):
+        one = accel.parameters[name]
+        other = replace(accel, parameters={**accel.parameters, name: replace(one, value=one.value + u)})
+        changes.append(directions(other) - at)
+    known = np.maximum(sigma, 1e-300)
+    return np.array(changes).reshape(len(names), len(at), 3), matrix / np.outer(known, known)
 
 
 def _means(recording: Recording, found: Dwells, place: str) -> Array:

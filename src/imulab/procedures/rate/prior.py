@@ -101,11 +101,11 @@ def _part(record: Calibration, names: list[str]) -> Calibration:
 
 def _shared(record: Calibration) -> dict[str, float]:
     """Return what all scale factors of a record have in common, a fraction, by whose it is."""
-    fit: Any = record.fit
-    if record.model.get("from") == "turns":
+    fit: Any = record.fit.get("rate", record.fit)
+    if "fence" in fit:  # of turns by hand
         return {"clock": fit.get("clock") or 0.0}
-    if record.procedure == "rate" or "rate" in fit:
-        return {"table": fit.get("rate", fit).get("table_uncertainty") or 0.0}
+    if record.procedure == "rate" or "rate" in record.fit:
+        return {"table": fit.get("table_uncertainty") or 0.0}
     return {"clock": fit.get("gyro", {}).get("clock", {}).get("standard_uncertainty") or 0.0}
 
 

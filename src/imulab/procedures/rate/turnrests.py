@@ -36,6 +36,10 @@ class Motions:
         Mean specific force at the rests, m/s^2, shape (m, 3); None without accelerometers.
     steps
         Turns of each sample of a motion, rad, one array of shape (n, 3) each.
+    span
+        First and last sample of each motion.
+    period
+        Usual time between two samples, s.
     bias
         Mean output at rest, rad/s, shape (3,), and its standard uncertainty.
     notes
@@ -52,6 +56,8 @@ class Motions:
     steps: tuple[Array, ...]
     bias: Array
     bias_uncertainty: Array
+    span: tuple[tuple[int, int], ...]
+    period: float
     notes: tuple[str, ...] = ()
 
 
@@ -90,7 +96,7 @@ def find_motions(recording: Recording, fence: float) -> Motions:
         free = rate[a : b + 1] - zero[k] * (1 - share) - zero[k + 1] * share
         steps = (free[1:] + free[:-1]) / 2 * np.diff(time[a : b + 1])[:, None]
         duration = float(time[b] - time[a])
-        rows.append((time[a], time[b], steps, duration / 2 * np.sqrt(spread[k] ** 2 + spread[k + 1] ** 2)))
+        rows.append((time[a], time[b], steps, duration / 2 * np.sqrt(spread[k] ** 2 + spread[k + 1] ** 2), (a, b)))
     means = None if force is None else np.array([force[a:b].mean(axis=0) for a, b in rests])
     return Motions(
         start=np.array([row[0] for row in rows]),
@@ -103,6 +109,8 @@ def find_motions(recording: Recording, fence: float) -> Motions:
         steps=tuple(row[2] for row in rows),
         bias=zero.mean(axis=0),
         bias_uncertainty=zero.std(axis=0, ddof=1) / np.sqrt(len(zero)),
+        span=tuple(row[4] for row in rows),
+        period=float(np.median(np.diff(time))),
         notes=tuple(notes),
     )
 

@@ -16,8 +16,10 @@ import numpy as np
 from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
 from imulab.procedures.rate.choices import AXES, FENCE, gyros_of
 from imulab.procedures.rate.prior import with_prior
+from imulab.procedures.rate.turnaxes import check_accel, with_axes
 from imulab.procedures.rate.turnrecord import turns_record
 from imulab.procedures.rate.turnrests import Motions, carried, composed, find_motions
 from imulab.procedures.result import Result
@@ -93,6 +95,7 @@ def fit_turns(
     fence: float | str = FENCE,
     turns: str | Sequence[int] | None = None,
     clock: float | str | None = None,
+    accel: Record | None = None,
     prior: Record | None = None,
     **reading: Unpack[Reading],
 ) -> TurnsFit:
@@ -111,6 +114,9 @@ def fit_turns(
         Number of turns of each in order, ``"1,5,-6"``; counted from the gyroscopes if not given.
     clock
         Relative standard uncertainty of the sample rate; without it the scale factors are those per clock.
+    accel
+        Record of `fit_tumble` of the same unit or its file, for turns about x, y and z on a level table: its
+        ``accel_*`` tell the axes of the turns, and the result is a record of both triads, with misalignments.
     prior
         Earlier record of the same gyroscopes, of `fit_gyro` or of a rate test, or its file: both are one fit. The
         record says whether they agree, and holds what turns do not show as the prior has it.
@@ -122,7 +128,12 @@ def fit_turns(
     SegmentError
         There are no rests between turns.
     DataError
-        No motion is a whole turn, one is none, or the sample rate cannot be right.
+        No motion is a whole turn, one is none, the sample rate cannot be right, or the accelerometers see another
+        axis upright.
+    ObservabilityError
+        With accel: the unit was not turned about x, y and z.
+    RecordError
+        `accel` or `prior` is not such a record.
     OptionError
         An option has an unknown value.
 
@@ -142,7 +153,10 @@ def fit_turns(
         raise OptionError(f"fence {fence}: expected the uncertainty of the difference of two stops, such as 0.5 deg")
     of_clock = None if clock is None else fraction(clock, "clock")
     stated = None if turns is None else _counts(turns)
+    held = None if accel is None else as_record(accel, "fit_turns: accel")
     recording = as_recording(data, reading, fit_turns, gyros_of)
+    if held is not None:
+        check_accel(held, recording)
     motions = find_motions(recording, width)
     _check_sample_rate(motions, recording.name)
     which = _turning(motions, recording.name)
@@ -157,8 +171,13 @@ def fit_turns(
             count = _numbered(angle, motions, own, recording.name) if given is None else given
             found[AXES[axis]] = _scale(motions, own, axis, angle, count, width)
     record = turns_record(recording, motions, found, width, of_clock)
+    if held is not None:
+        record = with_axes(record, recording, motions, found, held)
     if prior is not None:
-        record = with_prior(record, as_record(prior, "fit_turns: prior"), None)
+        frame = None if held is None else BY_ACCELEROMETERS
+        record = with_prior(record, as_record(prior, "fit_turns: prior"), frame)
+    if held is not None:
+        record = with_accelerometers(held, record)
     return TurnsFit(record, found)
 
 

@@ -1,0 +1,105 @@
+"""Whole turns by hand with accelerometers: the axis of each turn, misalignments, and both triads in one record."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import imulab as il
+from imulab.cli import main
+from reference import rate as reference
+from test_rate_accel import ARM, BIAS, SCALE, TURN, accel
+
+__all__ = ["accel"]
+FREQUENCY = 100.0
+LEAN = np.array([[0.02, -0.03, 1.0], [1.0, 0.015, -0.01], [-0.025, 1.0, 0.02]])
+"""Of the vertical on the faces z, x and y: by up to 2 deg."""
+
+
+def hand(counts=(1, -1), noise=0.0, force_noise=0.0, seed=1, tilt=5e-3, stops=0.0, axes=LEAN, arm=ARM):
+    rng = np.random.default_rng(seed)
+    off = stops * rng.standard_normal(3 * (len(counts) + 1)).reshape(3, -1)
+    moved = np.diff(off, axis=1).ravel()
+    rate, force = reference.hand_turns(axes, counts, FREQUENCY, arm, tilt, stops=moved)
+    out = SCALE * (rate @ TURN.T + BIAS) + noise * rng.standard_normal(rate.shape)
+    return il.Recording.from_arrays(
+        gyro=out, accel=force + force_noise * rng.standard_normal(force.shape), rate=FREQUENCY,
+        units={"gyro": "rad/s", "accel": "m/s^2"},
+    )  # fmt: skip
+
+
+def test_scale_factors_and_misalignments_are_those_of_the_turns(accel):
+    """Axes that lean by 2 deg, a table 5 mrad off level, an arm of 6 cm and 240 deg/s at most."""
+    found = il.fit_turns(hand(noise=1e-6), accel=accel).calibration
+    for i, a in enumerate("xyz"):
+        assert found.value(f"gyro_scale_factor_{a}") == pytest.approx(SCALE[i], rel=15e-6)
+        for k, b in enumerate("xyz"):
+            if i != k:
+                assert found.value(f"gyro_misalignment_{a}{b}") == pytest.approx(TURN[i, k], abs=1e-5)
+
+
+def test_intervals_hold_the_misalignments(accel):
+    scores = []
+    for seed in range(40):
+        made = hand((1, -1, 1, -1), 2e-3, 0.03, seed, stops=0.5 / np.sqrt(2), axes=LEAN)
+        found = il.fit_turns(made, accel=accel).calibration
+        for i, a in enumerate("xyz"):
+            for name, true in [(f"gyro_scale_factor_{a}", SCALE[i])] + [
+                (f"gyro_misalignment_{a}{b}", TURN[i, k]) for k, b in enumerate("xyz") if i != k
+            ]:
+                p = found.parameters[name]
+                scores.append((name[5:8], (p.value - true) / p.standard_uncertainty))
+    for kind in ("sca", "mis"):
+        squares = np.mean([s**2 for k, s in scores if k == kind])
+        assert 0.5 < squares < 1.6, (kind, squares)
+
+
+def test_the_record_is_of_both_triads_and_corrects_both(accel, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    il.write(hand(noise=1e-4), "turns.csv")
+    accel.save("accel.json")
+    command = ["rate", "turn", "turns.csv", "--accel", "accel.json", "-o", "both.json", "--report", "both.html"]
+    assert main(command, project=False) == 0
+    capsys.readouterr()
+    assert main(["show", "both.json"], project=False) == 0
+    said = capsys.readouterr().out
+    assert "gyro_misalignment_xy" in said
+    assert "bias_x" in said
+    corrected = il.apply("both.json", "turns.csv")
+    assert float(np.sum(corrected.si("gyro_z")[:700]) / FREQUENCY) == pytest.approx(2 * np.pi, abs=0.01)
+
+
+REFUSED = {
+    "no triad": ("without accelerometers", lambda a: il.fit_turns(hand(), accel=_bare(a))),
+    "no columns": ("no column accel_x", lambda a: il.fit_turns(_without(hand()), accel=a)),
+    "one face": ("no turns about x y", lambda a: il.fit_turns(_first(hand()), accel=a)),
+    "on its side": ("by the accelerometers x is upright", lambda a: il.fit_turns(_swapped(hand()), accel=a)),
+}
+
+
+def _bare(record):
+    kept = {name: p for name, p in record.parameters.items() if name != "bias_x"}
+    return dataclasses.replace(record, parameters=kept)
+
+
+def _without(made):
+    return il.Recording({n: v for n, v in made.columns.items() if "accel" not in n}, made.units, name="turns.csv")
+
+
+def _first(made):
+    return il.Recording({n: v[:1500] for n, v in made.columns.items()}, made.units, name="turns.csv")
+
+
+def _swapped(made):
+    """Of each turn alone, gravity along another axis: constant, so that attitudes do not differ."""
+    size = len(made)
+    other = {"accel_x": np.full(size, 9.8), "accel_y": np.full(size, 0.1), "accel_z": np.full(size, 0.2)}
+    return il.Recording({**made.columns, **other}, made.units, name="turns.csv")
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_refused_in_a_line(name, accel):
+    said, call = REFUSED[name]
+    with pytest.raises(il.ImulabError, match=said) as refused:
+        call(accel)
+    assert "\n" not in str(refused.value)
