@@ -127,14 +127,18 @@ def test_what_cannot_be_corrected_is_refused_in_one_line(record, tmp_path, capsy
 def test_what_would_correct_twice_or_out_of_turn_is_refused(record, made, tmp_path):
     tumble = il.fit_tumble(il.simulate_tumble(gravity=G), order=1, gravity=G).calibration
     warmup = il.fit_warmup(il.simulate_warmup([0, 20, 40], rate=1.0), temperatures="0,20,40").calibration
+    gyros = il.fit_warmup(
+        il.simulate_warmup([0, 20, 40], rate=1.0), temperatures="0,20,40", axes="gyro_x,gyro_y,gyro_z"
+    ).calibration
     for records, said in (
         ([tumble, record], "a tumble and a thermal record together"),
         ([record, tumble], "a tumble and a thermal record together"),
         ([warmup, record], "a warm-up record before a thermal one"),
+        ([record, warmup], "whose cycles no thermal record had corrected"),
     ):
         with pytest.raises(il.ImulabError, match=said):
             next(apply_blocks(records, [wandering()]))
         with pytest.raises(il.ImulabError, match=said):
             il.export("c", records, tmp_path / "out")
         assert not (tmp_path / "out").exists()
-    assert il.export("blob", [record, warmup], tmp_path / "out")
+    assert il.export("blob", [record, gyros], tmp_path / "out")

@@ -17,9 +17,10 @@ from imulab.errors import DataError, OptionError, RecordError
 from imulab.power_on import with_power_on_temperature
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.loading import load_any
+from imulab.procedures.order import check_after, check_order, entry, thermals_of
 from imulab.procedures.procedure import Section
 from imulab.procedures.registry import procedure_of, section
-from imulab.procedures.unit_tables import check_order, tables_of
+from imulab.procedures.unit_tables import tables_of
 from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
@@ -160,7 +161,8 @@ def apply(
     Raises
     ------
     RecordError
-        The record's procedure has nothing to apply here, or `heading` is asked of one without magnetometers.
+        The record's procedure has nothing to apply here, it is a warm-up record of cycles that another thermal record
+        had corrected than the recording, or `heading` is asked of one without magnetometers.
     UnitError
         The recording's unit cannot be converted to the record's.
     DataError
@@ -190,7 +192,7 @@ def apply(
         if isinstance(record, Loaded):
             raise OptionError("heading: expected a record, found one that was loaded without")
         (ready,) = with_heading([ready], [record])
-    before = {entry.rpartition("sha256:")[2] for entry in recording.corrected_by}
+    before = {each.rpartition("sha256:")[2] for each in recording.corrected_by}
     if not ready.again and before.intersection(ready.holds):
         raise DataError(
             f"{recording.name}: already corrected by {ready.name}: a second time would take its errors off twice; "
@@ -198,6 +200,9 @@ def apply(
         )
     if temperature_column and any(part.since_power_on for part, _ in ready.sections):
         (recording,) = with_power_on_temperature([recording])
+    check_after(
+        ((part.kind, columns, ready.holds) for part, columns in ready.sections), thermals_of(recording.corrected_by)
+    )
     corrected = recording
     for part, columns in sections_for(ready.sections, recording):
         assert part.apply is not None
@@ -206,7 +211,8 @@ def apply(
         corrected = ready.further(corrected)
     if corrected is recording:
         return recording
-    return replace(corrected, corrected_by=(*recording.corrected_by, f"{ready.name} sha256:{ready.holds[0]}"))
+    by = entry(ready.name, ready.holds[0], (part.kind for part, _ in ready.sections))
+    return replace(corrected, corrected_by=(*recording.corrected_by, by))
 
 
 def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from imulab.device.array_settings import Fusion
 from imulab.device.tables import DeviceTable
 from imulab.errors import RecordError
+from imulab.procedures.order import check_after, check_order
 from imulab.procedures.registry import procedure_of
 from imulab.records.calibration import Calibration
 
@@ -31,42 +32,17 @@ def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) 
     Raises
     ------
     RecordError
-        Two records give the same section, or are of different units.
+        Two records give the same section, are of different units, or would correct one error twice or out of turn.
     """
     serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
         raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
-    tables = [table for record in records for table in tables_of(record, fusion)]
+    made = [(tables_of(record, fusion), record) for record in records]
+    tables = [table for own, _ in made for table in own]
     kinds = [table.kind for table in tables]
     twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
     if twice:
         raise RecordError(f"two records give a {twice[0]} table; a unit has one")
     check_order(kinds)
+    check_after((table.kind, table.columns, (record.sealed()[0],)) for own, record in made for table in own)
     return tables
-
-
-def check_order(kinds: Sequence[str]) -> None:
-    """Refuse sections, by kind in the order of application, that would correct one error twice or out of turn.
-
-    Raises
-    ------
-    RecordError
-        A tumble is beside a thermal record, which contains it; or a warm-up table comes before the thermal record.
-    """
-    if "thermal" not in kinds:
-        return
-    if "tumble" in kinds:
-        raise RecordError(
-            "a tumble and a thermal record together: both take off bias, scale factor and misalignment; expected the "
-            "thermal record alone (thermal fit --prior takes the tumble's knowledge in)"
-        )
-    if "gyro" in kinds and "thermal_gyro" in kinds:
-        raise RecordError(
-            "a gyroscope record beside a thermal one that holds gyroscopes too: both take off their biases; expected "
-            "the thermal record alone, or one fitted without --with gyro"
-        )
-    if "warmup" in kinds[: list(kinds).index("thermal")]:
-        raise RecordError(
-            "a warm-up record before a thermal one: expected the thermal record first, since the warm-up is what is "
-            "left after the laws over temperature"
-        )

@@ -82,16 +82,14 @@ class Cycle:
         At power-on, degC.
     first, last
         Time of the first and the last sample, s since power-on.
-    name, serial
-        What messages call it, and the unit.
+    name, serial, sensor_model
+        What messages call it; of the head of the file.
     first_reading
         First value of the column temperature, degC, or None.
     chamber
         ``chamber_temperature`` or ``set_point`` of the head of the file, degC, or None.
-    source
-        File and hash.
-    sensor_model
-        ``model`` of the head of the file.
+    source, corrected_by
+        File and hash, and what it was corrected by.
     file_units
         Units of the axes as the file has them.
     zeros
@@ -112,6 +110,7 @@ class Cycle:
     sensor_model: str | None = None
     file_units: tuple[str, ...] = ()
     zeros: int = 0
+    corrected_by: tuple[str, ...] = ()
 
 
 def find_power_cycle(
@@ -199,6 +198,7 @@ def find_power_cycle(
         sensor_model=head.metadata.get("model"),
         file_units=tuple(parse_unit(head.units[axis]).symbol for axis in axes),
         zeros=zeros,
+        corrected_by=head.corrected_by,
     )
 
 

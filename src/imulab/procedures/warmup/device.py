@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,8 @@ _TICK = 0.01  # s
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the table of a warm-up record; errors as for `record_table` and `warmup_table`."""
-    return (warmup_table(record_table(record).to_section()),)
+    table, after = warmup_table(record_table(record).to_section()), record.model.get("after")
+    return (table if after is None else replace(table, columns={**table.columns, "after": after}),)
 
 
 def warmup_table(table: Mapping[str, Any]) -> DeviceTable:

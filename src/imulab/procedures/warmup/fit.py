@@ -27,6 +27,7 @@ from imulab.procedures.warmup.judge import (
     worst_between,
 )
 from imulab.procedures.warmup.model import SOURCE_TEMPERATURES, WarmupTable
+from imulab.procedures.warmup.quality import after_of
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
 from imulab.quantities import in_si, number, temperature_list
@@ -156,7 +157,7 @@ def fit_warmup(
         found = [with_axes(cycle, _names(axes)) for cycle in found]
     order = common_axes(found)
     found = [with_axes(cycle, order) for cycle in found]
-    _check_units(found, pool)
+    _check_together(found, pool)
     limits = _limits(settling_limit)
     curves, settled = make_curves(found, at, tolerance=tolerance, settling_time=settling_time, limit=limits)
     spread = repeatability(curves)
@@ -276,7 +277,8 @@ def check_options(
     return at
 
 
-def _check_units(cycles: Sequence[Cycle], pool: str) -> None:
+def _check_together(cycles: Sequence[Cycle], pool: str) -> None:
+    after_of(cycles)
     if pool == "type":
         unnamed = [cycle.name for cycle in cycles if not cycle.serial]
         if unnamed:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.errors import first_of
+from imulab.errors import DataError, first_of
+from imulab.procedures.order import thermals_of
 from imulab.procedures.warmup.curves import SETTLED, Curves
+from imulab.procedures.warmup.cycles import Cycle
 from imulab.procedures.warmup.engineering import in_engineering
 from imulab.procedures.warmup.judge import Judged, Worst
 from imulab.procedures.warmup.solve import SCALE_LIMIT
@@ -248,3 +252,24 @@ def _constants(curves: Curves, chosen: Judged) -> list[str]:
         f"the time constant {tau:.4g} s is the longest that is sought, {SCALE_LIMIT:g} T_M: the cycles only show that "
         "something changes more slowly than they last"
     ]
+
+
+def after_of(cycles: Sequence[Cycle]) -> str | None:
+    """Return the SHA-256 of the thermal record that the axes of all cycles were corrected by; None for none.
+
+    Raises
+    ------
+    DataError
+        It is not the same for all.
+    """
+    first = cycles[0]
+    sensors = {axis.partition("_")[0] for axis in first.axes}
+    found = [next((t.hashes[0] for t in thermals_of(c.corrected_by) if t.sensor in sensors), None) for c in cycles]
+    for cycle, after in zip(cycles, found, strict=True):
+        if after != found[0]:
+            mine, its = (f"the thermal record sha256:{one[:12]}" if one else "none" for one in (after, found[0]))
+            raise DataError(
+                f"{cycle.name}: corrected over temperature by {mine}, but {first.name} by {its}; expected all cycles "
+                "as the unit put them out, or all corrected by the same thermal record"
+            )
+    return found[0]

@@ -10,7 +10,7 @@ import numpy as np
 from imulab.procedures.warmup.curves import Curves
 from imulab.procedures.warmup.judge import Judged, Repeatability, Worst
 from imulab.procedures.warmup.model import WarmupTable, evaluate, exit_jump
-from imulab.procedures.warmup.quality import expectations, quality_warnings
+from imulab.procedures.warmup.quality import after_of, expectations, quality_warnings
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -49,6 +49,7 @@ def make_record(
             "reference": "each cycle's own settled mean",
             "pool": "type" if by_unit else "unit",
             "serials": serials,
+            "after": after_of(curves.cycles),
         },
         fit={
             "cycles": len(curves.cycles),

@@ -16,11 +16,12 @@ Rows = Annotated[list[Annotated[list[Annotated[list[float], "terms"]], "axes"]],
 
 
 class Model(Part):
-    """``model``."""
+    """``model``; `after` is the SHA-256 of the thermal record that the cycles were corrected by, None for none."""
 
     model: str
     settling_time: Above0
     pool: str = "unit"
+    after: str | None = None
     temperature: Quantity | None = None
 
 

@@ -1,0 +1,89 @@
+"""What corrects before what: a warm-up table comes after the thermal record that its cycles were corrected by."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from imulab.errors import RecordError
+
+SENSORS = {"thermal": "accel", "thermal_gyro": "gyro"}
+"""What the sections of a thermal record correct."""
+_ENTRY = re.compile(r" \(thermal: ([a-z ]+)\) sha256:([0-9a-f]{64})$")
+
+
+@dataclass(frozen=True)
+class Thermal:
+    """Laws over temperature that were applied: the SHA-256 by which their record goes, and the sensor they correct."""
+
+    hashes: Sequence[str]
+    sensor: str
+
+
+def entry(name: str, digest: str, kinds: Iterable[str]) -> str:
+    """Return what a corrected recording says of a record: ``thermal.json (thermal: accel) sha256:...``."""
+    over = " ".join(SENSORS[kind] for kind in kinds if kind in SENSORS)
+    return f"{name} (thermal: {over}) sha256:{digest}" if over else f"{name} sha256:{digest}"
+
+
+def thermals_of(corrected_by: Iterable[str]) -> list[Thermal]:
+    """Return the laws over temperature that a recording says it was corrected by."""
+    matches = filter(None, map(_ENTRY.search, corrected_by))
+    return [Thermal((match[2],), sensor) for match in matches for sensor in match[1].split()]
+
+
+def check_order(kinds: Sequence[str]) -> None:
+    """Refuse sections, by kind in the order of application, that would correct one error twice or out of turn.
+
+    Raises
+    ------
+    RecordError
+        A tumble is beside a thermal record, which contains it; or a warm-up table comes before the thermal record.
+    """
+    if "thermal" not in kinds:
+        return
+    if "tumble" in kinds:
+        raise RecordError(
+            "a tumble and a thermal record together: both take off bias, scale factor and misalignment; expected the "
+            "thermal record alone (thermal fit --prior takes the tumble's knowledge in)"
+        )
+    if "warmup" in kinds[: list(kinds).index("thermal")]:
+        raise RecordError(
+            "a warm-up record before a thermal one: expected the thermal record first, since the warm-up is what is "
+            "left after the laws over temperature"
+        )
+
+
+def check_after(
+    sections: Iterable[tuple[str, Mapping[str, Any], Sequence[str]]], before: Iterable[Thermal] = ()
+) -> None:
+    """Refuse a warm-up table whose cycles were corrected by other laws over temperature than what is corrected by it.
+
+    Sections in the order of application: kind, columns, and the SHA-256 by which their record goes.
+
+    Raises
+    ------
+    RecordError
+        The table was fitted to cycles that no thermal record had corrected, or that another had.
+    """
+    found = list(before)
+    for kind, columns, hashes in sections:
+        if kind in SENSORS:
+            found.append(Thermal(hashes, SENSORS[kind]))
+        if kind != "warmup":
+            continue
+        sensors = {str(axis).partition("_")[0] for axis in columns["axes"]}
+        own, after = [each for each in found if each.sensor in sensors], columns.get("after")
+        if after is None and own:
+            raise RecordError(
+                f"a warm-up record after a thermal one, both of columns {own[0].sensor}_*, whose cycles no thermal "
+                "record had corrected: what follows the temperature would be taken off twice; expected a warm-up "
+                "record of cycles that were corrected by the thermal one (imulab apply, then warmup fit)"
+            )
+        if after is not None and not any(after in each.hashes for each in own):
+            raise RecordError(
+                f"a warm-up record whose cycles were corrected by the thermal record sha256:{after[:12]}, "
+                f"with {'another' if own else 'none'} before it: expected that one"
+            )
