@@ -5,6 +5,8 @@ The recordings are made here: a unit that is put down and turned by hand, its ou
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -218,6 +220,37 @@ def test_a_saturated_axis_is_refused_or_the_attitudes_are_left_out(clipped):
     found = trial(saturated)
     assert found["silent"] == 0
     assert (found["said"] == 6) == (clipped == 10)
+
+
+def test_an_attitude_beside_a_strong_magnet_is_named_before_it_bends_the_fit():
+    rng = np.random.default_rng(4)
+    truth, turned = unit(rng), attitudes(rng)
+    for size, refused in ((50.0, False), (400.0, True)):
+        field = world_field(24)
+        field[7] += size * direction(rng)
+        recording = table(*outputs(truth, turned, field, rng))
+        if refused:
+            with pytest.raises(il.ImulabError, match=r"row 8: the outputs .* was a magnet near.* --drop 8$"):
+                il.fit_mag(recording, gravity=G, order=2, field=f"{F} uT")
+            recording = il.fit_mag(recording, gravity=G, order=2, field=f"{F} uT", drop=["8"])
+        else:
+            recording = il.fit_mag(recording, gravity=G, order=2, field=f"{F} uT")
+            assert [one.index for one in recording.set_aside] == [7]
+        error, stated = heading_errors(recording.calibration, truth)
+        assert error < 3 * stated
+
+
+def test_axes_that_are_saturated_in_some_attitudes_are_named_with_what_they_leave():
+    rng = np.random.default_rng(9)
+    accel, mag = outputs(unit(rng), attitudes(rng), world_field(24), rng)
+    middle = mag.mean(axis=0)
+    clipped = np.clip(mag, middle - 0.8 * F, middle + 0.7 * F)
+    record = fitted(table(accel, clipped))
+    (said,) = [warning for warning in record.warnings if "scatters by" in warning]
+    found = re.search(r"is mag_([xyz]) saturated at (\S+) uT \((\d+) attitudes\)", said)
+    values = clipped[:, "xyz".index(found[1])]
+    assert min(abs(float(found[2]) - end) for end in (values.min(), values.max())) < 0.01
+    assert int(found[3]) == max((values == values.max()).sum(), (values == values.min()).sum()) > 2
 
 
 @pytest.mark.parametrize(("factor", "stated"), [(0.01, F), (10.0, F), (0.01, None), (10.0, None)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,8 @@ _DEAD = 1e-3
 _CLIPPED = 0.3
 """Share of the attitudes at one extreme of an axis from which it is taken for saturated."""
 _FLAT = 0.05
+_FAR = 4.5
+"""Distance from the middle of the outputs, over its median: up to 4.1 where axes differ in scale by a factor of 2."""
 _FIELDS = (5e-6, 2e-4)
 """Magnitudes that the field can have near the Earth's surface, T: from a quarter of the least to thrice the most."""
 
@@ -48,12 +51,14 @@ def field_means(attitudes: Attitudes, kept: NDArray[np.intp]) -> FieldMeans:
     Raises
     ------
     DataError
-        A constant or saturated axis, outputs in one plane, too few attitudes, and as for `outputs_of`.
+        A constant or saturated axis, outputs in one plane, an attitude far from all others, too few attitudes, and as
+        for `outputs_of`.
     OptionError, UnitError
         As for `outputs_of`.
     """
     found = outputs_of(attitudes, kept)
     _check(replace(found, mean=found.mean[kept]), attitudes.recording.name, triad("mag"))
+    _check_far(found.mean[kept], [attitudes.label(i) for i in kept], kept, attitudes.recording.name)
     return found
 
 
@@ -167,24 +172,42 @@ def _check(found: FieldMeans, name: str, names: list[str]) -> None:
         raise DataError(f"{name}: {n} attitudes; a magnetometer needs {FEWEST} or more, better 16, at several headings")
     span = np.ptp(found.mean, axis=0)
     for axis, column in enumerate(names):
-        values = found.mean[:, axis]
         if span[axis] <= _DEAD * span.max():
             raise DataError(
                 f"{name}: column {column}: the output changes by {span[axis]:.3g} {found.unit} over the {n} attitudes, "
                 f"other axes by {span.max():.3g} {found.unit}: a dead axis?"
             )
-        for extreme, word in ((values.max(), "largest"), (values.min(), "smallest")):
-            at = np.isclose(values, extreme, rtol=0, atol=1e-6 * span[axis])
-            if at.sum() > max(2, _CLIPPED * n):
-                raise DataError(
-                    f"{name}: column {column}: {int(at.sum())} of {n} attitudes have the {word} output, "
-                    f"{extreme:.6g} {found.unit}: the axis is saturated; expected a wider range, or less iron near"
-                )
+    count, axis, extreme = most_at_an_extreme(found.mean)
+    if count > max(2, _CLIPPED * n):
+        word = "largest" if extreme > found.mean[:, axis].mean() else "smallest"
+        raise DataError(
+            f"{name}: column {names[axis]}: {count} of {n} attitudes have the {word} output, {extreme:.6g} "
+            f"{found.unit}: the axis is saturated; expected a wider range, or less iron near"
+        )
     flat = np.linalg.svd(found.mean - found.mean.mean(axis=0), compute_uv=False)
     if flat[2] < _FLAT * flat[0]:
         raise DataError(
             f"{name}: the outputs of {' '.join(names)} lie in one plane over the {n} attitudes (spread across it "
             f"{100 * flat[2] / flat[0]:.1f} % of that along it); turn the unit about two axes"
+        )
+
+
+def most_at_an_extreme(mean: Array) -> tuple[int, int, float]:
+    """Return in how many attitudes an axis has its largest or smallest output, and which axis and output that is."""
+    ends = [(axis, float(end(mean[:, axis]))) for axis in range(3) for end in (np.max, np.min)]
+    near = 1e-6 * np.ptp(mean, axis=0)
+    return max((int((np.abs(mean[:, axis] - value) <= near[axis]).sum()), axis, value) for axis, value in ends)
+
+
+def _check_far(mean: Array, labels: Sequence[str], kept: NDArray[np.intp], name: str) -> None:
+    """Refuse outputs of one attitude that no field of the others' magnitude gives, which would bend the whole fit."""
+    distance = np.linalg.norm(mean - np.median(mean, axis=0), axis=1)
+    distance /= np.median(distance)
+    worst = int(np.argmax(distance))
+    if distance[worst] > _FAR:
+        raise DataError(
+            f"{name}: {labels[worst]}: the outputs of mag_x mag_y mag_z lie {distance[worst]:.1f} times as far from "
+            f"the middle of all as usual: was a magnet near? leave the attitude out with --drop {kept[worst] + 1}"
         )
 
 

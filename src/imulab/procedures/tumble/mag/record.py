@@ -7,9 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.estimation.least_squares import coverage_factor
 from imulab.estimation.ranked import rms
+from imulab.procedures.tumble.mag.field import FieldMeans, most_at_an_extreme
 from imulab.procedures.tumble.mag.judge import Disturbed, Seen, heading_uncertainty, leave_one_out, likeliest_step
 from imulab.procedures.tumble.mag.model import mag_names
 from imulab.procedures.tumble.mag.scaling import Ready
@@ -21,6 +23,7 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import parse_unit
 from imulab.verdict import UNJUDGED, Bad, Note
 
+_AXES = "xyz"
 _FEW = 16
 _MOVED = 3.0
 """Standard uncertainties of an accelerometer parameter beyond which the joint fit moves it too far."""
@@ -211,17 +214,19 @@ def _data(ready: Ready, joint: Joint, aside: Sequence[Disturbed]) -> dict[str, A
     }
 
 
-def _scatter(joint: Joint) -> list[str]:
+def _scatter(joint: Joint, means: FieldMeans, used: NDArray[np.intp]) -> list[str]:
     """Say if |m| or dip scatter so much that the triads do not belong together, or the field was not steady."""
     magnitude, dip = rms(joint.found.residuals[:, 1]), rms(joint.found.residuals[:, 2])
     worst = max(magnitude / _LARGE_RMS, dip / _LARGE_DIP)
     if worst <= 1:
         return []
     kind = Bad if worst > _HOPELESS else str
+    count, axis, value = most_at_an_extreme(means.mean[used])
+    clipped = f", is mag_{_AXES[axis]} saturated at {value:.4g} {means.unit} ({count} attitudes)" if count > 2 else ""
     return [
         kind(
             f"mag: |m| scatters by {100 * magnitude:.2g} % of the field, the dip by {np.degrees(dip):.2g} deg: were "
-            "both triads in the same attitudes, by one clock, and was no iron near that moved?"
+            f"both triads in the same attitudes, by one clock, and was no iron near that moved{clipped}?"
         )
     ]
 
@@ -295,7 +300,8 @@ def _warnings(
             "gravity contradict each other; was iron near, or did the unit move?"
         )
     left = np.delete(ready.kept, [one.index for one in aside])
-    found += [*_scatter(joint), *_step(joint, [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left])]
+    labels = [attitudes.label(int(np.searchsorted(ready.kept, i))) for i in left]
+    found += [*_scatter(joint, ready.means, left), *_step(joint, labels)]
     if joint.pair.held is not None and joint.sigma[2] > _POINTING:
         found.append(
             f"mag: the attitudes of --same-direction scatter by {np.degrees(joint.sigma[2]):.2g} deg about their "
