@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from imulab import disk
 from imulab.cli import main
 from imulab.cli.options import GivenFiles
 from imulab.errors import ImulabError
@@ -129,7 +130,7 @@ def test_a_large_file_gives_the_record_of_a_small_one(tmp_path, monkeypatch, kin
         return list(record.parameters), values, record.sensor, record.warnings
 
     small = outcome()
-    monkeypatch.setattr(logs, "LARGE", 0)
+    monkeypatch.setattr(disk, "LARGE", 0)
     large = outcome()
     assert large[0] == small[0]
     assert large[1] == pytest.approx(small[1], rel=1e-4)
@@ -162,7 +163,7 @@ def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, 
     il.write_csv(Recording(log(2), UNITS), later)
     record = il.fit_noise(file, columns="gyro_x,gyro_y").calibration
     small = il.check_noise(record, later)
-    monkeypatch.setattr(logs, "LARGE", 0)
+    monkeypatch.setattr(disk, "LARGE", 0)
     monkeypatch.setattr(logs, "as_recording", None)  # as a whole it is not read
     large = il.fit_noise(file, columns="gyro_x,gyro_y").calibration
     assert large.sources == record.sources
@@ -177,3 +178,80 @@ def test_functions_and_check_read_a_large_file_in_blocks(tmp_path, monkeypatch, 
     assert main(["noise", "check", str(tmp_path / "record.json"), str(later), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said == json.loads(json_text(as_json(found)))
+
+
+def mended(kind):
+    """Columns with rows that only a look at all of them tells."""
+    columns = log(n=20_000)
+    rng = np.random.default_rng(4)
+    if kind == "held":
+        return {name: np.repeat(values, 2) if name != "time" else np.arange(40_000) / RATE
+                for name, values in columns.items()}  # fmt: skip
+    struck = rng.choice(20_000, 60, replace=False)
+    columns["gyro_y"][struck] = {"plain": columns["gyro_y"][struck], "no numbers": np.nan, "zeros": 0.0}[kind]
+    if kind == "zeros":
+        columns["gyro_x"] += 30.0
+        columns["gyro_x"][struck] = 0.0
+    return columns
+
+
+@pytest.mark.parametrize("kind", ["plain", "no numbers", "zeros", "held"])
+def test_the_curve_of_a_large_file_is_that_of_a_small_one_to_the_last_bit(tmp_path, monkeypatch, capsys, kind):
+    file, report = tmp_path / "log.csv", tmp_path / "page.html"
+    il.write_csv(Recording(mended(kind), UNITS), file)
+
+    def outcomes():
+        assert main(["allan", str(file), "--json", "--taus", "dense"]) == 0
+        curve = il.allan_deviation(file, column="gyro_y")
+        assert main(["allan", str(file), "--report", str(report)]) == 0
+        return capsys.readouterr(), curve.deviation.tolist(), curve.coefficients, curve.notes, report.read_text()
+
+    small = outcomes()
+    monkeypatch.setattr(disk, "LARGE", 0)
+    monkeypatch.setattr("imulab.readers.read", None)  # as a whole it is not read
+    assert outcomes() == small
+
+
+@pytest.mark.parametrize("kind", ["zeros", "held"])
+def test_a_large_file_that_has_to_be_looked_at_as_a_whole_is_not_in_memory(tmp_path, monkeypatch, kind):
+    file = tmp_path / "log.csv"
+    il.write_csv(Recording(mended(kind), UNITS), file)
+    small = il.fit_noise(file).calibration
+    assert any({"zeros": "exact zeros", "held": "stands in 2 rows"}[kind] in note for note in small.warnings)
+    monkeypatch.setattr(disk, "LARGE", 0)
+    monkeypatch.setattr(logs, "as_recording", None)
+    held = []
+    rest_of = at_rest
+
+    def watched(recording, names):
+        rest = rest_of(recording, names)
+        held.extend(disk.stored_as(np.empty(1), rest.recording.column(name)) for name in names)
+        return rest
+
+    monkeypatch.setattr("imulab.procedures.noise.fit.at_rest", watched)
+    large = il.fit_noise(file).calibration
+    assert large.parameters == small.parameters
+    assert large.warnings == small.warnings
+    assert large.sources == small.sources
+    assert len(held) == 2
+    assert all(isinstance(values, np.memmap) for values in held)
+
+
+def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, capsys):
+    import errno
+    import io
+
+    class Full(io.BytesIO):
+        def write(self, _):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    file = tmp_path / "log.csv"
+    il.write_csv(Recording(mended("plain"), UNITS), file)
+    monkeypatch.setattr(disk, "LARGE", 0)
+    monkeypatch.setattr(disk.tempfile, "TemporaryFile", Full)
+    assert main(["allan", str(file)]) == 2
+    found = capsys.readouterr()
+    assert found.out == ""
+    assert "no room in " in found.err
+    assert "TMPDIR" in found.err
+    assert len(found.err.splitlines()) == 1

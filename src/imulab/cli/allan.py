@@ -26,12 +26,14 @@ def allan(
     json: AsJson = False,
 ) -> None:
     """Print Allan deviation and noise coefficients of every sensor column of a recording at rest."""
+    from imulab.disk import is_large, on_disk
     from imulab.estimation.column_noise import analyse
     from imulab.quantities import labelled
-    from imulab.readers import read
+    from imulab.readers import read, read_blocks
 
     check_outputs([report], [name for name in (file, options["layout"]) if name])
-    recording = read(file, **reading(options))
+    how = reading(options)
+    recording = on_disk(read_blocks(file, **how)) if is_large(file) else read(file, **how)
     with labelled("--{}", ["taus"]):
         found = analyse(recording, taus)
     if report:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import kind_of
+from imulab.disk import stored_as
 from imulab.errors import DataError
 from imulab.estimation.ranked import distinct, quantile
 from imulab.recording import Array, Recording
@@ -124,8 +125,9 @@ def leave_out(recording: Recording, names: Sequence[str]) -> LeftOut:
         return LeftOut(recording, tuple(names), kinds)
     columns = {}
     for name, column in zip(names, values, strict=True):
-        columns[name] = np.array(column)
-        columns[name][index] = np.interp(index, good, column[good])
+        mended = np.array(column)
+        mended[index] = np.interp(index, good, column[good])
+        columns[name] = stored_as(mended, column)
     return LeftOut(recording.with_columns(columns, {}), tuple(names), kinds)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imulab.disk import stored_as
 from imulab.errors import DataError
 from imulab.estimation.ranked import median, quantile
 from imulab.recording import Array, Recording, check_finite, check_time
@@ -139,11 +140,14 @@ def bridged(recording: Recording, names: list[str]) -> tuple[Recording, list[str
         return recording, []
     if count > BRIDGED * len(recording):
         check_finite(recording, [*names, *(["time"] if "time" in recording else [])])
-    columns = {name: values[timed] for name, values in recording.columns.items()}
+    columns = dict(recording.columns)
+    if not timed.all():
+        columns = {name: stored_as(values[timed], values) for name, values in columns.items()}
     row = np.arange(len(recording), dtype=np.float64)[timed]
     for name in names:
         fine = np.isfinite(columns[name])
-        columns[name] = np.interp(row, row[fine], columns[name][fine])
+        if not fine.all():
+            columns[name] = stored_as(np.interp(row, row[fine], columns[name][fine]), columns[name])
     first = recording.place(int(np.argmax(bad | ~timed)))
     return replace(recording, columns=columns), [bridged_line(recording.name, count, first)]
 

@@ -9,13 +9,14 @@ from typing import Any, ClassVar, Unpack
 
 import numpy as np
 
+from imulab.disk import is_large, on_disk
 from imulab.errors import DataError, OptionError, listed
 from imulab.estimation import allan
 from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_columns, samples_noise
 from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients_dict
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
-from imulab.procedures.inputs import Data, Part, Window, as_recording
+from imulab.procedures.inputs import Data, Part, Window, as_blocks, as_recording
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording, check_finite
 from imulab.report.elements import Exhibits, Figure, ReportTable, format_uncertain
@@ -143,7 +144,10 @@ def allan_deviation(
                 raise OptionError(f"allan_deviation: {name} does not go with such data: samples have their rate alone")
         return _of_samples(unmasked(data).astype(np.float64), rate, taus)
     given: dict[str, Any] = {**reading, "rate": rate, "window": window}
-    recording = as_recording(data, given, allan_deviation)
+    if isinstance(data, str | PathLike) and is_large(data):
+        recording = on_disk(as_blocks(data, given, allan_deviation)[0])
+    else:
+        recording = as_recording(data, given, allan_deviation)
     names = [name for name in recording.columns if name != "time"]
     chosen = column or (names[0] if len(names) == 1 else None)
     if chosen not in names:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import kind_of
+from imulab.disk import stored_as
 from imulab.errors import DataError
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.ranked import distinct, median
@@ -47,7 +48,7 @@ def own_readings(recording: Recording, names: Sequence[str]) -> tuple[Recording,
     rows = set(held.values())
     if len(rows) == 1 and (count := rows.pop()) > 1:
         kept = _first_rows([recording.column(name) for name in names], count)
-        columns = {name: values[kept] for name, values in recording.columns.items()}
+        columns = {name: stored_as(values[kept], values) for name, values in recording.columns.items()}
         notes.append(
             Note(
                 f"{recording.name}: every reading stands in {count} rows, of a sensor slower than its log: fitted are "
@@ -108,8 +109,9 @@ def _without_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Recor
                 f"samples are exact zeros in place of lost readings; expected at most {100 * _MOST:.0f} %, which are "
                 "left out"
             )
-        columns[name] = np.array(recording.column(name), dtype=np.float64)
-        columns[name][lost] = np.interp(row[lost], row[~lost], columns[name][~lost])
+        mended = np.array(recording.column(name), dtype=np.float64)
+        mended[lost] = np.interp(row[lost], row[~lost], mended[~lost])
+        columns[name] = stored_as(mended, recording.column(name))
     bad = np.logical_or.reduce(list(found.values()))
     note = (
         f"{recording.name}: {_columns(list(found))}: exact zeros in {int(np.count_nonzero(bad))} rows, the first "

@@ -1,4 +1,4 @@
-"""Logs at rest as they are given: short ones as recordings, large files block by block."""
+"""Logs at rest as they are given: short ones as recordings, large files block by block or with columns on disk."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from imulab.disk import is_large, on_disk
 from imulab.estimation.noise.long_rest import long_rest
 from imulab.estimation.noise.rest import Rest
 from imulab.procedures.inputs import Data, Reading, as_blocks, as_recording
 from imulab.recording import Recording, Source
-
-LARGE = 1 << 28
-"""Bytes of a file whose rows are not kept in memory."""
 
 
 def given_log(
@@ -44,6 +42,8 @@ def read_log(
 ) -> Recording | Rest:
     """Return a log; of a large file at rest, read block by block, what is left without its rows.
 
+    Where a large one has to be looked at as a whole, its columns lie in temporary files.
+
     Parameters
     ----------
     path
@@ -51,14 +51,16 @@ def read_log(
     blocks
         Reads it block by block, and says its source.
     whole
-        Reads it as a whole, where it is short or has faults that have to be looked at.
+        Reads it as a whole, where it is short.
     choose
         Returns the columns to fit, given the first block.
     """
-    if path is None or not path.is_file() or path.stat().st_size <= LARGE:
+    if not is_large(path):
         return whole()
     read, source = blocks()
     first = next(read)
     names = choose(first)
     found = long_rest(chain([first], read), names) if names else None
-    return whole() if found is None else replace(found, recording=replace(found.recording, source=source))
+    if found is None:
+        return replace(on_disk(blocks()[0]), source=source)
+    return replace(found, recording=replace(found.recording, source=source))
