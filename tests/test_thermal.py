@@ -196,6 +196,51 @@ def test_a_jump_of_the_temperature_is_named(made):
         il.fit_thermal([made[0].with_columns({"temperature": values}, {}), *made[1:]])
 
 
+def test_a_thermometer_that_stops_is_refused_and_one_that_never_goes_is_named(made):
+    ramp = il.simulate_thermal(ramps=1)[5]
+    values = ramp.column("temperature").copy()
+    values[4500:] = values[4500]
+    with pytest.raises(il.ImulabError, match=r"row 4501 to row 9000, column temperature: stuck at"):
+        il.fit_thermal([*made, ramp.with_columns({"temperature": values}, {})])
+    still = made[2].with_columns({"temperature": np.full(len(made[2]), 25.0)}, {})
+    record = il.fit_thermal([*made[:2], still, *made[3:]]).calibration
+    assert any("tumble_25.csv: column temperature: the same value in every row" in w for w in record.warnings)
+    constant = [warmer(each, 0) for each in made]
+    constant = [each.with_columns({"temperature": np.full(len(each), at)}, {})
+                for each, at in zip(constant, (-20.0, 0.0, 25.0, 45.0, 60.0), strict=True)]  # fmt: skip
+    assert not any("in every row" in w for w in il.fit_thermal(constant).calibration.warnings)
+
+
+def test_a_reading_in_whole_kelvins_is_not_stuck(made):
+    ramps = [r for r in il.simulate_thermal(ramps=3, turn_on=0.0) if r.name.startswith("ramp")]
+    coarse = [r.with_columns({"temperature": np.round(r.column("temperature"))}, {}) for r in (*made, *ramps)]
+    assert il.fit_thermal(coarse).calibration.fit["recordings"] == 8
+
+
+def test_recordings_that_no_power_cycle_parts_are_asked_about(made):
+    swapped = made[0].with_columns({"accel_x": made[0].column("accel_y"), "accel_y": made[0].column("accel_x")}, {})
+    record = il.fit_thermal([swapped, *made[1:]]).calibration
+    assert any("which no power cycle does: are all of one unit" in w for w in record.warnings)
+    assert record.verdict.state == "look"
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "said"),
+    [
+        (lambda r: [*r, r[0]], {}, "would count twice"),
+        (lambda r: [warmer(r[0], -300), *r[1:]], {}, "degC cannot be; expected -120 to 150 degC"),
+        (lambda r: r, {"settle": "-5 s"}, "settle -5 s: expected 0 s or more"),
+        (lambda r: r, {"degrees": "5,5,5"}, "expected a degree below their number"),
+    ],
+    ids=["twice", "cold", "settle", "degrees"],
+)
+def test_more_that_cannot_be_is_refused_in_one_line(made, change, options, said):
+    with pytest.raises(il.ImulabError) as refused:
+        il.fit_thermal(change(made), **options)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
 def test_data_inside_the_settling_time_are_refused(made):
     started = replace(made[0], metadata={**made[0].metadata, "power_on_temperature": "-20"})
     with pytest.raises(il.ImulabError, match="inside the settling time of 300 s"):

@@ -8,14 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from imulab.columns import triad
-from imulab.errors import DataError
+from imulab.errors import DataError, OptionError
 from imulab.procedures.thermal.choices import LEAST_SPAN, SETTLE
 from imulab.procedures.thermal.holds import Holds
-from imulab.recording import Recording, check_finite
+from imulab.recording import Array, Recording, check_finite
 from imulab.units import parse_unit
 
 _KELVIN = 150.0  # degC; no unit is calibrated above it, and every kelvin above -120 degC is
 _JUMP, _QUICK = 5.0, 2.0  # K; s
+_COLDEST = -120.0  # degC
+_STUCK, _SHORT, _READINGS = 200, 20.0, 20
+"""A reading that stays for so many samples, so many times as long as nearly all others, of which there are so many."""
 
 
 def prepared(
@@ -27,11 +30,14 @@ def prepared(
     ------
     DataError
         They are of two units, of two sensors' temperatures, one is there twice, or their temperature cannot be.
+    OptionError
+        The settling time is less than 0.
     """
     given = [_with_temperature(recording, column) for recording in recordings]
     _check_together(given)
     for recording in given:
         _check_temperature(recording)
+    given = _with_constant_named(given)
     low = min(float(recording.si("temperature").min()) for recording in given)
     high = max(float(recording.si("temperature").max()) for recording in given)
     if high - low < span:
@@ -78,7 +84,7 @@ def _called(recording: Recording, column: str) -> Recording:
 
 def _check_together(recordings: Sequence[Recording]) -> None:
     first = recordings[0]
-    seen: dict[str, str] = {}
+    seen: dict[bytes, str] = {}
     for recording in recordings:
         for key in ("serial", "element"):
             mine, its = first.metadata.get(key), recording.metadata.get(key)
@@ -93,12 +99,10 @@ def _check_together(recordings: Sequence[Recording]) -> None:
                 f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
                 "expected one unit"
             )
-        if recording.source is not None:
-            if recording.source.sha256 in seen:
-                raise DataError(
-                    f"{recording.name}: the same recording as {seen[recording.source.sha256]}, which would count twice"
-                )
-            seen[recording.source.sha256] = recording.name
+        own = np.column_stack([recording.column(name) for name in triad("accel")]).tobytes()
+        if own in seen:
+            raise DataError(f"{recording.name}: the same recording as {seen[own]}, which would count twice")
+        seen[own] = recording.name
 
 
 def _check_temperature(recording: Recording) -> None:
@@ -111,6 +115,13 @@ def _check_temperature(recording: Recording) -> None:
             f"{recording.name}: column temperature: {values.min():.1f} to {values.max():.1f} degC cannot be; are these "
             "kelvins? expected a title such as 'temperature [K]'"
         )
+    if values.min() < _COLDEST:
+        raise DataError(
+            f"{recording.name}: column temperature: {values.min():.1f} degC cannot be; expected {_COLDEST:g} to "
+            f"{_KELVIN:g} degC"
+        )
+    if time is not None:
+        _check_stuck(recording, values)
     if time is not None and values.size > 1:
         jump = np.abs(np.diff(values))
         index = int(np.argmax(jump))
@@ -122,9 +133,40 @@ def _check_temperature(recording: Recording) -> None:
             )
 
 
+def _check_stuck(recording: Recording, values: Array) -> None:
+    """Refuse a thermometer that stops: one reading for long, where others change every few samples."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
+    runs = np.diff(edges)
+    longest = int(np.argmax(runs))
+    if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * np.quantile(np.delete(runs, longest), 0.95)):
+        return
+    first, last = int(edges[longest]), int(edges[longest + 1]) - 1
+    raise DataError(
+        f"{recording.name}: {recording.place(first)} to {recording.place(last)}, column temperature: stuck at "
+        f"{values[first]:.6g} degC over {runs[longest]} samples, where others change every few; expected a thermometer "
+        "that goes on: choose the part before it (--window)"
+    )
+
+
+def _with_constant_named(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the same, with a note on each that has one temperature throughout while that of others changes."""
+    counts = [
+        0 if recording.time is None else len(np.unique(recording.column("temperature"))) for recording in recordings
+    ]
+    if max(counts) < _READINGS:
+        return list(recordings)
+    note = "column temperature: the same value in every row, while it changes in other recordings: a thermometer stuck?"
+    return [
+        replace(recording, notes=(*recording.notes, f"{recording.name}: {note}")) if count == 1 else recording
+        for recording, count in zip(recordings, counts, strict=True)
+    ]
+
+
 def _settled(recording: Recording, settle: float | None) -> Recording:
     """Return what lies after the settling time: by default where the head says that time counts from power-on."""
     time = recording.time
+    if settle is not None and not settle >= 0:
+        raise OptionError(f"settle {settle:g} s: expected 0 s or more")
     if settle is None:
         settle = SETTLE if "power_on_temperature" in recording.metadata else 0.0
     if time is None or not settle:

@@ -23,6 +23,8 @@ from imulab.verdict import Note
 _STANDS_OUT = 5.0
 _MOST_NAMED = 6
 _WORSE = 3.0
+_MOVES = (0.01, 0.005)
+"""What biases (g) and scale factors hardly move by from one power cycle to the next."""
 _SAME = 1e-9
 """Of two values of gravity that are one."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
@@ -156,6 +158,23 @@ def in_si_powers(solution: Solution, gravity: Gravity, scale: Array) -> tuple[Ar
     return values, covariance
 
 
+def _unlike(solution: Solution, name: str) -> list[str]:
+    """Return what says that recordings are hardly of one unit, mounted alike: a scatter that no power cycle makes."""
+    bias, scale = solution.scatter.tau.tolist()
+    found = [
+        text
+        for size, text in (
+            (bias / _MOVES[0], f"biases by {1e3 * bias:.3g} mg"),
+            (scale / _MOVES[1], f"scale factors by {100 * scale:.2g} %"),
+        )
+        if size > 1
+    ]
+    return [
+        f"{name}: from one recording to the next {' and '.join(found)} differ, which no power cycle does: are all of "
+        "one unit, its axes named alike, its temperatures by one thermometer?"
+    ] * bool(found)
+
+
 def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[Laws, Array, Array, Array, float]:
     """Return the laws of a record with coefficients and covariance in units of g, the outputs' scale, per g.
 
@@ -217,6 +236,7 @@ def _findings(
             f"{name}: too few recordings to tell how far biases move from one power cycle to the next, so no "
             "uncertainty holds that: record more temperatures or come back to some, or state --turn-on-scatter"
         )
+    found += _unlike(solution, name)
     if options["degrees"] == "auto":
         found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees)}"))
     far = [each for each in left_out if each.chi_square > _WORSE**2]
