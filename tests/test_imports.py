@@ -99,8 +99,11 @@ def test_no_circles():
         pytest.fail(f"modules import each other in a circle: {' <- '.join(error.args[1])}")
 
 
-SHARED = {f"imulab.procedures.tumble.{name}" for name in ("attitudes", "segment", "plan", "planning", "sheet")}
-"""Attitudes at rest and plans of them, which a calibration over temperature starts from as the tumble test does."""
+SHARED = {
+    f"imulab.procedures.tumble.{name}"
+    for name in ("attitudes", "segment", "plan", "planning", "sheet", "gyrorest", "gyrosolve", "gyroturns")
+}
+"""Attitudes at rest, plans of them and the turns between them: over temperature they are those of the tumble test."""
 
 
 def test_procedures_do_not_import_each_other():

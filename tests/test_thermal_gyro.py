@@ -31,7 +31,7 @@ def recordings(made):
 
 @pytest.fixture(scope="module")
 def chamber():
-    """Gyroscopes without scale or alignment errors, whose g-sensitivity is all that the holds differ by."""
+    """Eight attitudes each, whose turns are too few to tell scale factors: gyroscopes with no error of these."""
     rng = np.random.default_rng(5)
     gyros = reference.Gyros(rng)
     gyros.scale[:], gyros.matrix = [[1.0] * 3, [0.0] * 3], np.eye(3)
@@ -206,3 +206,89 @@ def test_gyroscopes_of_two_records_are_refused_together(chamber, fitted, tmp_pat
         next(apply_blocks([fitted, rate], recordings(chamber[2])[:1]))
     alone = il.fit_thermal(recordings(chamber[2]), gravity=G).calibration
     assert il.export("blob", [alone, rate], tmp_path / "out")
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """Twelve attitudes at each temperature, whose turns tell scale factors that follow it."""
+    rng = np.random.default_rng(11)
+    return reference.chamber(rng, AT, count=12, gyros=reference.Gyros(rng, scale_per_kelvin=1e-4), noise=1e-7)
+
+
+def off(record, gyros, temperature):
+    """Errors of scale factors (relative to output in rad/s), misalignments and biases over temperature."""
+    places = np.array(temperature)
+    from_middle = places - record.model["reference_temperature"]["value"]
+    scale = [
+        record.value(f"gyro_scale_factor_{a}") + record.value(f"gyro_scale_factor_{a}_t1") * from_middle for a in "xyz"
+    ]
+    matrix = np.eye(3)
+    for i, a in enumerate("xyz"):
+        for j, b in enumerate("xyz"):
+            if i != j:
+                matrix[i, j] = record.value(f"gyro_misalignment_{a}{b}")
+    bias, _ = gyro_predicted(record, places)
+    return np.array(scale).T - gyros.scale_at(places), matrix - gyros.matrix, bias.T - gyros.bias_at(places)
+
+
+def test_turns_tell_scale_factors_over_temperature_and_biases_are_of_those(turned):
+    _, gyros, made = turned
+    record = il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1").calibration
+    assert record.model["gyro"] == {
+        "output_unit": "rad/s", "degrees": {"bias": 3, "scale_factor": 1}, "g_sensitivity": True, "scale": "turns",
+    }  # fmt: skip
+    scale, matrix, bias = off(record, gyros, np.linspace(-20, 60, 9))
+    # The accelerometers' noise of 1 um/s^2 moves a direction by 1e-7, and the sum over steps is that of a smooth turn.
+    assert np.abs(scale).max() < 1e-6
+    assert np.abs(matrix).max() < 1e-6
+    assert np.abs(bias).max() < 2e-7
+    assert record.fit["gyro"]["turns"]["turns"] == 55
+    # The clock's 50 ppm are in every scale factor.
+    u = record.parameters["gyro_scale_factor_x"].standard_uncertainty
+    assert u == pytest.approx(50e-6 * record.value("gyro_scale_factor_x"), rel=0.05)
+
+
+def test_counts_get_their_scale_factor_from_the_turns(turned):
+    _, _, made = turned
+    nominal = il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1").calibration
+    counts = [{**c, **{f"gyro_{a}": c[f"gyro_{a}"] * 900.0 for a in "xyz"}} for c in made]
+    units = {**UNITS, **{f"gyro_{a}": "count" for a in "xyz"}}
+    given = [il.Recording(columns=c, units=units, name=f"soak_{k + 1}.csv") for k, c in enumerate(counts)]
+    record = il.fit_thermal(given, gravity=G, with_="gyro", degrees="3,2,1").calibration
+    for name in ("gyro_scale_factor_x", "gyro_scale_factor_y_t1"):
+        assert record.value(name) == pytest.approx(900.0 * nominal.value(name), rel=1e-4)
+        assert record.parameters[name].unit.startswith("count/(rad/s)")
+    for name in ("gyro_bias_z", "gyro_bias_z_t2", "gyro_g_sensitivity_xy"):
+        assert record.value(name) == pytest.approx(nominal.value(name), rel=1e-4)
+        assert record.parameters[name].unit == nominal.parameters[name].unit
+    found, expected = il.apply(record, given[0]), il.apply(nominal, recordings(made)[0])
+    assert np.abs(found.triad("gyro") - expected.triad("gyro")).max() < 1e-5
+
+
+def test_counts_without_turns_are_refused(chamber):
+    units = {**UNITS, **{f"gyro_{a}": "count" for a in "xyz"}}
+    given = [il.Recording(columns=c, units=units, name=f"soak_{k + 1}.csv") for k, c in enumerate(chamber[2])]
+    with pytest.raises(il.ImulabError, match=r"^soak_1.csv: columns gyro_x gyro_y gyro_z are in count, of which turns"):
+        il.fit_thermal(given, gravity=G, with_="gyro")
+
+
+def test_degrees_taken_for_radians_are_said_by_the_turns(turned):
+    made = [{**c, **{f"gyro_{a}": np.degrees(c[f"gyro_{a}"]) for a in "xyz"}} for c in turned[2]]
+    made = [{**c, **{f"gyro_{a}": c[f"gyro_{a}"] - c[f"gyro_{a}"][:300].mean() for a in "xyz"}} for c in made]
+    record = il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1").calibration
+    assert record.verdict.state == "bad"
+    assert any("the scale factors are off by" in each and "is the unit" in each for each in record.warnings)
+
+
+def test_lost_samples_and_saturated_turns_are_named(turned):
+    made = [dict(columns) for columns in turned[2]]
+    for a in "xyz":
+        made[1][f"gyro_{a}"] = np.clip(made[1][f"gyro_{a}"], -1.5, 1.5)
+    keep = np.ones(len(made[3]["time"]), dtype=bool)
+    keep[720:760] = False  # within a turn: 700 to 800
+    made[3] = {name: values[keep] for name, values in made[3].items()}
+    record = il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1").calibration
+    said = [each for each in record.warnings if each.startswith(("soak_2", "soak_4"))]
+    assert any("soak_2.csv: gyro: " in each and "clipped" in each for each in said)
+    assert any("soak_4.csv: gyro: 1 turn left out, samples are missing" in each for each in said)
+    assert np.abs(off(record, turned[1], [0.0, 60.0])[0]).max() < 1e-5

@@ -20,6 +20,7 @@ from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose
 from imulab.procedures.thermal.gyro import fit_gyroscopes
 from imulab.procedures.thermal.gyroholds import check_gyroscopes, rates_at_rest
 from imulab.procedures.thermal.gyrorecord import with_gyroscopes
+from imulab.procedures.thermal.gyroscale import nominal_output, scale_from_turns
 from imulab.procedures.thermal.holds import Holds, find_holds
 from imulab.procedures.thermal.lag import drift_of, moving
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
@@ -164,9 +165,7 @@ def fit_thermal(
     options = {key: value for key, value in options.items() if value is not None}
     record = make_record(holds, problem, solution, drift, steps, held, view, local, scale, options, name)
     if further:
-        rest = rates_at_rest(holds, _force(problem, solution))
-        gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, rates, name)
-        record = with_gyroscopes(record, holds, gyros, local.value, name)
+        record = _with_gyroscopes(record, holds, problem, solution, scale, wanted, rates, name)
     return ThermalFit(record, view, tuple(steps), tuple(held))
 
 
@@ -179,10 +178,23 @@ def _several(data: Data | Sequence[Data]) -> list[Any]:
     return given
 
 
-def _force(problem: Problem, solution: Solution) -> Array:
-    """Return the specific force in each hold, in g, shape (n, 3)."""
+def _with_gyroscopes(
+    record: Calibration,
+    holds: Holds,
+    problem: Problem,
+    solution: Solution,
+    scale: Array,
+    wanted: str | Degrees,
+    tau: float | None,
+    name: str,
+) -> Calibration:
+    """Return the record of the accelerometers with the gyroscopes: biases at rest, then scale factors from turns."""
     laws = solution.laws
-    return forces(laws.design(problem.temperature) @ solution.coefficients[: laws.size], problem.reading)[0]
+    force, _ = forces(laws.design(problem.temperature) @ solution.coefficients[: laws.size], problem.reading)
+    nominal = nominal_output(holds, record, holds.recordings[0].triad_unit("gyro"))
+    gyros = fit_gyroscopes(rates_at_rest(holds, force, nominal), laws.low, laws.high, wanted, tau, name)
+    turned = scale_from_turns(holds, problem, solution, record, gyros, scale)
+    return with_gyroscopes(record, holds, gyros, turned, name)
 
 
 def _scatter(given: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:

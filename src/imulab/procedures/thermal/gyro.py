@@ -52,6 +52,23 @@ class Gyroscopes:
     left_out: tuple[LeftOut, ...]
     aside: NDArray[np.int64]
 
+    def at_rest(self, temperature: Array) -> Array:
+        """Return the biases at temperatures (n,), rad/s, shape (n, 3)."""
+        laws, degree = self.solution.laws, self.solution.laws.degrees[0]
+        rows = self.solution.coefficients[: self.size].reshape(3, degree + 1)
+        return np.asarray(np.polynomial.chebyshev.chebvander(laws.place(temperature), degree) @ rows.T, np.float64)
+
+    def sensitivities(self, gravity: float) -> Array:
+        """Return G, rad/s per m/s^2, shape (3, 3)."""
+        return self.solution.coefficients[self.size :].reshape(3, 3) / gravity
+
+    def again(self, held: RatesAtRest) -> Gyroscopes:
+        """Return the same terms fitted to other means of the same holds, with the scatter that was found."""
+        laws, scatter = self.solution.laws, self.solution.scatter
+        found = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity)
+        assert found is not None
+        return replace(self, held=held, solution=replace(found, scatter=scatter))
+
     @property
     def size(self) -> int:
         """Number of coefficients of the biases."""

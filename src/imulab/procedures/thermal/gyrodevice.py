@@ -12,15 +12,13 @@ from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
-from imulab.procedures.thermal.gyrorecord import SENSITIVITIES
-from imulab.procedures.thermal.model import AXES, law_names
+from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, law_names
 from imulab.procedures.thermal.sections import GyroModel, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.triads import GyroscopeLaws, output_to_si
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
-_PAIRS = tuple((i, j) for i in range(3) for j in range(3) if i != j)
 _NODES = np.linspace(-1.0, 1.0, 65)
 
 
@@ -63,9 +61,8 @@ def gyro_laws_of(record: Calibration) -> Array:
 def _matrix(record: Calibration, gyro: GyroModel) -> Array:
     """Return T, the identity where turns did not tell it."""
     matrix = np.eye(3)
-    for i, j in _PAIRS:
-        if gyro.scale == "turns":
-            matrix[i, j] = values_of(record, [f"gyro_misalignment_{AXES[i]}{AXES[j]}"], "rad")[0]
+    if gyro.scale == "turns":
+        matrix[~np.eye(3, dtype=np.bool_)] = values_of(record, MISALIGNMENTS, "rad")
     return matrix
 
 

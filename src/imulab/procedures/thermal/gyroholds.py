@@ -34,7 +34,7 @@ class RatesAtRest:
     Attributes
     ----------
     mean, covariance
-        Mean outputs, shape (n, 3), and their covariances, (n, 3, 3); rad/s where the unit is one of rate.
+        Mean outputs, shape (n, 3), and their covariances, (n, 3, 3), in rad/s by the nominal scale factors.
     force
         Specific force, in g, shape (n, 3).
     temperature, rate, step, shared, recording
@@ -45,6 +45,8 @@ class RatesAtRest:
         Place among the holds, shape (n,).
     unit
         Of the outputs, as read.
+    size
+        Nominal output per rad/s that the means are in units of, shape (3,): 1 where the unit is one of rate.
     notes
         What a user should know of how they were found.
     """
@@ -60,6 +62,7 @@ class RatesAtRest:
     attitude: NDArray[np.int64]
     index: NDArray[np.int64]
     unit: str
+    size: Array
     notes: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -70,7 +73,7 @@ class RatesAtRest:
         return RatesAtRest(
             self.mean[kept], self.covariance[kept], self.force[kept], self.temperature[kept], self.rate[kept],
             self.step[kept], self.shared[kept], self.recording[kept], self.attitude[kept], self.index[kept],
-            self.unit, self.notes,
+            self.unit, self.size, self.notes,
         )  # fmt: skip
 
 
@@ -106,8 +109,14 @@ def check_gyroscopes(recordings: Sequence[Recording]) -> str:
     return first
 
 
-def rates_at_rest(holds: Holds, force: Array) -> RatesAtRest:
-    """Average the gyroscopes over the holds, under specific forces in g, shape (n, 3).
+def output_in(recording: Recording, size: Array) -> Array:
+    """Return the outputs in rad/s by nominal scale factors, output per rad/s for what is no rate, shape (n, 3)."""
+    unit, output = recording.triad_unit("gyro"), recording.triad("gyro")
+    return (to_si(output, unit) if parse_unit(unit).quantity == "rate" else output) / size
+
+
+def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
+    """Average the gyroscopes over the holds, under specific forces in g, shape (n, 3), by nominal scale factors (3,).
 
     Raises
     ------
@@ -117,14 +126,12 @@ def rates_at_rest(holds: Holds, force: Array) -> RatesAtRest:
         Their units differ between recordings.
     """
     unit = check_gyroscopes(holds.recordings)
-    known = parse_unit(unit)
     cuts: list[Cut | None] = [None] * len(holds)
     notes: list[str] = []
     for number, recording in enumerate(holds.recordings):
         check_finite(recording, _COLUMNS)
         left_out = leave_out(recording, _COLUMNS)
-        output = left_out.recording.triad("gyro")
-        output = to_si(output, unit) if known.quantity == "rate" else output
+        output = output_in(left_out.recording, size)
         own = np.flatnonzero(holds.recording == number)
         rest, found, moved = _still_cuts(holds, own, output, recording)
         notes += [f"gyro: {recording.name}: {note}" for note in left_out.notes(rest)] + moved
@@ -135,7 +142,7 @@ def rates_at_rest(holds: Holds, force: Array) -> RatesAtRest:
     if not averages:
         raise DataError(f"{holds.recordings[0].name}: columns gyro_x gyro_y gyro_z: they turn in every hold")
     mean = np.array([cut.mean for cut in averages])
-    if known.quantity == "rate" and np.abs(np.median(mean, axis=0)).max() > _LARGEST:
+    if np.abs(np.median(mean, axis=0)).max() > _LARGEST:
         worst = int(np.argmax(np.abs(np.median(mean, axis=0))))
         raise DataError(
             f"{holds.recordings[0].name}: column {_COLUMNS[worst]}: "
@@ -146,7 +153,7 @@ def rates_at_rest(holds: Holds, force: Array) -> RatesAtRest:
     attitude = np.where(alone, len(holds) + np.arange(len(holds)), holds.group)
     return RatesAtRest(
         mean, pooled(averages), force[kept], holds.temperature[kept], holds.rate[kept], holds.step[kept],
-        holds.shared[kept], holds.recording[kept], attitude[kept], np.flatnonzero(kept), unit, tuple(notes),
+        holds.shared[kept], holds.recording[kept], attitude[kept], np.flatnonzero(kept), unit, size, tuple(notes),
     )  # fmt: skip
 
 

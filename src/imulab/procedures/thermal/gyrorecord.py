@@ -8,32 +8,42 @@ from typing import Any
 import numpy as np
 
 from imulab.procedures.thermal.gyro import Gyroscopes
+from imulab.procedures.thermal.gyroscale import ScaleLaws, block_diagonal, joint_covariance, rescaled
 from imulab.procedures.thermal.holds import Holds
-from imulab.procedures.thermal.model import AXES, law_names
+from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, law_names
 from imulab.procedures.thermal.record import interval_of, law_at
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
+from imulab.units import from_si, parse_unit
 from imulab.verdict import UNJUDGED, Note
 
-SENSITIVITIES = tuple(f"gyro_g_sensitivity_{a}{b}" for a in AXES for b in AXES)
 _WORSE = 3.0
 
 
-def with_gyroscopes(record: Calibration, holds: Holds, gyros: Gyroscopes, gravity: float, name: str) -> Calibration:
+def with_gyroscopes(
+    record: Calibration, holds: Holds, gyros: Gyroscopes, turned: ScaleLaws | None, name: str
+) -> Calibration:
     """Return the record with the gyroscopes' laws, their covariance (independent of the accelerometers') and data."""
-    solution, laws = gyros.solution, gyros.solution.laws
-    matrix = _to_si(gyros, gravity)
-    values, covariance = matrix @ solution.coefficients, matrix @ solution.covariance @ matrix.T
-    names, units = names_and_units(laws.degrees[0], sensitivity=gyros.sensitivity)
-    freedom = [solution.degrees_of_freedom(row) for row in matrix]
+    gyros = gyros if turned is None else rescaled(gyros, turned)
+    degree = gyros.solution.laws.degrees[0]
+    names, units = names_and_units(degree, sensitivity=gyros.sensitivity)
+    matrix, coefficients = _to_si(gyros, record.model["gravity"]["value"]), gyros.solution.coefficients
+    covariance = gyros.solution.covariance
+    freedom = [gyros.solution.degrees_of_freedom(row) for row in matrix]
+    if turned is not None:
+        own, more, their_units = scale_to_si(turned, gyros.held.size, gyros.held.unit)
+        names, units, freedom = names + more, units + their_units, freedom + [np.inf] * len(more)
+        matrix = block_diagonal(matrix, own)
+        coefficients = np.concatenate([coefficients, turned.coefficients])
+        covariance = joint_covariance(gyros, turned)
+    values, covariance = matrix @ coefficients, matrix @ covariance @ matrix.T
     parameters = {
         key: Parameter(float(value), float(u), unit, interval_95=interval_of(float(value), float(u), nu))
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(covariance)), units, freedom, strict=True)
     }
-    n = len(record.covariance.names)
-    joined = np.zeros((n + len(names), n + len(names)))
-    joined[:n, :n], joined[n:, n:] = record.covariance.array(), covariance
+    joined = block_diagonal(record.covariance.array(), covariance)
+    fit = _fit(gyros, known="gyro_turn_on_scatter" in record.options)
     return replace(
         record,
         parameters={**record.parameters, **parameters},
@@ -42,14 +52,14 @@ def with_gyroscopes(record: Calibration, holds: Holds, gyros: Gyroscopes, gravit
             **record.model,
             "gyro": {
                 "output_unit": gyros.held.unit,
-                "degrees": {"bias": laws.degrees[0], "scale_factor": 0},
+                "degrees": {"bias": degree, "scale_factor": 0 if turned is None else turned.degree},
                 "g_sensitivity": gyros.sensitivity,
-                "scale": "nominal",
+                "scale": "nominal" if turned is None else "turns",
             },
         },
-        fit={**record.fit, "gyro": _fit(gyros, known="gyro_turn_on_scatter" in record.options)},
+        fit={**record.fit, "gyro": fit if turned is None else {**fit, "turns": _turns(turned)}},
         data={**record.data, "gyro": _data(holds, gyros)},
-        warnings=(*record.warnings, *_findings(record, holds, gyros, name)),
+        warnings=(*record.warnings, *_findings(record, holds, gyros, turned, name)),
         verdict=UNJUDGED,
     )
 
@@ -60,6 +70,32 @@ def _to_si(gyros: Gyroscopes, gravity: float) -> Array:
     matrix = np.eye(count) / gravity
     matrix[:size, :size] = gyros.solution.laws.to_powers()[:size, :size]
     return matrix
+
+
+def scale_to_si(turned: ScaleLaws, size: Array, output: str) -> tuple[Array, list[str], list[str]]:
+    """Return the matrix from coefficients of scale factors to powers of T - T0, outputs per rad/s, names and units."""
+    count, width = len(turned.coefficients), turned.degree + 1
+    unit = from_si(1.0, output) if parse_unit(output).quantity == "rate" else 1.0
+    powers = turned.laws.to_powers()[3 : 3 + width, 3 : 3 + width]
+    matrix = np.eye(count)
+    names: list[str] = []
+    units: list[str] = []
+    for k, axis in enumerate(AXES):
+        own = slice(k * width, (k + 1) * width)
+        matrix[own, own] = powers * size[k] * unit
+        law = law_names(f"gyro_scale_factor_{axis}", f"{output}/(rad/s)", turned.degree)
+        names, units = names + law[0], units + law[1]
+    return matrix, names + list(MISALIGNMENTS), units + ["rad"] * len(MISALIGNMENTS)
+
+
+def _turns(turned: ScaleLaws) -> dict[str, Any]:
+    return {
+        "recordings": turned.recordings,
+        "turns": turned.turns,
+        "rms": {"value": turned.miss, "unit": "rad"},
+        "chi_square": turned.chi_square,
+        "degrees_of_freedom": turned.freedom,
+    }
 
 
 def names_and_units(degree: int, *, sensitivity: bool) -> tuple[list[str], list[str]]:
@@ -103,7 +139,7 @@ def _data(holds: Holds, gyros: Gyroscopes) -> dict[str, Any]:
     }
 
 
-def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, name: str) -> list[str]:
+def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, turned: ScaleLaws | None, name: str) -> list[str]:
     found = list(gyros.held.notes)
     found += [
         f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
@@ -121,7 +157,11 @@ def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, name: str) -
         for each in gyros.left_out
         if each.chi_square > _WORSE**2
     ]
-    return [*found, Note(f"gyro: bias of degree {gyros.solution.laws.degrees[0]}; scale factors as stated by the unit")]
+    degree = gyros.solution.laws.degrees[0]
+    if turned is None:
+        return [*found, Note(f"gyro: bias of degree {degree}; no turns tell the scale factors, which are as stated")]
+    said = f"gyro: bias of degree {degree}, scale factor of degree {turned.degree} from {turned.turns} turns"
+    return [*found, *turned.notes, Note(said)]
 
 
 def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:

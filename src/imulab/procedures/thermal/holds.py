@@ -50,6 +50,8 @@ class Holds:
         Of the outputs.
     recordings
         As they were given, after the settling time.
+    attitudes
+        Those of each recording; one where it rests throughout.
     notes
         What a user should know of how they were found.
     """
@@ -66,6 +68,7 @@ class Holds:
     stop: Array
     unit: str
     recordings: tuple[Recording, ...]
+    attitudes: tuple[Attitudes, ...]
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -133,6 +136,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         stop=np.array([cut.stop for cut in cuts]),
         unit=attitudes[0].unit,
         recordings=tuple(recordings),
+        attitudes=tuple(attitudes),
         notes=tuple(f"{found.recording.name}: {note}" for found in attitudes for note in found.notes),
     )
 

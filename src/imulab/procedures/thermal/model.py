@@ -17,6 +17,9 @@ from numpy.polynomial import chebyshev
 from imulab.recording import Array
 
 AXES = ("x", "y", "z")
+MISALIGNMENTS = tuple(f"gyro_misalignment_{a}{b}" for a in AXES for b in AXES if a != b)
+SENSITIVITIES = tuple(f"gyro_g_sensitivity_{a}{b}" for a in AXES for b in AXES)
+"""Of gyroscopes, in the order of their parameters."""
 GROUPS = (("bias", AXES), ("scale_factor", AXES), ("misalignment", ("yx", "zx", "zy")))
 """Kinds of parameters, three each, in the order of the parameter vector."""
 

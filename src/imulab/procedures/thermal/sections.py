@@ -108,6 +108,16 @@ class GyroTurnOn(Part):
     from_: str
 
 
+class GyroTurns(Part):
+    """``fit.gyro.turns``: of how many recordings, what they miss the direction of gravity by (rms), how they agree."""
+
+    recordings: int
+    turns: int
+    rms: Length
+    chi_square: Size
+    degrees_of_freedom: int
+
+
 class GyroFit(Part):
     """``fit.gyro``; rms in rad/s, as those of temperatures left out."""
 
@@ -117,6 +127,7 @@ class GyroFit(Part):
     between_recordings: GyroTurnOn
     left_out_temperature: list[LeftOut]
     g_sensitivity_probability: float | None = None
+    turns: GyroTurns | None = None
 
 
 class Fit(Part):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
-from imulab.estimation.least_squares import Observability, covariance, observability
+from imulab.estimation.least_squares import Observability, observability
 from imulab.estimation.rows import LeftOut, leave_out
 from imulab.procedures.tumble.apply import output_factor, specific_force
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -30,7 +30,7 @@ from imulab.procedures.tumble.findings import aside_of
 from imulab.procedures.tumble.gyroclock import CRYSTAL, Clock, clock_of_scale, compare_clocks, counted, evened
 from imulab.procedures.tumble.gyrolinear import Nonlinearity, test_linearity
 from imulab.procedures.tumble.gyrorest import clock_notes, find_holds
-from imulab.procedures.tumble.gyrosolve import Case, Solved, solve_turns
+from imulab.procedures.tumble.gyrosolve import Case, Solved, solve_turns, turn_covariance
 from imulab.procedures.tumble.gyroturns import COLUMNS, ROWS, shared_covariance
 from imulab.procedures.tumble.sections import fit_of, model_of
 from imulab.recording import Array, Recording, check_finite, check_time
@@ -164,7 +164,7 @@ def fit_gyro(
     directions = direction_covariance(record, attitudes, means, case.force)
     zero = None if fit_bias else found.rest.zero_uncertainty
     shared = shared_covariance(segments, found.scale, found.theta, directions, zero)
-    matrix, variance = _covariance_with_shared(found, shared, freedom)
+    matrix, variance = turn_covariance(found, shared, freedom)
     linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
     if linearity is not None:
         notes += linearity.notes()
@@ -236,19 +236,6 @@ def _observability_of_turns(found: Solved, freedom: int, name: str) -> Observabi
             f"(condition number {seen.condition:.0f}); use more turns, about more directions"
         )
     return seen
-
-
-def _covariance_with_shared(found: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
-    """Return the covariance of the parameters, (p, p), and the variance that each residual has of its own.
-
-    `shared`, (3 m, 3 m), is what the residuals have in common; what they scatter beyond it is taken to be alike in all.
-    """
-    residual, jacobian = found.residual, found.jacobian
-    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
-    pulled = jacobian.T @ shared @ jacobian
-    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
-    variance = max(left, 0.0) / freedom
-    return bread @ pulled @ bread + variance * bread, variance
 
 
 def _record_notes(record: Calibration, attitudes: Attitudes, force: Array) -> list[str]:

@@ -181,3 +181,16 @@ def _outliers(segments: Segments, scale: Array, fit: Fit) -> tuple[NDArray[np.bo
     for k in np.flatnonzero(out).tolist():
         out[k] = m * f_test(cost + float(far[k]), size, cost, size + 2, left + size + 2) < _BY_CHANCE
     return out, np.linalg.norm(residual, axis=1)
+
+
+def turn_covariance(found: Solved, shared: Array, freedom: int) -> tuple[Array, float]:
+    """Return the covariance of the parameters, (p, p), and the variance that each residual has of its own.
+
+    `shared`, (3 m, 3 m), is what the residuals have in common; what they scatter beyond it is taken to be alike in all.
+    """
+    residual, jacobian = found.residual, found.jacobian
+    bread = covariance(jacobian[None], np.ones((1, len(residual))))[0]
+    pulled = jacobian.T @ shared @ jacobian
+    left = float(residual @ residual) - float(np.trace(shared)) + float(np.trace(bread @ pulled))
+    variance = max(left, 0.0) / freedom
+    return bread @ pulled @ bread + variance * bread, variance

@@ -151,17 +151,22 @@ def shared_covariance(segments: Segments, scale: Array, theta: Array, known: Arr
     zero
         Standard uncertainty of the output at rest, shape (3,), or None where the biases are fitted.
     """
-    m = len(segments.before)
-    spread = np.zeros((m, 3, len(known) // 3, 3))
-    spread[range(m), :, segments.attitude, :] = carried(segments, scale, theta)
-    spread[range(m), :, segments.attitude + 1, :] -= np.eye(3)
-    flat = spread.reshape(3 * m, -1)
+    flat = by_directions(segments, scale, theta, len(known) // 3)
     found: Array = flat @ known @ flat.T
     if zero is not None:
         moved = model(segments, scale, np.concatenate([theta[:9], np.zeros(3)]), fit_bias=True)[1][:, 9:]
         moved = moved * (zero / scale)
         found += moved @ moved.T
     return found
+
+
+def by_directions(segments: Segments, scale: Array, theta: Array, holds: int) -> Array:
+    """Return the derivatives of the residuals by the upward directions of all holds, shape (3 m, 3 holds)."""
+    m = len(segments.before)
+    spread = np.zeros((m, 3, holds, 3))
+    spread[range(m), :, segments.attitude, :] = carried(segments, scale, theta)
+    spread[range(m), :, segments.attitude + 1, :] -= np.eye(3)
+    return spread.reshape(3 * m, -1)
 
 
 def carried(segments: Segments, scale: Array, theta: Array) -> Array:
