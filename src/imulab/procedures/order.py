@@ -40,7 +40,8 @@ def check_order(kinds: Sequence[str]) -> None:
     Raises
     ------
     RecordError
-        A tumble is beside a thermal record, which contains it; or a warm-up table comes before the thermal record.
+        A tumble is beside a thermal record, which contains it, or gyroscopes beside one that holds them; or a warm-up
+        table comes before the thermal record.
     """
     if "thermal" not in kinds:
         return
@@ -48,6 +49,11 @@ def check_order(kinds: Sequence[str]) -> None:
         raise RecordError(
             "a tumble and a thermal record together: both take off bias, scale factor and misalignment; expected the "
             "thermal record alone (thermal fit --prior takes the tumble's knowledge in)"
+        )
+    if "gyro" in kinds and "thermal_gyro" in kinds:
+        raise RecordError(
+            "a gyroscope record beside a thermal one that holds gyroscopes too: both take off their biases; expected "
+            "the thermal record alone, or one fitted without --with gyro"
         )
     if "warmup" in kinds[: list(kinds).index("thermal")]:
         raise RecordError(
