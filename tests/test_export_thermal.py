@@ -134,12 +134,19 @@ def test_the_offsets_of_gyroscopes_follow_the_temperature_in_the_programs_formul
     told = []
     file = il.export(target, six_axes, tmp_path, lossy=True, device_id=77, tell=told.append)[0]
     correct = rates_by(target, file)
+
+    def value(name, power):
+        return six_axes.value(name + (f"_t{power}" if power else ""))
+
     zero, (low, high) = six_axes.model["reference_temperature"]["value"], six_axes.model["range"]
     for temperature in np.linspace(low - 10, high + 10, 41):
         t = min(max(temperature, low), high) - zero
-        bias = [sum(six_axes.value(f"gyro_bias_{a}" + (f"_t{k}" if k else "")) * t**k for k in range(4)) for a in "xyz"]
-        # Half of what single precision resolves of the largest coefficient, 1e6 times that per K, at 45 K from 35 degC.
-        assert np.abs(correct(np.array(bias), temperature)).max() < np.radians(0.3 / 3600)
+        bias, scale = (
+            np.array([sum(value(f"gyro_{kind}_{a}", k) * t**k for k in range(degree + 1)) for a in "xyz"])
+            for kind, degree in (("bias", 3), ("scale_factor", 1))
+        )
+        # The fourth power of the product, some 1e-4/K times 2e-6 deg/s/K^3, is what a cubic leaves: 40^4 / 8 of it.
+        assert np.abs(correct(np.radians(scale) * bias, temperature)).max() < np.radians(1e-4 * 2e-6 * 40**4 * 3 / 8)
     felt = [sum(abs(six_axes.value(f"gyro_g_sensitivity_{a}{b}")) for b in "xyz") for a in "xyz"]
     (drift,) = re.findall(r"gyro_g_sensitivity, which changes outputs by up to (\S+) deg/s within", told[0])
     assert float(drift) == pytest.approx(np.degrees(max(felt)) * G, rel=0.01)
