@@ -148,7 +148,21 @@ def test_the_offsets_of_gyroscopes_follow_the_temperature_in_the_programs_formul
         # The fourth power of the product, some 1e-4/K times 2e-6 deg/s/K^3, is what a cubic leaves: 40^4 / 8 of it.
         assert np.abs(correct(np.radians(scale) * bias, temperature)).max() < np.radians(1e-4 * 2e-6 * 40**4 * 3 / 8)
     felt = [sum(abs(six_axes.value(f"gyro_g_sensitivity_{a}{b}")) for b in "xyz") for a in "xyz"]
-    (drift,) = re.findall(r"gyro_g_sensitivity, which changes outputs by up to (\S+) deg/s within", told[0])
+    said = r"gyro_g_sensitivity, which changes outputs by up to (\S+) % of the rate, up to (\S+) deg/s within"
+    ((share, drift),) = re.findall(said, told[0])
+    matrix = np.eye(3)
+    for i, a in enumerate("xyz"):
+        for j, b in enumerate("xyz"):
+            if i != j:
+                matrix[i, j] = six_axes.value(f"gyro_misalignment_{a}{b}")
+    ends = [
+        np.radians(
+            [value(f"gyro_scale_factor_{a}", 0) + value(f"gyro_scale_factor_{a}", 1) * (t - zero) for a in "xyz"]
+        )
+        for t in (low, high)
+    ]
+    worst = max(np.abs(end[:, None] * matrix - np.eye(3)).sum(axis=1).max() for end in ends)
+    assert float(share) == pytest.approx(100 * worst, rel=0.01)
     assert float(drift) == pytest.approx(np.degrees(max(felt)) * G, rel=0.01)
     assert re.search(r"the offset of the gyroscopes changes by up to \S+ deg/h per K", file.read_text())
 
