@@ -144,6 +144,27 @@ def test_a_record_that_was_made_up_wrongly_is_refused(record, tmp_path, change, 
         il.load(tmp_path / "n.json")
 
 
+def test_the_table_of_models_names_next_what_the_choice_found_next():
+    """Least deviance plus 4 a parameter, whatever the weights; here a model weighs more than the one that is chosen."""
+    log = il.simulate_noise(white="0.3 deg/sqrt(h)", flicker="12 deg/h", walk="60 deg/h/sqrt(h)", duration="30 min",
+                            rate=50.0)  # fmt: skip
+    fit = il.fit_noise(log)
+    (table,) = (each for each in exhibits(fit.calibration).items if each.title == "Models")
+    heavier = 0
+    for name, chosen, following, weights, *_ in table.rows:
+        found = fit.calibration.fit["columns"][name]["candidates"]
+        price = {
+            each["model"]: each["deviance"] + 4 * (len(each["model"]) + each["model"].count("G")) for each in found
+        }
+        first, second = sorted(price, key=price.get)[:2]
+        assert (chosen, following) == (first, f"{second} +{price[second] - price[first]:.1f}")
+        weight = {each["model"]: f"{each['model']} {each['weight']:.0%}" for each in found}
+        assert weights.split(", ")[0] == weight[chosen]
+        heavier += len(weights.split(", ")) - 1
+        assert weights.split(", ")[-1] == max(weight.values(), key=lambda text: int(text.split()[1][:-1]))
+    assert heavier > 0
+
+
 def test_several_logs_add_up(record):
     both = il.fit_noise([log(1), log(2)]).calibration
     ratio = (

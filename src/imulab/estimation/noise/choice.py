@@ -13,7 +13,7 @@ from imulab.estimation.noise.terms import NAMES, Bins, terms
 from imulab.recording import Array
 
 CANDIDATES = ("N", "NK", "NB", "NG", "NBK", "NGK", "NGB", "NGG", "NGGK")
-_PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 4.0, 12.0
+PER_PARAMETER, _RIVAL, _QUANTISATION = 4.0, 4.0, 12.0
 """What a parameter must gain in deviance, how near a rival is, what quantisation noise must gain."""
 _LARGEST_VARIANCE = 2.0
 """Of the logarithm of a square: beyond it the expansion that it comes from says nothing more."""
@@ -39,7 +39,7 @@ class Choice:
 
     @property
     def _cost(self) -> Array:
-        return np.asarray(self.deviance + _PER_PARAMETER * self.models.sum(axis=-1))
+        return np.asarray(self.deviance + PER_PARAMETER * self.models.sum(axis=-1))
 
     @property
     def chosen(self) -> NDArray[np.int64]:
@@ -55,7 +55,11 @@ class Choice:
 
     @property
     def weights(self) -> Array:
-        """``exp(-deviance/2 - parameters)`` over their sum, shape (c, m)."""
+        """``exp(-deviance/2 - parameters)`` over their sum, shape (c, m).
+
+        A parameter counts half of what it does in the choice: with the same price averages are too sure of the fewest
+        terms, and the mean over a tenth of a log of a Gauss-Markov process as long is within 2 u in 87 %, not 91 %.
+        """
         exponent = self.deviance / 2 + self.models.sum(axis=-1)
         weights = np.exp(exponent.min(axis=-1, keepdims=True) - exponent)
         return np.asarray(weights / weights.sum(axis=-1, keepdims=True))

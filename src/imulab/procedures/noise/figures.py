@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.noise.terms import LINEAR, allan_terms
+from imulab.estimation.noise.choice import PER_PARAMETER
+from imulab.estimation.noise.terms import LINEAR, allan_terms, terms
 from imulab.estimation.noise.use import at_band_edge
 from imulab.procedures.noise.choices import rejected
 from imulab.procedures.noise.engineering import density, label, shown, split
@@ -130,14 +131,16 @@ def _for_filters(fit: Fit) -> ReportTable:
 def _models(fit: Fit) -> ReportTable:
     rows = []
     for name, column in fit.columns.items():
-        rivals = sorted((c for c in column.candidates if c.model != column.chosen), key=lambda c: -c.weight)
-        chosen = next(c for c in column.candidates if c.model == column.chosen)
-        best = f"{rivals[0].model} ({rivals[0].weight:.0%})" if rivals else "–"
+        price = {each.model: each.deviance + PER_PARAMETER * int(terms(each.model).sum()) for each in column.candidates}
+        weight = {each.model: each.weight for each in column.candidates}
+        others = sorted(price.keys() - {column.chosen}, key=price.__getitem__)
+        heavy = max(weight, key=weight.__getitem__)
         rows.append(
             [
                 name,
-                f"{column.chosen} ({chosen.weight:.0%})",
-                best,
+                column.chosen,
+                f"{others[0]} +{max(price[others[0]] - price[column.chosen], 0.0):.1f}" if others else "–",
+                ", ".join(f"{each} {weight[each]:.0%}" for each in dict.fromkeys([column.chosen, heavy])),
                 f"{column.test.probability:.2g}" if column.test.degrees_of_freedom else "–",
                 f"{fit.band[name].value:.4g}",
                 f"{100 * column.ripple:.2g}",
@@ -148,13 +151,14 @@ def _models(fit: Fit) -> ReportTable:
         )
     return ReportTable(
         "Models",
-        "Chosen terms, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation, with the weight among all candidates "
-        "(a G of the shortest time that the band tells is a filter or vibration, and counts as white noise); the "
-        "heaviest of the others, which may weigh more than the chosen one: a choice asks twice the gain of a weight "
-        "from each further parameter, so that no term is named without need; "
-        "the probability of the test of fit (of a good model below 0.01 in one record of a hundred); the "
-        "highest frequency used; by how much bins are off the model; what was taken for no noise.",
-        ["column", "chosen", "next", "p of fit", "up to, Hz", "ripple, %", "spikes", "lines", "steps"],
+        "Chosen terms, N white, B 1/f, K walk, G Gauss-Markov, Q quantisation (a G of the shortest time that the "
+        "band tells is a filter or vibration, and counts as white noise): those of the least deviance plus "
+        f"{PER_PARAMETER:g} for each parameter, so that no term is named without need; next, and by how much its sum "
+        "is larger: within 4 the log hardly tells the two apart. The weight in all averages, such as what filters "
+        "get, counts a parameter as 2, so that no term is lost that may be there: the model of the largest weight "
+        "may be another one. Then the probability of the test of fit (of a good model below 0.01 in one record of a "
+        "hundred); the highest frequency used; by how much bins are off the model; what was taken for no noise.",
+        ["column", "chosen", "next", "weights", "p of fit", "up to, Hz", "ripple, %", "spikes", "lines", "steps"],
         rows,
     )
 
