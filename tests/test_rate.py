@@ -9,7 +9,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.manifest import RateTest, Run
+from imulab.procedures.rate.manifest import RateTest, Run, load_test, manifest_text
 from imulab.procedures.rate.simulate import RateRecordings
 from reference import rate as reference
 
@@ -79,7 +79,7 @@ def test_errors_are_those_that_the_record_states():
         parameters = [(found.parameters[name], truth(name)) for name in LINEAR]
         scores += [(p.value - true) / p.standard_uncertainty for p, true in parameters]
     squares = np.square(scores)
-    # chi-square over its number: 96 scores scatter by 0.14 about 1; biases hold the faces' scatter beside their own
+    # chi-square over its number: 96 scores scatter by 0.14 about 1
     assert 0.5 < squares.mean() < 1 + 4 * np.sqrt(2 / len(squares))
 
 
@@ -333,3 +333,33 @@ def test_a_manifest_that_cannot_be_is_refused_by_its_place(text, said, tmp_path,
     assert said in error
     assert len(error.splitlines()) == 1
     assert not Path("r.json").exists()
+
+
+def test_a_bias_holds_what_faces_differ_by_once():
+    """Without noise, by 0, 3 and -3 mrad/s: Student's t of three faces; where they do not differ nothing is added."""
+    made = whole()
+    lifted = [
+        each.with_columns({"gyro_x": each.column("gyro_x") + 1.004 * zero}, {"gyro_x": "rad/s"})
+        for each, zero in zip(made.recordings, (0.0, 3e-3, -3e-3), strict=True)
+    ]
+    found = il.fit_rate(dataclasses.replace(made, recordings=tuple(lifted)), order=1).calibration
+    bias = found.parameters["gyro_bias_x"]
+    assert bias.standard_uncertainty == pytest.approx(3e-3 / np.sqrt(3), rel=1e-3)
+    half = (bias.interval_95[1] - bias.interval_95[0]) / 2
+    assert half == pytest.approx(4.303 * bias.standard_uncertainty, rel=1e-3)
+    assert found.parameters["gyro_bias_y"].standard_uncertainty < 1e-8
+
+
+def test_a_table_is_stated_in_parts_of_the_rate(tmp_path):
+    """100 ppm a rate, of 5 rates: the uncertainty of S is that of the weighted mean of their quotients."""
+    stated = {"proportional_uncertainty": 1e-4}
+    found = il.fit_rate(whole(False, [0, 100, 200, 0, -100, -200, 0], test=stated), order=1).calibration
+    scale = found.parameters["gyro_scale_factor_x"]
+    assert scale.standard_uncertainty / scale.value == pytest.approx(1e-4 / np.sqrt(4), rel=0.02)
+    test = whole(False, test=stated).test
+    (tmp_path / "t.toml").write_text(manifest_text(test), encoding="utf-8")
+    assert load_test(tmp_path / "t.toml").proportional_uncertainty == 1e-4
+    below = manifest_text(test).replace("_uncertainty = 0.0001", "_uncertainty = -1")
+    (tmp_path / "t.toml").write_text(below, encoding="utf-8")
+    with pytest.raises(il.ImulabError, match="rates: proportional_standard_uncertainty: expected 0 or more, found -1"):
+        load_test(tmp_path / "t.toml")

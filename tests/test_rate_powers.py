@@ -27,7 +27,9 @@ def problem(rng, k=(), cycles=3, each=0.0, noise=NOISE):
     mean = mean + noise * rng.standard_normal(len(table))
     same = np.zeros(len(table), dtype=int)
     variance = np.full((len(table), 1), noise**2)
-    return Problem((2,), run, same + 2, same + 1, table, table, mean[:, None], variance, np.zeros((len(run), 2)), 0.0)
+    return Problem(
+        (2,), run, same + 2, same + 1, table, table, mean[:, None], variance, np.zeros((len(run), 2)), 0 * table
+    )
 
 
 @pytest.mark.parametrize("each", [0.0, 5e-6 * LARGEST, 20e-6 * LARGEST])

@@ -238,7 +238,7 @@ def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Prob
         mean=np.vstack([found.mean for found in dwells]),
         variance=np.vstack([_pooled(found) for found in dwells]),
         level=np.vstack([found.level for found in dwells]),
-        rate_uncertainty=test.rate_uncertainty,
+        rate_uncertainty=test.spread_of(table),
         scale_error=np.repeat([0.0 if found.sweep is None else found.sweep.scale_error for found in dwells], counts),
     )
 

@@ -71,14 +71,17 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
     values = problem.mean[own, gyro] / scale
     variance = problem.variance[own, gyro] / scale**2 + (_EXACT * np.abs(rate).max()) ** 2
     key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
-    variance_of_rate = problem.rate_uncertainty**2
+    of_rate = problem.rate_uncertainty[own] ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
     largest = float(np.abs(rate).max())
     left, _ = _fitted(np.column_stack([rate, zeros]), values, variance)
     means = np.array(
-        [[left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2] for k in np.unique(key)]
+        [
+            [left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2 + of_rate[key == k].mean()]
+            for k in np.unique(key)
+        ]
     )
-    spread = np.sqrt(means[:, 1] + variance_of_rate)
+    spread = np.sqrt(means[:, 1])
     worst = int(np.argmax(np.abs(means[:, 0])))
     freedom = len(means) - 2
     chi_square = float(np.sum((means[:, 0] / spread) ** 2))
@@ -94,7 +97,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
         uncertainty=np.sqrt(variance) / largest,
         direction=direction,
         nonlinearity=(float(abs(means[worst, 0])) / largest, float(spread[worst]) / largest),
-        asymmetry=_asymmetry(rate, values, variance, zeros, direction, variance_of_rate),
+        asymmetry=_asymmetry(rate, values, variance, zeros, direction, of_rate),
         hysteresis=hysteresis,
         probability=probability,
         by_noise=reach * float(spread.max()) / largest,
@@ -126,7 +129,7 @@ def _directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _asymmetry(
-    rate: Array, values: Array, variance: Array, zeros: Array, direction: NDArray[np.int64], of_rate: float
+    rate: Array, values: Array, variance: Array, zeros: Array, direction: NDArray[np.int64], of_rate: Array
 ) -> tuple[float, float] | None:
     """Return (S+ - S-)/S by two slopes and one zero, beside the loop of hysteresis; None for rates of one sign."""
     if not (rate > 0).any() or not (rate < 0).any():

@@ -11,9 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from imulab.errors import ReadError, file_name, quoted
 from imulab.procedures.rate.choices import AXES, MOUNTINGS
 from imulab.quantity_entries import check_keys, number_of, unit_of, value_and_unit
+from imulab.recording import Array
 from imulab.toml import load_toml
 from imulab.units import from_si, to_si
 
@@ -57,6 +60,8 @@ class RateTest:
         Standard uncertainty that all rates have in common, a fraction; None where the manifest does not say.
     rate_uncertainty
         Of each commanded rate, the same at every visit, rad/s.
+    proportional_uncertainty
+        Likewise, and beside it, a fraction of that rate.
     mounting_uncertainty
         Of the table axis across each face, rad; None where the manifest does not say.
     latitude
@@ -70,6 +75,11 @@ class RateTest:
     latitude: float | None = None
     sensor: Mapping[str, str] = field(default_factory=dict)
     name: str = "test"
+    proportional_uncertainty: float = 0.0
+
+    def spread_of(self, rate: Array) -> Array:
+        """Return the standard uncertainty of commanded rates beside what all have in common, rad/s, shape (n,)."""
+        return np.hypot(self.rate_uncertainty, self.proportional_uncertainty * rate)
 
     def place(self, index: int) -> str:
         """Return how messages name run `index`, counted from 0."""
@@ -93,10 +103,10 @@ def load_test(path: str | Path, name: str | None = None) -> RateTest:
     rates = table.get("rates", {"unit": "deg/s"})
     if not isinstance(rates, dict) or "unit" not in rates:
         raise ReadError(f"{name}: rates: expected {_RATES}, found {quoted(rates)}")
-    known = ("unit", "relative_standard_uncertainty", "standard_uncertainty")
-    check_keys(rates, known, f"{name}: rates")
+    sizes = ("relative_standard_uncertainty", "standard_uncertainty", "proportional_standard_uncertainty")
+    check_keys(rates, ("unit", *sizes), f"{name}: rates")
     unit = unit_of(rates["unit"], "rate", f"{name}: rates")
-    relative, each = (None if key not in rates else _size(rates[key], f"{name}: rates: {key}") for key in known[1:])
+    relative, each, part = (None if key not in rates else _size(rates[key], f"{name}: rates: {key}") for key in sizes)
     entries = table.get("run")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise ReadError(f"{name}: run: expected tables [[run]], one for each file")
@@ -111,6 +121,7 @@ def load_test(path: str | Path, name: str | None = None) -> RateTest:
         latitude=_latitude(table.get("latitude"), f"{name}: latitude"),
         sensor={key: str(value) for key, value in sensor.items()},
         name=name,
+        proportional_uncertainty=part or 0.0,
     )
 
 
@@ -167,6 +178,8 @@ def manifest_text(test: RateTest, comments: Sequence[str] = ()) -> str:
         parts.append(f"relative_standard_uncertainty = {test.relative_uncertainty!r}")
     if test.rate_uncertainty:
         parts.append(f"standard_uncertainty = {from_si(test.rate_uncertainty, 'deg/s'):.9g}")
+    if test.proportional_uncertainty:
+        parts.append(f"proportional_standard_uncertainty = {test.proportional_uncertainty!r}")
     lines = [*(f"# {comment}" for comment in comments), f"rates = {{ {', '.join(parts)} }}"]
     if test.mounting_uncertainty is not None:
         lines.append(f'mounting = {{ standard_uncertainty = {1e3 * test.mounting_uncertainty:.9g}, unit = "mrad" }}')

@@ -42,7 +42,8 @@ def _order_of(problem: Problem, gyro: int) -> int:
     powers = np.column_stack([rate**p for p in range(1, max(min(HIGHEST, count - 2), 1) + 1)])
     values = problem.mean[own, gyro]
     slope = float(np.ptp(values) / max(np.ptp(problem.rate[own]), 1e-300))
-    of_rate = (problem.rate_uncertainty * slope) ** 2 * (key[:, None] == key)
+    stated = problem.rate_uncertainty[own] * slope
+    of_rate = np.outer(stated, stated) * (key[:, None] == key)
     noise = problem.variance[own, gyro] + (_EXACT * np.abs(values).max()) ** 2
     lower = np.linalg.cholesky(np.diag(noise) + of_rate)
     visits = (key[:, None] == np.arange(count)).astype(np.float64)

@@ -66,8 +66,11 @@ def _entries(problem: Problem, solution: Solution, i: int, unit: str) -> list[_E
 
 def model_parameters(
     test: RateTest, problem: Problem, solution: Solution, unit: str, axes: TableAxes | None = None
-) -> tuple[list[str], Array, Array, list[str]]:
-    """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate."""
+) -> tuple[list[str], Array, Array, list[str], dict[str, float]]:
+    """Return names, values, covariance and units of bias, scale factor, misalignment and powers of the rate.
+
+    And the degrees of freedom of those whose uncertainty few faces show.
+    """
     measured = [i for i, axis in enumerate(problem.gyros) if axis in problem.faces]
     found = [entry for i in measured for entry in _entries(problem, solution, i, unit)]
     found.sort(key=lambda entry: _ORDER.index(entry.name.rpartition("_")[0]))
@@ -76,17 +79,23 @@ def model_parameters(
     mounting = (test.mounting_uncertainty or 0.0) if axes is None else 0.0
     own = np.array([entry.mounted for entry in found]) * mounting**2
     names = [entry.name for entry in found]
+    few: dict[str, tuple[float, float]] = {}
     for i in measured:
         axis = AXES[problem.gyros[i]]
-        added = _between_faces(problem, solution, problem.gyros[i])
+        added, freedom = _between_faces(problem, solution, problem.gyros[i])
         of_zeros = [f"gyro_bias_{axis}", *(f"gyro_g_sensitivity_{axis}{b}" for b in AXES)]
         for name, value in zip(of_zeros, added.tolist(), strict=False):
             own[names.index(name)] = value
+            if value:
+                few[name] = (value, freedom)
     matrix = np.asarray(jacobian @ solution.covariance @ jacobian.T + np.outer(shared, shared) + np.diag(own))
     if axes is not None:
         matrix += _by_axes(problem, found, axes)
     values = np.array([entry.value for entry in found])
-    return names, values, matrix, [entry.unit for entry in found]
+    # Welch and Satterthwaite: the share that few faces show has few degrees of freedom
+    variance = dict(zip(names, np.diag(matrix).tolist(), strict=True))
+    freedoms = {name: nu * (variance[name] / added) ** 2 for name, (added, nu) in few.items()}
+    return names, values, matrix, [entry.unit for entry in found], freedoms
 
 
 def _by_axes(problem: Problem, found: Sequence[_Entry], axes: TableAxes) -> Array:
@@ -177,17 +186,26 @@ def g_sensitivity(problem: Problem, solution: Solution) -> Array | None:
     return np.array([weights[1:] @ found[len(found) - problem.runs :] for found in solution.coefficients])
 
 
-def _between_faces(problem: Problem, solution: Solution, axis: int) -> Array:
-    """Return what the faces' scatter adds to the variances of b and G of a gyroscope, (rad/s)^2 .., shape (k,)."""
+def _between_faces(problem: Problem, solution: Solution, axis: int) -> tuple[Array, float]:
+    """Return what faces scatter beyond noise adds to the variances of b and G of a gyroscope, and its freedom.
+
+    (rad/s)^2 .., shape (k,): the expected share of the noise is taken off, so that it does not count twice.
+    """
     i = problem.gyros.index(axis)
-    found = solution.coefficients[i]
-    zeros = found[len(found) - problem.runs :] / float(found[problem.faces.index(axis)])
+    found, first = solution.coefficients[i], sum(map(len, solution.coefficients[:i]))
+    scale, at = float(found[problem.faces.index(axis)]), len(found) - problem.runs
+    zeros = found[at:] / scale
+    noise = solution.covariance[first + at : first + len(found), first + at : first + len(found)] / scale**2
     weights, freedom = _of_zeros(problem)
     groups = list(_faces_of_runs(problem).values())
     if freedom < 1:
-        return np.zeros(len(weights))
-    means = np.array([zeros[runs].mean() for runs in groups])
+        return np.zeros(len(weights)), 0
+    mean = np.zeros((len(groups), problem.runs))
+    for row, runs in zip(mean, groups, strict=True):
+        row[runs] = 1 / len(runs)
     share = np.array([weights[:, runs].sum(axis=1) for runs in groups])
     # the columns whose pseudoinverse the weights are: one, and the force where there are four
-    fitted = np.linalg.pinv(share.T) @ (weights @ zeros) if len(weights) > 1 else np.full(len(groups), means.mean())
-    return np.asarray(np.sum(share**2, axis=0) * np.sum((means - fitted) ** 2) / freedom)
+    columns = np.linalg.pinv(share.T) if len(weights) > 1 else np.ones((len(groups), 1))
+    rest = (np.eye(len(groups)) - columns @ np.linalg.pinv(columns)) @ mean
+    beyond = max(float(np.sum((rest @ zeros) ** 2) - np.trace(rest @ noise @ rest.T)), 0.0) / freedom
+    return np.asarray(np.sum(share**2, axis=0) * beyond), freedom

@@ -321,9 +321,9 @@ def _predicted(test: RateTest, planned: dict[float, PlannedRate], order: int) ->
     variance = np.repeat(np.array(rows["variance"])[:, None], len(gyros), axis=1)
     problem = Problem(
         gyros=gyros, run=np.array(rows["run"]), axis=axis, sign=sign, rate=body, table=table, mean=mean,
-        variance=variance, level=np.array(rows["level"]), rate_uncertainty=test.rate_uncertainty,
+        variance=variance, level=np.array(rows["level"]), rate_uncertainty=test.spread_of(table),
     )  # fmt: skip
-    names, _, matrix, _ = model_parameters(test, problem, solve(problem, (order,) * len(gyros)), "rad/s")
+    names, _, matrix, _, _ = model_parameters(test, problem, solve(problem, (order,) * len(gyros)), "rad/s")
     return dict(zip(names, np.sqrt(np.diag(matrix)).tolist(), strict=True))
 
 

@@ -39,11 +39,12 @@ def make_record(
     axes: TableAxes | None = None,
 ) -> Calibration:
     """Turn a solution into the record."""
-    names, values, matrix, units = model_parameters(test, problem, solution, unit, axes)
-    nu = solution.cycle_freedom
+    names, values, matrix, units, freedoms = model_parameters(test, problem, solution, unit, axes)
+    if solution.cycle_freedom is not None:
+        freedoms |= {name: float(solution.cycle_freedom) for name in names if name.startswith("gyro_scale_factor")}
     parameters = {}
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
-        wide = coverage_factor(float(nu)) * u if nu is not None and name.startswith("gyro_scale_factor") else None
+        wide = coverage_factor(freedoms[name]) * u if name in freedoms else None
         parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
     figures = _figures(linearity) | dynamics_of(test, dwells)
     figures |= temperature_slopes(recordings, dwells, problem, solution)
@@ -107,6 +108,7 @@ def _fit(
         "between_runs": solution.cycle,
         "table_uncertainty": test.relative_uncertainty,
         "rate_uncertainty": {"value": test.rate_uncertainty, "unit": "rad/s"},
+        "proportional_uncertainty": test.proportional_uncertainty,
         "mounting_uncertainty": test.mounting_uncertainty,
         "latitude": test.latitude,
         "axes": {

@@ -47,7 +47,7 @@ class Problem:
     level
         Mean cosine and sine of the table's angle, shape (n, 2).
     rate_uncertainty
-        Of each commanded rate, rad/s.
+        Of the commanded rate of each dwell, which all visits of it share, rad/s, shape (n,).
     scale_error
         What each dwell's run adds to its scale factor, which delay and bandwidth share with it, shape (n,).
     lean
@@ -65,7 +65,7 @@ class Problem:
     mean: Array
     variance: Array
     level: Array
-    rate_uncertainty: float
+    rate_uncertainty: Array
     scale_error: Array | None = None
     lean: Array | None = None
     force: Array | None = None
@@ -180,7 +180,8 @@ def _own(problem: Problem, gains: list[Array], gyro: int) -> float:
 def _shared_blocks(problem: Problem, gains: list[Array]) -> dict[tuple[int, int], Array]:
     """Return what the means of two gyroscopes share: errors of single rates, and the Earth's level part."""
     face = np.array([problem.faces.index(axis) for axis in problem.axis.tolist()])
-    alike = np.isclose(problem.table[:, None], problem.table, rtol=1e-9, atol=1e-9) * problem.rate_uncertainty**2
+    alike = np.isclose(problem.table[:, None], problem.table, rtol=1e-9, atol=1e-9).astype(np.float64)
+    alike *= np.outer(problem.rate_uncertainty, problem.rate_uncertainty)
     same = (problem.run[:, None] == problem.run) * (problem.level @ problem.level.T) * EARTH**2 / 2
     blocks: dict[tuple[int, int], Array] = {}
     for i, first in enumerate(gains):
@@ -245,7 +246,7 @@ def _cycles(problem: Problem, order: int, variance: Array, gains: list[Array]) -
             part = Problem(
                 (axis,), np.zeros(int(which.sum()), dtype=np.int64), problem.axis[which], problem.sign[which],
                 problem.rate[which], problem.table[which], mean[which, i : i + 1],
-                problem.variance[which, i : i + 1], problem.level[which], 0.0,
+                problem.variance[which, i : i + 1], problem.level[which], np.zeros(int(which.sum())),
             )  # fmt: skip
             columns = design(part, 0, 1)
             if len(columns) > columns.shape[1]:
