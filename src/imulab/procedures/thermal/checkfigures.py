@@ -22,7 +22,8 @@ _BEYOND = 2.0
 
 
 def _ug(value: float, sign: str = "+") -> str:
-    return f"{from_si(float(value), 'ug'):{sign}.3g}"
+    micro = from_si(float(value), "ug")
+    return f"{micro:{sign}.3g}" if abs(micro) < 999.5 else f"{micro:{sign}.0f}"
 
 
 def _p(value: float | None) -> str:

@@ -13,7 +13,7 @@ from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
 from imulab.procedures.thermal.model import AXES, GROUPS, Laws, law_names
-from imulab.procedures.thermal.rows import Problem
+from imulab.procedures.thermal.rows import Problem, together
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Solution
 from imulab.recording import Array
@@ -237,6 +237,12 @@ def _findings(
             "uncertainty holds that: record more temperatures or come back to some, or state --turn-on-scatter"
         )
     found += _unlike(solution, name)
+    if options["degrees"] == "auto" and not solution.laws.degrees[0] and solution.scatter.tau[0] > 0:
+        found.append(
+            f"{name}: the recordings' biases differ by {1e3 * solution.scatter.tau[0]:.2g} mg (standard deviation); so "
+            "few recordings do not tell whether by their temperature or from power cycle to power cycle: record five "
+            "temperatures or more, or state --degrees"
+        )
     if options["degrees"] == "auto":
         found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees)}"))
     far = [each for each in left_out if each.chi_square > _WORSE**2]
@@ -247,7 +253,10 @@ def _findings(
     ]
     found += findings(drift, solution, name)
     rows = solution.rows
-    standard = np.abs(rows.residual) / np.sqrt(np.diag(rows.noise) + solution.excess**2)
+    # What recordings have in common is expected of power cycles, and no hold's own.
+    whole, own = (together(rows, solution.excess**2, tau) for tau in (solution.scatter.tau, np.zeros(2)))
+    left = own @ np.linalg.solve(whole, rows.residual)
+    standard = np.abs(left) / np.sqrt(np.diag(rows.noise) + solution.excess**2)
     out = np.flatnonzero((standard > _STANDS_OUT) & (rows.owner >= 0))
     for index in out[np.argsort(-standard[out], kind="stable")][:_MOST_NAMED].tolist():
         what = "its magnitude" if rows.magnitude[index] else "its direction, although nothing was to move: a knock?"
