@@ -310,8 +310,7 @@ def test_records_without_a_temperature_in_common_are_not_compared():
 
 def test_three_temperatures_do_not_tell_a_law_from_power_cycles_and_no_hold_is_blamed():
     """A cubic law at three temperatures: what recordings have in common is said, and is no fault of single holds."""
-    made = il.simulate_thermal("-20,0,25")
-    record = il.fit_thermal(made.recordings).calibration
+    record = il.fit_thermal(il.simulate_thermal("-20,0,25")).calibration
     assert not any("stands out" in line for line in record.warnings)
     assert record.model["degrees"]["bias"] == 0
     assert any("do not tell whether by their temperature" in line for line in record.warnings)
