@@ -102,8 +102,9 @@ def test_no_circles():
 SHARED = {
     f"imulab.procedures.tumble.{name}"
     for name in ("attitudes", "segment", "plan", "planning", "sheet", "gyrorest", "gyrosolve", "gyroturns")
-}
-"""Attitudes at rest, plans of them and the turns between them: over temperature they are those of the tumble test."""
+} | {"imulab.procedures.thermal.prior"}
+"""Attitudes at rest, plans of them and the turns between them: over temperature they are those of the tumble test; and
+what laws over temperature know of such a test."""
 
 
 def test_procedures_do_not_import_each_other():

@@ -95,7 +95,7 @@ def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Arr
     by_drift = np.einsum("Nj,Njk->Nk", felt, drift[owner])
     jacobian = np.hstack([jacobian, by_drift[:, list(problem.free)], turns])
     found = Rows(residual, jacobian, own, (offsets[0], offsets[1]), errors, by_drift, owner.astype(np.int64), ~side)
-    return found if problem.known is None else _with_prior(found, problem.known, laws, coefficients)
+    return found if problem.known is None else _with_prior(found, problem.known, laws, coefficients, problem.step.max())
 
 
 def parameters_of(problem: Problem, laws: Laws, coefficients: Array) -> tuple[Array, Array, Array, Array]:
@@ -141,10 +141,11 @@ def _errors(heat: Array, owner: NDArray[np.int64], problem: Problem, count: int)
     return loadings
 
 
-def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array) -> Rows:
-    """Add the nine parameters of a prior at its temperature, which counts as one recording."""
+def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array, step: float) -> Rows:
+    """Add the nine parameters of a prior at its temperature, read in steps too, which counts as one recording."""
     temperature, values, covariance = known
-    design = laws.design(np.array([temperature]))[0]
+    at = np.array([temperature])
+    design, heat = laws.design(at)[0], laws.slope(at)[0] @ coefficients[: laws.size] * step
     n, extra = len(rows.residual), rows.jacobian.shape[1] - laws.size
     noise = np.zeros((n + 9, n + 9))
     noise[:n, :n], noise[n:, n:] = rows.noise, covariance
@@ -159,7 +160,7 @@ def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coeff
         np.vstack([rows.jacobian, np.hstack([design, np.zeros((9, extra))])]),
         noise,
         (offsets[0], offsets[1]),
-        np.vstack([rows.errors, np.zeros((9, rows.errors.shape[1]))]),
+        np.block([[rows.errors, np.zeros((n, 1))], [np.zeros((9, rows.errors.shape[1])), heat[:, None]]]),
         np.vstack([rows.drift, np.zeros((9, 4))]),
         np.append(rows.owner, np.full(9, -1)),
         np.append(rows.magnitude, np.zeros(9, dtype=np.bool_)),

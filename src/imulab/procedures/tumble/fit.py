@@ -120,7 +120,7 @@ def fit_tumble(
     prior
         Earlier tumble record of the same unit, or its file, taken as a normal distribution of the parameters, which is
         widened by what the attitudes say that it aged; gives the order under ``"auto"``. Needs method norm, loss square
-        and stated or measured noise.
+        and stated or measured noise. A thermal record is one at the temperature of the recording.
     ageing
         Standard deviations of what biases (m/s^2), scale factors (1) and misalignments (rad) changed since the prior
         was made, as many as are known, or as ``"100ug,100ppm"``; the attitudes tell the others.
@@ -197,7 +197,7 @@ def fit_tumble(
     local = local_gravity(at_place(gravity, latitude, height), attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = nominal_scaling(attitudes, local.value)
-    known = None if prior is None else as_record(prior, "fit_tumble: prior")
+    known = None if prior is None else prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
     order = order if known is None else _prior_order(known, order, attitudes)
     rest = _threshold(threshold, local.value) if method == "linearised" else None
     estimate = estimate_triad(
@@ -260,6 +260,15 @@ def _propagated(estimate: Estimate, trials: int, progress: Callable[[int], None]
         )
     freedom = estimate.given_order.freedom
     return propagate(estimate.problem, estimate.solution, trials=trials, freedom=freedom, progress=progress)
+
+
+def prior_record(record: Calibration, attitudes: Attitudes) -> Calibration:
+    """Return a record as a prior of these attitudes: one over temperature at theirs; errors as for `at_temperature`."""
+    if record.procedure != "thermal":
+        return record
+    from imulab.procedures.thermal.prior import at_temperature
+
+    return at_temperature(record, attitudes.temperature, attitudes.recording.name)
 
 
 def _prior_order(prior: Calibration, order: int | str, attitudes: Attitudes) -> int:

@@ -25,7 +25,7 @@ from imulab.procedures.tumble.choices import FURTHER, HEMISPHERES, LOSSES, METHO
 from imulab.quantities import labelled
 
 if TYPE_CHECKING:
-    from imulab.recording import Recording
+    from imulab.procedures.tumble.attitudes import Attitudes
     from imulab.records.calibration import Calibration
 
 
@@ -42,8 +42,8 @@ def _fit(
     from imulab.procedures.tumble.segment import find_attitudes
 
     recording = access.recording(files[0], values["layout"], **values["part"])
-    prior = None if values["prior"] is None else _prior(values["prior"], recording, access)
     attitudes = find_attitudes(recording)
+    prior = None if values["prior"] is None else _prior(values["prior"], attitudes, access)
     return fit_tumble(
         attitudes,
         order=values["order"],
@@ -64,13 +64,15 @@ def _fit(
     ).calibration
 
 
-def _prior(file: str, recording: Recording, access: Files) -> Calibration:
-    """Read a record that can be a prior for this recording."""
+def _prior(file: str, attitudes: Attitudes, access: Files) -> Calibration:
+    """Read a record that can be a prior for these attitudes."""
     from imulab.procedures.tumble.checks import check_prior, made_from
+    from imulab.procedures.tumble.fit import prior_record
     from imulab.procedures.tumble.sections import model_of
 
-    record = access.record(file)
+    record, recording = access.record(file), attitudes.recording
     try:
+        record = prior_record(record, attitudes)
         check_prior(record)
     except RecordError as error:
         raise RecordError(f"{file}: {error}") from None
@@ -114,7 +116,7 @@ OPTIONS = (
         shows="20ug,20ug",
     ),
     *GRAVITY,
-    file_option("prior", "Earlier record of this unit, as prior knowledge.", "RECORD"),
+    file_option("prior", "Earlier record of this unit, or one over temperature, as prior knowledge.", "RECORD"),
     Option(
         "ageing",
         "What the unit may have changed since the prior, if known.",
