@@ -113,8 +113,53 @@ def test_two_thousand_trials_are_at_the_bound(request):
     assert (covered.mean(axis=0) > 0.93 - 3 * np.sqrt(0.0475 / count)).all()
 
 
+def heading_error(record, truth, turned):
+    """Error of the direction of north in the attitudes of the test, without noise, rms, rad."""
+    up, m = reference.directions(turned, truth.dip)
+    clean = table(reference.accelerometer_output(truth, up), m @ truth.matrix.T + truth.hard_iron)
+    corrected = il.apply(record, clean)
+    f, m = corrected.triad("accel"), corrected.triad("mag")
+    horizontal = m - f * (np.einsum("ni,ni->n", f, m) / (f**2).sum(axis=1))[:, None]
+    sine = np.einsum("ni,ni->n", turned[:, :, 0], horizontal) / np.linalg.norm(horizontal, axis=1)
+    return float(np.sqrt(np.mean(np.arcsin(sine) ** 2)))
+
+
+@pytest.mark.slow
+def test_headings_err_by_what_is_stated_within_five_percent(request):
+    """Over 4,300 trials 1.02 times (0.3 % of the field), over 2,000 1.01 times (0.1 %)."""
+    count = 150 if request.config.getoption("--reduced") else 2000
+    for noise in ({}, {"field": 1e-3, "more": 0.0}):
+        found = []
+        for seed in range(count):
+            truth, turned, data = simulated(seed, **noise)
+            record = il.fit_mag(table(*data), gravity=G, order=2, loss="square").calibration
+            stated = record.fit["mag"]["heading"]["standard_uncertainty"]["value"]
+            found.append((heading_error(record, truth, turned), stated))
+        error, stated = np.sqrt(np.mean(np.square(found), axis=0))
+        by_chance = 1 / np.sqrt(5 * count)  # some two to three of the parameters make heading
+        assert abs(error / stated - 1) < 0.05 + (2 * by_chance if count < 2000 else 0.0)
+
+
+def test_the_minimum_is_found_from_twelve_attitudes_of_any_unit():
+    """Hard iron of twice the field, soft iron of 15 %, 1 % noise: no error is far beyond its bound."""
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        iron = rng.standard_normal(3)
+        truth = replace(
+            reference.random_unit(rng, NORTH),
+            matrix=50 * reference.random_rotation(rng) @ (np.eye(3) + 0.15 * rng.uniform(-1, 1, (3, 3))),
+            hard_iron=100 * iron / np.linalg.norm(iron),
+            k2=np.zeros(3),
+        )
+        turned = attitudes(rng, 12)
+        data = reference.simulate(truth, turned, rng, accel=5e-4, field=1e-2, dip=0.0)
+        record = il.fit_mag(table(*data), gravity=G, order=1, loss="square").calibration
+        limit = np.sqrt(np.diag(reference.bound(truth, turned, accel=5e-4, field=1e-2, dip=1e-4)))[:9]
+        assert np.abs((matrix_and_hard_iron(record)[0] - truth.matrix).ravel() / limit).max() < 6
+
+
 def disturbed(seed, by, attitude=7):
-    truth, _, (outputs, mag) = simulated(seed, more=np.radians(0.24))
+    truth, _, (outputs, mag) = simulated(seed)
     rng = np.random.default_rng(seed + 5000)
     iron = rng.standard_normal(3)
     mag[attitude] += by * truth.matrix @ (iron / np.linalg.norm(iron))
@@ -133,6 +178,25 @@ def test_a_disturbed_attitude_is_set_aside_and_named():
     (said,) = [w for w in record.warnings if "set aside" in w]
     assert said.startswith("mag: row 8 ")
     assert "iron or a vehicle near" in said
+
+
+@pytest.mark.slow
+def test_disturbances_are_named_as_often_as_the_document_says(request):
+    """3 % of the field in 79 %, 6 % in 96 %, none in 4 %; heading after 6 %: .71 deg, huber .42, dropped .37."""
+    count = 60 if request.config.getoption("--reduced") else 500
+    wide = 0.05 + 2 * np.sqrt(0.25 / count)
+    for by, named in ((0.03, 0.79), (0.06, 0.96), (0.0, 0.04)):
+        found = [il.fit_mag(disturbed(seed, by)[1], gravity=G, order=2).calibration for seed in range(count)]
+        aside = [record.fit["mag"]["set_aside"] for record in found]
+        assert abs(np.mean([8 in numbers if by else bool(numbers) for numbers in aside]) - named) < wide
+    for given, expected in (({"loss": "square"}, 0.71), ({"loss": "huber"}, 0.42), ({"drop": [8]}, 0.37)):
+        errors = []
+        for seed in range(count):
+            turned = simulated(seed)[1]
+            truth, recording = disturbed(seed, 0.06)
+            record = il.fit_mag(recording, **{"gravity": G, "order": 2, "loss": "square"} | given).calibration
+            errors.append(heading_error(record, truth, turned))
+        assert abs(np.degrees(np.sqrt(np.mean(np.square(errors)))) / expected - 1) < 0.05 + 2 / np.sqrt(5 * count)
 
 
 def test_huber_limits_what_one_attitude_does():
