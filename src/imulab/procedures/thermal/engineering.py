@@ -15,6 +15,8 @@ def shown(name: str, unit: str) -> tuple[float, str]:
         return (1e6 if kelvin else 1e3) / STANDARD_GRAVITY, ("µg" if kelvin else "mg") + kelvin
     if name.startswith("gyro_bias"):
         return from_si(1.0, "deg/h" if kelvin else "deg/s"), ("deg/h" if kelvin else "deg/s") + kelvin
+    if name.startswith("gyro_scale_factor") and unit.startswith("deg/s/(rad/s)"):
+        return from_si(1.0, "rad/s") / from_si(1.0, "deg/s"), "deg/s/(deg/s)" + kelvin
     if name.startswith("gyro_g_sensitivity"):
         return from_si(1.0, "deg/h") * STANDARD_GRAVITY, "deg/h/g"
     if name.startswith(("misalignment", "gyro_misalignment")):

@@ -20,6 +20,7 @@ from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.thermal.choices import DEGREES
 from imulab.procedures.thermal.degrees import Degrees, LeftOut, clusters_of, left_out, tail
 from imulab.procedures.thermal.gyroholds import RatesAtRest
+from imulab.procedures.thermal.lag import ALL, Drift, tested, untold
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.rows import Rows, whitener
 from imulab.procedures.thermal.solve import Scatter, Solution, between, concluded, excess_of
@@ -51,6 +52,7 @@ class Gyroscopes:
     probability: float | None
     left_out: tuple[LeftOut, ...]
     aside: NDArray[np.int64]
+    drift: Drift
 
     def at_rest(self, temperature: Array) -> Array:
         """Return the biases at temperatures (n,), rad/s, shape (n, 3)."""
@@ -60,14 +62,19 @@ class Gyroscopes:
 
     def sensitivities(self, gravity: float) -> Array:
         """Return G, rad/s per m/s^2, shape (3, 3)."""
-        return self.solution.coefficients[self.size :].reshape(3, 3) / gravity
+        return self.solution.coefficients[self.size : self.size + 9].reshape(3, 3) / gravity
 
     def again(self, held: RatesAtRest) -> Gyroscopes:
         """Return the same terms fitted to other means of the same holds, with the scatter that was found."""
         laws, scatter = self.solution.laws, self.solution.scatter
-        found = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity)
+        found = solve(held, laws, float(scatter.tau[0]), sensitivity=self.sensitivity, free=self.drift.free)
         assert found is not None
         return replace(self, held=held, solution=replace(found, scatter=scatter))
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients but for lag and loops."""
+        return self.size + 9 * self.sensitivity
 
     @property
     def size(self) -> int:
@@ -106,12 +113,15 @@ def fit_gyroscopes(
             break
         laws = lower
         solution, sensitivity, probability = _solved(held, laws, tau)
+    drift = _drift(held, solution, sensitivity, tau)
+    if drift.free:
+        solution = solve(held, laws, tau, sensitivity=sensitivity, free=drift.free) or solution
     found = left_out(solution, np.ones(len(solution.coefficients), dtype=np.bool_), cluster)
     places = [
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
         for e in found
     ]
-    return Gyroscopes(held, solution, sensitivity, probability, tuple(places), aside)
+    return Gyroscopes(held, solution, sensitivity, probability, tuple(places), aside, drift)
 
 
 def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> tuple[Solution, bool, float | None]:
@@ -157,12 +167,35 @@ def _rms(found: list[LeftOut]) -> float | None:
     return float(np.sqrt(sum(each.holds * each.rms**2 for each in found) / total)) if total else None
 
 
-def solve(held: RatesAtRest, laws: Laws, tau: float | None, *, sensitivity: bool) -> Solution | None:
-    """Return the least-squares solution, None where the holds do not determine the coefficients."""
-    coefficients = np.zeros(3 * (laws.degrees[0] + 1) + 9 * sensitivity)
+def _drift(held: RatesAtRest, solution: Solution, sensitivity: bool, tau: float | None) -> Drift:
+    """Return lag and loops of the biases, each tested given the other."""
+    size = len(solution.coefficients)
+    reason = untold(held.temperature, held.rate, solution, size, 0)
+    if reason is not None:
+        return Drift(reason=reason)
+    whole = solve(held, solution.laws, tau, sensitivity=sensitivity, free=ALL)
+    if whole is None:
+        return Drift(reason="the holds in which the temperature drifts do not tell lag, loop and laws apart")
+    return tested(whole, size)
+
+
+def solve(
+    held: RatesAtRest, laws: Laws, tau: float | None, *, sensitivity: bool, free: tuple[int, ...] = ()
+) -> Solution | None:
+    """Return the least-squares solution, None where the holds do not determine the coefficients.
+
+    Those of the biases, of G where it is taken, and of what is `free` of lag and loops, as in `Problem`.
+    """
+    count = 3 * (laws.degrees[0] + 1) + 9 * sensitivity
+    coefficients = np.zeros(count + len(free))
+    if free:  # a lag is the shift of laws that must be there first
+        begun = solve(held, laws, tau, sensitivity=sensitivity)
+        if begun is None:
+            return None
+        coefficients[:count] = begun.coefficients
     excess, freedom, scatter = 0.0, np.inf, Scatter() if tau is None else Scatter(np.array([tau, 0.0]))
     for _ in range(_PASSES):
-        rows = rows_of(held, laws, coefficients)
+        rows = rows_of(held, laws, coefficients, free)
         white = whitener(rows, excess, scatter.tau)
         columns = white(rows.jacobian)
         size = np.linalg.norm(columns, axis=0)
@@ -173,27 +206,28 @@ def solve(held: RatesAtRest, laws: Laws, tau: float | None, *, sensitivity: bool
         excess, freedom = excess_of(rows, excess)
         if tau is None:
             scatter = between(rows, excess)
-    rows = rows_of(held, laws, coefficients)
+    rows = rows_of(held, laws, coefficients, free)
     return concluded(laws, coefficients, rows, (excess, freedom), scatter, converged=True)
 
 
-def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array) -> Rows:
+def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int, ...]) -> Rows:
     """Return the rows at these coefficients, three for each hold."""
     n, size = len(held), 3 * (laws.degrees[0] + 1)
     jacobian = laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size)
     slope = laws.slope(held.temperature)[:, :3, :size] @ coefficients[:size]
-    if len(coefficients) > size:
+    if len(coefficients) - len(free) > size:
         felt = np.einsum("nj,ik->nikj", held.force, np.eye(3)).reshape(3 * n, 9)
         jacobian = np.hstack([jacobian, felt])
+    drift = np.zeros((n, 3, 4))
+    drift[:, :, 0] = -held.rate[:, None] * slope
+    turn = np.sign(held.rate) * (1 - laws.place(held.temperature) ** 2)
+    drift[:, range(3), range(1, 4)] = turn[:, None]
+    jacobian = np.hstack([jacobian, drift.reshape(3 * n, 4)[:, list(free)]])
     noise = np.zeros((n, 3, n, 3))
     noise[range(n), :, range(n), :] = held.covariance
     number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
     heat = _spread(number) * (slope * held.step[:, None]).ravel()[:, None]
     earth = EARTH / np.sqrt(3) * _by_axis(held.attitude)
-    drift = np.zeros((n, 3, 4))
-    drift[:, :, 0] = -held.rate[:, None] * slope
-    turn = np.sign(held.rate) * (1 - laws.place(held.temperature) ** 2)
-    drift[:, range(3), range(1, 4)] = turn[:, None]
     return Rows(
         residual=jacobian @ coefficients - held.mean.ravel(),
         jacobian=jacobian,

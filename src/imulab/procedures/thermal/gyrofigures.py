@@ -29,10 +29,14 @@ def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[s
     left = fit.left_out_temperature
     worst = f"{plain_number(_hourly(max(row.rms for row in left)), 2)} deg/h rms at worst" if left else "–"
     facts = [
-        ("biases of gyroscopes", f"known to {plain_number(float(spread.max()) * 3600, 2)} deg/h or better"),
-        ("the same, power cycle to power cycle", told),
-        ("the same at left-out temperatures", worst),
+        ("gyroscope biases", f"known to {plain_number(float(spread.max()) * 3600, 2)} deg/h or better"),
+        ("gyroscope biases, power cycle to power cycle", told),
+        ("gyroscope biases at left-out temperatures", worst),
     ]
+    if fit.turns is not None:
+        facts.append(
+            ("turns", f"{fit.turns.turns}, missed by {plain_number(np.degrees(fit.turns.rms.value), 2)} deg rms")
+        )
     traces = []
     for k, name in enumerate(AXES):
         low, high = values[k] - 2 * spread[k], values[k] + 2 * spread[k]

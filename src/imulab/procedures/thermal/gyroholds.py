@@ -16,6 +16,7 @@ from imulab.errors import DataError, UnitError
 from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.estimation.rows import leave_out
 from imulab.procedures.thermal.holds import Cut, Holds, averaged, pooled
+from imulab.procedures.thermal.lag import moving
 from imulab.recording import Array, Recording, check_finite
 from imulab.units import parse_unit, to_si
 
@@ -152,7 +153,7 @@ def rates_at_rest(holds: Holds, force: Array, size: Array) -> RatesAtRest:
     alone = holds.group < 0
     attitude = np.where(alone, len(holds) + np.arange(len(holds)), holds.group)
     return RatesAtRest(
-        mean, pooled(averages), force[kept], holds.temperature[kept], holds.rate[kept], holds.step[kept],
+        mean, pooled(averages), force[kept], holds.temperature[kept], moving(holds)[kept], holds.step[kept],
         holds.shared[kept], holds.recording[kept], attitude[kept], np.flatnonzero(kept), unit, size, tuple(notes),
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ import numpy as np
 from imulab.procedures.thermal.gyro import Gyroscopes
 from imulab.procedures.thermal.gyroscale import ScaleLaws, block_diagonal, joint_covariance, rescaled
 from imulab.procedures.thermal.holds import Holds
+from imulab.procedures.thermal.lag import entries
 from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, law_names
 from imulab.procedures.thermal.record import interval_of, law_at
 from imulab.procedures.thermal.sections import thermal_of
@@ -28,8 +29,8 @@ def with_gyroscopes(
     gyros = gyros if turned is None else rescaled(gyros, turned)
     degree = gyros.solution.laws.degrees[0]
     names, units = names_and_units(degree, sensitivity=gyros.sensitivity)
-    matrix, coefficients = _to_si(gyros, record.model["gravity"]["value"]), gyros.solution.coefficients
-    covariance = gyros.solution.covariance
+    matrix, n = _to_si(gyros, record.model["gravity"]["value"]), gyros.count
+    coefficients, covariance = gyros.solution.coefficients[:n], gyros.solution.covariance[:n, :n]
     freedom = [gyros.solution.degrees_of_freedom(row) for row in matrix]
     if turned is not None:
         own, more, their_units = scale_to_si(turned, gyros.held.size, gyros.held.unit)
@@ -66,7 +67,7 @@ def with_gyroscopes(
 
 def _to_si(gyros: Gyroscopes, gravity: float) -> Array:
     """Return the matrix from the fit's coefficients to those of powers of T - T0, and of G to rad/s per m/s^2."""
-    size, count = gyros.size, len(gyros.solution.coefficients)
+    size, count = gyros.size, gyros.count
     matrix = np.eye(count) / gravity
     matrix[:size, :size] = gyros.solution.laws.to_powers()[:size, :size]
     return matrix
@@ -122,6 +123,7 @@ def _fit(gyros: Gyroscopes, *, known: bool) -> dict[str, Any]:
             "from": "argument" if known else "recordings" if solution.scatter.rank else "unknown",
         },
         "g_sensitivity_probability": gyros.probability,
+        **entries(gyros.drift, 1.0, "rad/s"),
         "left_out_temperature": [
             {"temperature": e.temperature, "holds": e.holds, "rms": e.rms, "chi_square": e.chi_square}
             for e in gyros.left_out
@@ -157,11 +159,33 @@ def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, turned: Scal
         for each in gyros.left_out
         if each.chi_square > _WORSE**2
     ]
+    found += _drifts(gyros, name)
     degree = gyros.solution.laws.degrees[0]
     if turned is None:
         return [*found, Note(f"gyro: bias of degree {degree}; no turns tell the scale factors, which are as stated")]
     said = f"gyro: bias of degree {degree}, scale factor of degree {turned.degree} from {turned.turns} turns"
     return [*found, *turned.notes, Note(said)]
+
+
+def _drifts(gyros: Gyroscopes, name: str) -> list[str]:
+    """Return what lag and loop mean for corrected outputs, where they are significant."""
+    drift, found = gyros.drift, []
+    if drift.values is None or drift.covariance is None:
+        return []
+    hourly, u = np.degrees(3600 * drift.values[1:]), np.sqrt(np.diag(drift.covariance))
+    if 0 in drift.free:
+        found.append(
+            f"gyro: {name}: biases differ from their laws by those of {drift.values[0]:.3g} s before (u {u[0]:.2g} s); "
+            "corrected outputs keep that"
+        )
+    if 1 in drift.free:
+        each = ", ".join(f"{axis} {h:+.3g}" for axis, h in zip(AXES, hourly, strict=True))
+        found.append(
+            f"gyro: {name}: biases differ between warming and cooling: in the middle of the range they are {each} "
+            f"deg/h (u {np.degrees(3600 * u[1:].max()):.2g}) from their laws in warming, and as much the other way in "
+            "cooling, which corrected outputs keep"
+        )
+    return found
 
 
 def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:

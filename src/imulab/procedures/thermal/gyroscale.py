@@ -159,7 +159,9 @@ def scale_from_turns(
         return None
     known = block_diagonal(
         solution.covariance[: solution.laws.size, : solution.laws.size],
-        gyros.solution.covariance[gyros.size :, gyros.size :] if gyros.sensitivity else np.zeros((9, 9)),
+        gyros.solution.covariance[gyros.size : gyros.count, gyros.size : gyros.count]
+        if gyros.sensitivity
+        else np.zeros((9, 9)),
     )
     return _laws(found, known, solution.laws, notes)
 
@@ -325,10 +327,10 @@ def joint_covariance(gyros: Gyroscopes, scale: ScaleLaws) -> Array:
     for k in range(len(AXES)):
         moved[:, k, k * functions.shape[1] : (k + 1) * functions.shape[1]] = each[:, k]
     assert functions.shape[1] * len(AXES) == size
-    slope = inverse @ white(moved.reshape(-1, len(scale.coefficients)))
-    n = len(slope)
+    n = gyros.count
+    slope = (inverse @ white(moved.reshape(-1, len(scale.coefficients))))[:n]
     joint = np.zeros((n + len(scale.coefficients),) * 2)
-    joint[:n, :n] = solution.covariance + slope @ scale.covariance @ slope.T
+    joint[:n, :n] = solution.covariance[:n, :n] + slope @ scale.covariance @ slope.T
     joint[:n, n:] = slope @ scale.covariance
     joint[n:, :n] = joint[:n, n:].T
     joint[n:, n:] = scale.covariance

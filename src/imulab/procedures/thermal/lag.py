@@ -29,7 +29,8 @@ _SHARED = 0.5
 _TELLS = 0.05
 """Share of the columns of lag and loops that must be left beside the laws and each other."""
 _NAMES = ("lag", *(f"loop_{axis}" for axis in AXES))
-_ALL = (0, 1, 2, 3)
+ALL = (0, 1, 2, 3)
+"""Lag and loops of x, y and z, as `Problem.free`."""
 
 
 @dataclass(frozen=True)
@@ -63,15 +64,17 @@ def moving(holds: Holds) -> Array:
 
 def drift_of(problem: Problem, solution: Solution, tau: float | None) -> Drift:
     """Fit lag and loops beside the laws of a solution, and test each given the other."""
-    reason = _reason(problem)
+    reason = untold(problem.temperature, problem.rate, solution, solution.laws.size, len(problem.free))
     if reason is not None:
         return Drift(reason=reason)
-    size = solution.laws.size
-    if not _told(solution, size, len(problem.free)):
-        return Drift(reason="the holds in which the temperature drifts do not tell lag, loop and laws apart")
-    whole = solve(replace(problem, free=_ALL), solution.laws, tau=tau)
+    whole = solve(replace(problem, free=ALL), solution.laws, tau=tau)
     if not whole.converged:
         return Drift(reason="the fit of lag and loop beside the laws did not converge")
+    return tested(whole, solution.laws.size)
+
+
+def tested(whole: Solution, size: int) -> Drift:
+    """Return lag and loops of a solution whose coefficients after the first `size` they are, each tested."""
     values, covariance = whole.coefficients[size:], whole.covariance[size:, size:]
     probability = []
     for part in (slice(0, 1), slice(1, 4)):
@@ -82,9 +85,20 @@ def drift_of(problem: Problem, solution: Solution, tau: float | None) -> Drift:
     return Drift(values, covariance, (probability[0], probability[1]))
 
 
-def _reason(problem: Problem) -> str | None:
+def untold(temperature: Array, rate: Array, solution: Solution, size: int, free: int) -> str | None:
+    """Return why lag and loop are not told: empty where the temperature never drifts, None where they are.
+
+    The solution's columns for what is `free` of them come after the first `size`.
+    """
+    reason = _reason(temperature, rate)
+    if reason is None and not _told(solution, size, free):
+        return "the holds in which the temperature drifts do not tell lag, loop and laws apart"
+    return reason
+
+
+def _reason(temperature: Array, rate: Array) -> str | None:
     """Return why the temperatures cannot tell lag from law: empty where they never drift, None where they can."""
-    up, down = (problem.temperature[sign * problem.rate > 0] for sign in (1, -1))
+    up, down = (temperature[sign * rate > 0] for sign in (1, -1))
     if not up.size and not down.size:
         return ""
     if not up.size or not down.size:
@@ -93,9 +107,9 @@ def _reason(problem: Problem) -> str | None:
             "the laws: record the way back too"
         )
     both = min(up.max(), down.max()) - max(up.min(), down.min())
-    if both < _SHARED * np.ptp(problem.temperature):
+    if both < _SHARED * np.ptp(temperature):
         return (
-            f"the unit both warms and cools in {max(both, 0.0):.0f} K of {np.ptp(problem.temperature):.0f} K, too "
+            f"the unit both warms and cools in {max(both, 0.0):.0f} K of {np.ptp(temperature):.0f} K, too "
             "little to tell a lag behind the thermometer from the laws: record the way back too"
         )
     return None
@@ -139,17 +153,17 @@ def findings(drift: Drift, solution: Solution, name: str) -> list[str]:
     return found
 
 
-def entries(drift: Drift, gravity: float) -> dict[str, Any]:
-    """Return ``lag``, ``loop_x`` ... of the record's fit, in SI; None where they cannot be told."""
+def entries(drift: Drift, scale: float, unit: str = "m/s^2") -> dict[str, Any]:
+    """Return ``lag``, ``loop_x`` ... of the record's fit, loops times `scale` in a unit; None where not told."""
     if drift.values is None:
         return dict.fromkeys(_NAMES)
     assert drift.covariance is not None
-    size, u = np.array([1.0, gravity, gravity, gravity]), np.sqrt(np.diag(drift.covariance))
+    size, u = np.array([1.0, scale, scale, scale]), np.sqrt(np.diag(drift.covariance))
     return {
         name: {
             "value": float(drift.values[k] * size[k]),
             "standard_uncertainty": float(u[k] * size[k]),
-            "unit": "m/s^2" if k else "s",
+            "unit": unit if k else "s",
             "probability": drift.probability[min(k, 1)],
             "fitted": k in drift.free,
         }

@@ -128,6 +128,10 @@ class GyroFit(Part):
     left_out_temperature: list[LeftOut]
     g_sensitivity_probability: float | None = None
     turns: GyroTurns | None = None
+    lag: Tested | None = None
+    loop_x: Tested | None = None
+    loop_y: Tested | None = None
+    loop_z: Tested | None = None
 
 
 class Fit(Part):
