@@ -62,3 +62,19 @@ def test_behind_a_filter_the_white_noise_of_low_frequencies_is_found():
     assert record.fit["band"]["gyro_x"]["value"] < 1
     assert record.fit["filter_white"]["gyro_x"]["value"] == pytest.approx(SMALL, rel=0.03)
     assert any("on the spectrum is not level" in note for note in record.warnings)
+
+
+@pytest.mark.parametrize("corner", [2.0, 10.0])
+def test_white_noise_that_no_octave_shows_has_an_interval_that_holds_it(corner):
+    """A minute at 100 Hz behind the sensor's filter: the end of the band shows 1 %, or half of it too much."""
+    pole = np.exp(-2 * np.pi * corner / 100)
+    held = []
+    for seed in range(8):
+        drawn = np.random.default_rng([seed, 6]).standard_normal(8000)
+        samples = SMALL * lfilter([1 - pole], [1, -pole], drawn)[2000:]
+        record = il.fit_noise({"gyro_x": samples}, rate=100.0, unit="rad/s").calibration
+        assert any("the spectrum is level nowhere" in note for note in record.warnings)
+        white = record.parameter("gyro_x_white")
+        held.append(white.interval_95[0] <= 0.1 * SMALL <= white.interval_95[1])
+        assert white.value == 0 or white.standard_uncertainty > 0.1 * abs(white.value - 0.1 * SMALL)
+    assert np.mean(held) > 0.8  # 0 of both before

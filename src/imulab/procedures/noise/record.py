@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _DIGITS = 7
 _TAILS = (0.025, 0.975)
+_PAIRS = tuple(zip(SIGMA, TIME, strict=True))
 _SLOW = ("flicker", "walk")
 """Terms that have a limit where the chosen model has not got them."""
 _PART = 10.0
@@ -114,6 +115,8 @@ def _parameters(
             covariance[0, 0] += analysis.band.roll_off**2
             low[0] = values[0] - np.hypot(values[0] - low[0], NORMAL_95 * more_of_white)
             high[0] = values[0] + np.hypot(high[0] - values[0], NORMAL_95 * more_of_white)
+        elif not analysis.band.flat:
+            covariance = _level_nowhere(analysis, float(values[0]), covariance, low, high)
         has, known = np.where(analysis.values > 0, values > 0, analysis.model), []
         for k, term in enumerate(NAMES):
             slow = term in _SLOW
@@ -137,6 +140,23 @@ def _parameters(
                 names.append(f"{name}_ramp")
                 blocks.append(np.array([[u**2]]))
     return found, names, blocks
+
+
+def _level_nowhere(analysis: Analysis, white: float, covariance: Array, low: Array, high: Array) -> Array:
+    """Widen the interval of a white noise that no octave shows, and return the covariance with its uncertainty.
+
+    It lies between the level at the end of the band and that below all Gauss-Markov terms, of which one may be the
+    filter of the sensor: ``N^2 + sum 2 S^2 T``.
+    """
+    below = analysis.average(
+        lambda each: np.square(each[..., :1]) + sum(2 * each[..., s, None] ** 2 * each[..., t, None] for s, t in _PAIRS)
+    )
+    least = analysis.values[0] * np.exp(-NORMAL_95 * np.sqrt(analysis.covariance[0, 0]))
+    low[0], high[0] = min(float(low[0]), least), max(float(high[0]), float(np.sqrt(below.quantile(_TAILS[1])[0, 0])))
+    covariance = covariance.copy()
+    if white > 0:
+        covariance[0, 0] = (max(high[0] - white, white - low[0]) / NORMAL_95 / white) ** 2
+    return covariance
 
 
 def _intervals(analysis: Analysis, more: Flags, values: Array, covariance: Array) -> tuple[Array, Array]:
