@@ -21,7 +21,7 @@ from imulab.procedures.thermal.gyro import fit_gyroscopes
 from imulab.procedures.thermal.gyroholds import check_gyroscopes, rates_at_rest
 from imulab.procedures.thermal.gyrorecord import with_gyroscopes
 from imulab.procedures.thermal.gyroscale import nominal_output, scale_from_turns
-from imulab.procedures.thermal.holds import Holds, find_holds
+from imulab.procedures.thermal.holds import Holds, find_holds, sides
 from imulab.procedures.thermal.lag import drift_of, moving
 from imulab.procedures.thermal.model import GROUPS, Laws, forces
 from imulab.procedures.thermal.record import make_record
@@ -229,6 +229,7 @@ def _problem(holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[
         tilt,
         zero,
         known,
+        side=sides(holds),
     )
 
 

@@ -24,6 +24,7 @@ _CUT = 1.0  # K
 _BATCHES = 10
 _FEWEST = 20
 """Samples of a cut: what is shorter joins the one before."""
+_SIDES = {"warming": 1.0, "cooling": -1.0}
 _FEW, _TURNED = 0.005, 0.1
 """A recording whose outputs but for a few move by less than this share of g is one at rest."""
 
@@ -220,3 +221,21 @@ def _step(temperature: Array) -> float:
     digits = next((k for k in range(6) if np.array_equal(np.round(values, k), values)), 6)
     step = min(10.0**-digits, float(np.diff(values).min()) if len(values) > 1 else np.inf)
     return step / float(np.sqrt(12))
+
+
+def sides(holds: Holds) -> Array:
+    """Return whether each hold is of a soak that was reached by warming (1) or cooling (-1), as its head says; else 0.
+
+    Raises
+    ------
+    DataError
+        A head says something else.
+    """
+    found = []
+    for recording in holds.recordings:
+        said = recording.metadata.get("reached_by", "").strip()
+        if said not in ("", *_SIDES):
+            raise DataError(f"{recording.name}: reached_by {said!r} in the head: expected warming or cooling")
+        found.append(_SIDES.get(said, 0.0))
+    which: Array = np.array(found)[holds.recording]
+    return which

@@ -2,7 +2,8 @@
 
 The *lag* L is one for the unit, ``p(T - L dT/dt)``; the *loop* h one for each axis, ``h sign(dT/dt) (1 - theta^2)``.
 All four are fitted beside the laws, and each of the two is tested, given the other, by F at 1 %; what is significant
-stays in the fit. Corrected outputs use L = 0 and h = 0: a unit would have to differentiate its temperature.
+stays in the fit. Soaks have loops by the side that they were reached from, where heads say it. Corrected outputs use
+L = 0 and h = 0: a unit would have to differentiate its temperature.
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ def moving(holds: Holds) -> Array:
 def drift_of(problem: Problem, solution: Solution, tau: float | None) -> Drift:
     """Fit lag and loops beside the laws of a solution, and test each given the other."""
     reason = untold(problem.temperature, problem.rate, solution, solution.laws.size, len(problem.free))
+    if reason == "" and problem.side is not None and len(np.unique(problem.side[problem.side != 0])) == 2:
+        return _of_soaks(problem, solution, tau)
     if reason is not None:
         return Drift(reason=reason)
     whole = solve(replace(problem, free=ALL), solution.laws, tau=tau)
@@ -85,13 +88,28 @@ def tested(whole: Solution, size: int) -> Drift:
     return Drift(values, covariance, (probability[0], probability[1]))
 
 
+def _of_soaks(problem: Problem, solution: Solution, tau: float | None) -> Drift:
+    """Fit loops beside the laws of soaks that were reached from either side; they say nothing of a lag."""
+    size, loops = solution.laws.size, ALL[1:]
+    if not _told(solution, size, len(problem.free), loops):
+        return Drift(reason="the soaks reached by warming and by cooling do not tell loops and laws apart")
+    whole = solve(replace(problem, free=loops), solution.laws, tau=tau)
+    if not whole.converged:
+        return Drift(reason="the fit of loops beside the laws did not converge")
+    own, covariance = whole.coefficients[size:], np.full((4, 4), np.nan)
+    covariance[1:, 1:] = whole.covariance[size:, size:]
+    square = float(own @ np.linalg.solve(covariance[1:, 1:], own)) / len(own)
+    freedom = min(whole.degrees_of_freedom(row) for row in np.eye(size + 3)[size:])
+    return Drift(np.append(np.nan, own), covariance, (1.0, tail(square, len(own), freedom)))
+
+
 def untold(temperature: Array, rate: Array, solution: Solution, size: int, free: int) -> str | None:
     """Return why lag and loop are not told: empty where the temperature never drifts, None where they are.
 
     The solution's columns for what is `free` of them come after the first `size`.
     """
     reason = _reason(temperature, rate)
-    if reason is None and not _told(solution, size, free):
+    if reason is None and not _told(solution, size, free, ALL):
         return "the holds in which the temperature drifts do not tell lag, loop and laws apart"
     return reason
 
@@ -115,10 +133,11 @@ def _reason(temperature: Array, rate: Array) -> str | None:
     return None
 
 
-def _told(solution: Solution, size: int, free: int) -> bool:
+def _told(solution: Solution, size: int, free: int, wanted: tuple[int, ...]) -> bool:
     rows = solution.rows
     white = whitener(rows, solution.excess**2, solution.scatter.tau)
-    rest, columns = white(np.delete(rows.jacobian, np.s_[size : size + free], axis=1)), white(rows.drift)
+    rest = white(np.delete(rows.jacobian, np.s_[size : size + free], axis=1))
+    columns = white(rows.drift[:, list(wanted)])
     length = np.linalg.norm(columns, axis=0)
     if not length.min() > 0:
         return False
@@ -167,5 +186,7 @@ def entries(drift: Drift, scale: float, unit: str = "m/s^2") -> dict[str, Any]:
             "probability": drift.probability[min(k, 1)],
             "fitted": k in drift.free,
         }
+        if np.isfinite(u[k])
+        else None
         for k, name in enumerate(_NAMES)
     }

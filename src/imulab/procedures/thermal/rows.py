@@ -23,7 +23,8 @@ class Problem:
     `rate`: change of the temperature, K/s, 0 where it counts as still; `tilt`: standard deviation of the direction of
     an unmoved hold, rad; `zero`: biases to start from, shape (3,); `known`: a prior as rows of nine parameters,
     ``(temperature, values (9,), covariance (9, 9))``; `free`: what is fitted beside the laws, the lag (s) as 0, the
-    loops of x, y and z (g) as 1 to 3.
+    loops of x, y and z (g) as 1 to 3; `side`: whether a soak was reached by warming (1) or
+    cooling (-1), 0 where nobody says.
     """
 
     reading: Array
@@ -38,6 +39,7 @@ class Problem:
     zero: Array
     known: tuple[float, Array, Array] | None = None
     free: tuple[int, ...] = ()
+    side: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,10 @@ def parameters_of(problem: Problem, laws: Laws, coefficients: Array) -> tuple[Ar
     slope = slopes @ coefficients[:size]
     drift = np.zeros((len(slope), 9, 4))
     drift[:, :, 0] = -problem.rate[:, None] * slope
-    turn = np.sign(problem.rate) * (1 - laws.place(problem.temperature) ** 2)
+    way = np.sign(problem.rate)
+    if problem.side is not None:
+        way = np.where(way == 0, problem.side, way)
+    turn = way * (1 - laws.place(problem.temperature) ** 2)
     drift[:, range(3), range(1, 4)] = turn[:, None]
     parameters = design @ coefficients[:size] + drift @ own
     return parameters, design - own[0] * problem.rate[:, None, None] * slopes, drift, slope
