@@ -1,6 +1,7 @@
 """A rate test with accelerometers: the table axis in the body, both triads in one record, bias and g-sensitivity."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -144,6 +145,11 @@ def test_both_triads_are_one_record_that_is_applied_and_exported(accel, tmp_path
     assert main(words, project=False) == 0
     assert main(["show", "both.json"], project=False) == 0
     assert "gyro_g_sensitivity_xx" in capsys.readouterr().out
+    assert "What the best line leaves of gyro_x" in Path("r.html").read_text(encoding="utf-8")
+    fast = made.recordings[0].with_columns({"gyro_x": 2 * made.recordings[0].column("gyro_x")}, {"gyro_x": "rad/s"})
+    il.write(fast, "fast.csv")
+    assert main(["apply", "both.json", "fast.csv", "-o", "corrected.csv"], project=False) == 0
+    assert "beyond 300 deg/s (up to 600" in capsys.readouterr().err
     assert main(["export", "--to", "c", "both.json", "-o", "c"], project=False) == 0
     rng = np.random.default_rng(2)
     rate, force = rng.uniform(-3, 3, (40, 3)), rng.uniform(-G, G, (40, 3))

@@ -1,6 +1,7 @@
 """Whole turns by hand with accelerometers: the axis of each turn, misalignments, and both triads in one record."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,6 +61,7 @@ def test_the_record_is_of_both_triads_and_corrects_both(accel, tmp_path, monkeyp
     accel.save("accel.json")
     command = ["rate", "turn", "turns.csv", "--accel", "accel.json", "-o", "both.json", "--report", "both.html"]
     assert main(command, project=False) == 0
+    assert "What is left of each turn" in Path("both.html").read_text(encoding="utf-8")
     capsys.readouterr()
     assert main(["show", "both.json"], project=False) == 0
     said = capsys.readouterr().out

@@ -117,14 +117,15 @@ class _Rows:
 def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
     from imulab.power_on import TAKEN_FROM
-    from imulab.procedures.apply import beyond_message, beyond_test_of, warnings_of
+    from imulab.procedures.apply import beyond_tests_of, warnings_of
     from imulab.verdict import Note
 
-    counts, largest, name = [0] * len(records), [0.0] * len(records), ""
+    tests = [test for record in records for test in beyond_tests_of(record)]
+    counts, largest, name = [0] * len(tests), [0.0] * len(tests), ""
     for number, block in enumerate(blocks):
-        for index, record in enumerate(records):
+        for index, (record, beyond, _) in enumerate(tests):
             try:
-                here, most = beyond_test_of(record, block)
+                here, most = beyond(record, block)
             except ImulabError:  # what only an earlier record of the chain makes usable; apply itself refuses the rest
                 continue
             counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
@@ -136,9 +137,9 @@ def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording
             messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]
             for message in dict.fromkeys(messages):
                 warn(message)
-    for record, count, most in zip(records, counts, largest, strict=True):
+    for (record, _, said), count, most in zip(tests, counts, largest, strict=True):
         if count:
-            warn(f"{name}: {beyond_message(record, count, most)}")
+            warn(f"{name}: {said(record, count, most)}")
 
 
 @with_options(READ)

@@ -12,6 +12,8 @@ from typing import Any, Unpack
 
 from imulab.columns import KINDS, triad
 from imulab.device.blob import Blob
+from imulab.device.gyroscopes import beyond_message as gyroscopes_beyond
+from imulab.device.gyroscopes import beyond_rates
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.power_on import with_power_on_temperature
@@ -25,6 +27,9 @@ from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.verdict import SENTENCES, Note
+
+_Beyond = Callable[[Calibration, Recording], tuple[int, float]]
+_Said = Callable[[Calibration, int, float], str]
 
 _FAR_IN_TEMPERATURE = 20.0
 
@@ -301,15 +306,14 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     ]
 
 
-def beyond_test_of(record: Calibration | Blob, recording: Recording) -> tuple[int, float]:
-    """Return how many samples lie far beyond what the record was made at, and the largest, SI."""
-    beyond = None if isinstance(record, Blob) else procedure_of(record).beyond
-    return (0, 0.0) if beyond is None or isinstance(record, Blob) else beyond(record, recording)
-
-
-def beyond_message(record: Calibration | Blob, count: int, largest: float) -> str:
-    """Say that `count` samples, up to `largest`, SI, lie beyond what the record was made at."""
-    assert not isinstance(record, Blob)
-    message = procedure_of(record).beyond_message
-    assert message is not None
-    return message(record, count, largest)
+def beyond_tests_of(record: Calibration | Blob) -> list[tuple[Calibration, _Beyond, _Said]]:
+    """Return what counts samples far beyond what the record was made at, and what says so, each with the record."""
+    if isinstance(record, Blob):
+        return []
+    of = procedure_of(record)
+    found = [] if of.beyond is None or of.beyond_message is None else [(record, of.beyond, of.beyond_message)]
+    if "largest_rate" in record.model and record.procedure != "rate":
+        found.append(
+            (record, beyond_rates, gyroscopes_beyond)
+        )  # of gyroscopes that joined a record of another procedure
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from imulab import report
@@ -32,7 +33,12 @@ def exhibits_of(record: Calibration) -> Exhibits:
         Its procedure is not known, or it lacks the data that they need.
     """
     exhibits: Exhibits = procedure_of(record).exhibits(record)
-    return exhibits
+    if "rate" not in record.fit or record.procedure == "rate":
+        return exhibits
+    from imulab.procedures.rate.figures import exhibits_of_joined
+
+    joined = exhibits_of_joined(record)
+    return replace(exhibits, headline=f"{exhibits.headline} {joined.headline}", items=[*exhibits.items, *joined.items])
 
 
 def change_unit(change: Change, record: Calibration) -> tuple[float, str]:

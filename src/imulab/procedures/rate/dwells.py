@@ -85,7 +85,7 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     if column is None and run.rates is None:
         raise SegmentError(
             f"{place}: no column table_rate or table_angle; expected the table's rates (rates = [0, 10, -10] in the "
-            "manifest, or --rates)"
+            'manifest, --rates for one recording; in Python rates="0,10,-10")'
         )
     recorded = column is not None
     signal = own if column is None else column

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,23 @@ def exhibits(record: Calibration) -> Exhibits:
     return Exhibits(headline, facts, items)
 
 
+def exhibits_of_joined(record: Calibration) -> Exhibits:
+    """Return what a record of both triads (``--accel``) shows of its gyroscopes beside the parameters."""
+    fit, data = record.fit["rate"], record.data["rate"]
+    by_hand = "turns" in data
+    axes = sorted(set(data["turns" if by_hand else "dwells"]["axis"]))
+    own = replace(
+        record,
+        procedure="rate",
+        parameters={name: p for name, p in record.parameters.items() if name.startswith("gyro_")},
+        model={**record.model, "axes": "".join(axes), "from": "turns" if by_hand else "steps"},
+        fit=fit,
+        data=data,
+    )
+    found = exhibits(own)
+    return replace(found, items=found.items[1:])
+
+
 def _parameters(record: Calibration) -> ReportTable:
     rows = []
     for row in engineering_rows(record):
@@ -81,7 +99,7 @@ def _left(name: str, seen: Seen) -> Figure:
         caption="Each dwell, in ppm of the largest rate; bars: one standard uncertainty by its noise. Rising and "
         "falling rates that lie apart are hysteresis; a bend that both follow is nonlinearity.",
         traces=traces,
-        layout={"xaxis": axis("rate, deg/s"), "yaxis": axis("left, ppm of the largest rate"), "legend": LEGEND},
+        layout={"xaxis": axis("rate, deg/s"), "yaxis": axis("residual, ppm of the largest rate"), "legend": LEGEND},
     )
 
 
@@ -103,21 +121,21 @@ def _of_line(record: Calibration, found: Rate) -> ReportTable:
         )  # fmt: skip
     return ReportTable(
         "What a line does not hold, ppm",
-        "Nonlinearity: largest residual of a rate over the largest rate; by noise it stays below the next column with "
-        "95 %, and leaves as much with probability p. Powers: highest of the rate in the model, and the largest "
-        "residual that is left of them. Asymmetry: slope of positive less slope of negative rates. "
-        "Hysteresis: largest rising less falling; p that noise makes such a loop. Repeatability: standard deviation of "
-        "the scale factor over runs, and that which noise makes.",
+        "Nonlinearity: largest residual of a rate over the largest rate; noise alone stays below the next column with "
+        "95 %, and leaves as much as was found with probability p. Order: highest power of the rate in the model; "
+        "what its powers leave is the largest residual beside them. Asymmetry: slope of positive less slope of "
+        "negative rates. Hysteresis: largest rising less falling; p of loop is the probability that noise makes it. "
+        "Repeatability: standard deviation of the scale factor over runs, and that which noise makes.",
         [
             "gyro",
             "nonlinearity",
             "95 % by noise",
-            "p",
-            "powers",
-            "left",
+            "p of noise",
+            "order",
+            "powers leave",
             "asymmetry",
             "hysteresis",
-            "p",
+            "p of loop",
             "repeatability",
             "by noise",
         ],

@@ -78,8 +78,11 @@ class RateTest:
     proportional_uncertainty: float = 0.0
 
     def spread_of(self, rate: Array) -> Array:
-        """Return the standard uncertainty of commanded rates beside what all have in common, rad/s, shape (n,)."""
-        return np.hypot(self.rate_uncertainty, self.proportional_uncertainty * rate)
+        """Return the standard uncertainty of commanded rates beside what all have in common, rad/s, shape (n,).
+
+        A table that stands still has none.
+        """
+        return np.where(rate == 0, 0.0, np.hypot(self.rate_uncertainty, self.proportional_uncertainty * rate))
 
     def place(self, index: int) -> str:
         """Return how messages name run `index`, counted from 0."""

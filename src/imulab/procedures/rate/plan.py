@@ -104,12 +104,16 @@ class RatePlan(Shown):
         total = len(self.test.runs) * self.duration
         head = (
             f"{len(self.test.runs)} runs of {self.duration / 60:.1f} min, {total / 3600:.1f} h at the table's rates; "
-            f"predicted: {self._predicted()}"
+            f"predicted standard uncertainties at most: {self._predicted()}"
         )
         return head, ["rate, deg/s", "stay, s", "turns", "u, ppm of full", "wanted"], rows
 
     def _predicted(self) -> str:
-        words = {"gyro_scale_factor": "u(S) {} ppm", "gyro_misalignment": "u(T) {} mrad", "gyro_bias": "u(b) {} deg/h"}
+        words = {
+            "gyro_scale_factor": "scale factors {} ppm",
+            "gyro_misalignment": "misalignments {} mrad",
+            "gyro_bias": "biases {} deg/h",
+        }
         said = []
         for stem, words_ in words.items():
             most = max((u for name, u in self.predicted.items() if name.startswith(stem)), default=None)

@@ -41,7 +41,8 @@ def make_record(
     """Turn a solution into the record."""
     names, values, matrix, units, freedoms = model_parameters(test, problem, solution, unit, axes)
     if solution.cycle_freedom is not None:
-        freedoms |= {name: float(solution.cycle_freedom) for name in names if name.startswith("gyro_scale_factor")}
+        variances = np.diag(matrix).tolist()
+        freedoms |= _of_cycles(problem, solution, names, values.tolist(), variances)
     parameters = {}
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
         wide = coverage_factor(freedoms[name]) * u if name in freedoms else None
@@ -80,6 +81,19 @@ def make_record(
             *of_sines(test, dwells),
         ),
     )
+
+
+def _of_cycles(
+    problem: Problem, solution: Solution, names: Sequence[str], values: Sequence[float], variances: Sequence[float]
+) -> dict[str, float]:
+    """Return the degrees of freedom of scale factors, whose share by cycles few cycles show (Welch, Satterthwaite)."""
+    freedoms = {}
+    for name, value, variance in zip(names, values, variances, strict=True):
+        if name.startswith("gyro_scale_factor"):
+            runs = len(np.unique(problem.run[problem.axis == AXES.index(name[-1])]))
+            share = (solution.cycle * value) ** 2 / runs / variance
+            freedoms[name] = float(solution.cycle_freedom or 0) / min(share, 1.0) ** 2
+    return freedoms
 
 
 def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:

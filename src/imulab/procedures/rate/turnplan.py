@@ -48,7 +48,7 @@ class TurnPlan(Shown):
             f"{self.turns} turn{'s' * (self.turns > 1)} on and {self.turns} back about each axis, {self.stops} stops, "
             f"reach {1e6 * self.reached[-1]:.3g} ppm; wanted {1e6 * self.wanted:.6g} ppm"
         )
-        return head, ["turns each way", "stops", "u(S)/S, ppm"], rows
+        return head, ["turns each way", "stops", "u of the scale factor, ppm"], rows
 
     def plot(self) -> Plot:
         """Return the uncertainty over the number of turns, beside the wanted one."""

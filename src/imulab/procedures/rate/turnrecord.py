@@ -134,7 +134,7 @@ def turns_exhibits(record: Calibration) -> Exhibits:
         title="What is left of each turn",
         caption="Bars: one standard uncertainty, of both stops and of the zero.",
         traces=traces,
-        layout={"xaxis": axis("turn", dtick=1), "yaxis": axis("left, deg")},
+        layout={"xaxis": axis("turn", dtick=1), "yaxis": axis("residual, deg")},
     )
     fence = float(np.degrees(found.fit.fence.value))
     return Exhibits(
@@ -147,7 +147,7 @@ def turns_exhibits(record: Calibration) -> Exhibits:
             ReportTable(
                 "Turns",
                 "Stated angle of each, and what is left of it by the scale factor found.",
-                ["gyro", "from, s", "to, s", "turns", "angle, deg", "left, deg", "u, deg"],
+                ["gyro", "from, s", "to, s", "turns", "angle, deg", "residual, deg", "u, deg"],
                 table,
             ),
             *([figure] if several else []),
