@@ -41,8 +41,8 @@ def make_record(
     """Turn a solution into the record."""
     names, values, matrix, units, freedoms = model_parameters(test, problem, solution, unit, axes)
     if solution.cycle_freedom is not None:
-        variances = np.diag(matrix).tolist()
-        freedoms |= _of_cycles(problem, solution, names, values.tolist(), variances)
+        cycles = solution.cycle_freedom
+        freedoms |= _of_cycles(test, cycles, names, values.tolist(), np.diag(matrix).tolist())
     parameters = {}
     for name, value, u, of in zip(names, values.tolist(), np.sqrt(np.diag(matrix)).tolist(), units, strict=True):
         wide = coverage_factor(freedoms[name]) * u if name in freedoms else None
@@ -84,15 +84,14 @@ def make_record(
 
 
 def _of_cycles(
-    problem: Problem, solution: Solution, names: Sequence[str], values: Sequence[float], variances: Sequence[float]
+    test: RateTest, freedom: int, names: Sequence[str], values: Sequence[float], variances: Sequence[float]
 ) -> dict[str, float]:
-    """Return the degrees of freedom of scale factors, whose share by cycles few cycles show (Welch, Satterthwaite)."""
+    """Return the degrees of freedom of scale factors: cycles show all but what the table states (Satterthwaite)."""
     freedoms = {}
     for name, value, variance in zip(names, values, variances, strict=True):
         if name.startswith("gyro_scale_factor"):
-            runs = len(np.unique(problem.run[problem.axis == AXES.index(name[-1])]))
-            share = (solution.cycle * value) ** 2 / runs / variance
-            freedoms[name] = float(solution.cycle_freedom or 0) / min(share, 1.0) ** 2
+            seen = 1 - (value * (test.relative_uncertainty or 0.0)) ** 2 / variance
+            freedoms[name] = freedom / max(seen, 1e-3) ** 2
     return freedoms
 
 
