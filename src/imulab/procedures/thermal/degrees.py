@@ -64,28 +64,50 @@ def seen(solution: Solution) -> Observability:
     return observability(np.delete(rows.jacobian, fitted, axis=1), 1 / (np.diag(rows.noise) + solution.excess**2))
 
 
-def left_out(solution: Solution, kept: NDArray[np.bool_], cluster: NDArray[np.int64]) -> list[LeftOut]:
-    """Return the errors at each interior temperature under a fit, with these coefficients alone, to all others."""
+@dataclass(frozen=True)
+class Split:
+    """One temperature left out: its rows with their V, and all others whitened; the Jacobians have every column."""
+
+    number: int
+    jacobian: Array
+    target: Array
+    covariance: Array
+    rest: Array
+    rest_target: Array
+
+
+def splits(solution: Solution, cluster: NDArray[np.int64]) -> list[Split]:
+    """Return the split at each interior temperature: the factor of V is what takes time, and no choice changes it."""
     rows, found = solution.rows, []
-    columns = np.ones(rows.jacobian.shape[1], dtype=np.bool_)
-    columns[: len(kept)] = kept
-    whole = np.zeros(len(columns))
+    whole = np.zeros(rows.jacobian.shape[1])
     whole[: len(solution.coefficients)] = solution.coefficients
-    target, jacobian = rows.jacobian @ whole - rows.residual, rows.jacobian[:, columns]
+    target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
     for number in range(1, int(cluster.max(initial=0))):
         train, test = at != number, (at == number) & rows.magnitude
         white = whitener(_part(rows, train), solution.excess**2, solution.scatter.tau)
-        rest = white(jacobian[train])
+        own = together(_part(rows, test), solution.excess**2, solution.scatter.tau)
+        given = rows.jacobian[train], target[train]
+        found.append(Split(number, rows.jacobian[test], target[test], own, white(given[0]), white(given[1])))
+    return found
+
+
+def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOut]:
+    """Return the errors at each interior temperature under a fit, with these coefficients alone, to all others."""
+    found = []
+    for split in given:
+        columns = np.ones(split.rest.shape[1], dtype=np.bool_)
+        columns[: len(kept)] = kept
+        rest, jacobian = split.rest[:, columns], split.jacobian[:, columns]
         values = np.linalg.svd(rest / np.maximum(np.linalg.norm(rest, axis=0), 1e-300), compute_uv=False)
         if not values[-1] > values[0] / _TOLD or len(rest) < rest.shape[1]:
             continue  # the only tumble is at this temperature: the others do not determine the laws
         inverse = np.linalg.pinv(rest, rcond=1e-13)
-        error = target[test] - jacobian[test] @ (inverse @ white(target[train]))
-        carried = jacobian[test] @ inverse
-        scatter = together(_part(rows, test), solution.excess**2, solution.scatter.tau) + carried @ carried.T
+        error = split.target - jacobian @ (inverse @ split.rest_target)
+        carried = jacobian @ inverse
+        scatter = split.covariance + carried @ carried.T
         chi_square = float(error @ np.linalg.solve(scatter, error)) / len(error)
-        found.append(LeftOut(number, int(test.sum()), float(np.sqrt(np.mean(error**2))), chi_square))
+        found.append(LeftOut(split.number, len(error), float(np.sqrt(np.mean(error**2))), chi_square))
     return found
 
 
@@ -123,22 +145,25 @@ def choose(problem: Problem, laws: Laws, wanted: str | Degrees, tau: float | Non
                 "expected a degree below their number: record at more temperatures"
             )
         solution, view = _observable(problem, replace(laws, degrees=degrees), tau, name)
-        return solution, [], _at(left_out(solution, _all(laws, degrees), cluster), problem, cluster), view
+        return solution, [], _at(left_out(splits(solution, cluster), _all(laws, degrees)), problem, cluster), view
     degrees = _start(problem, laws, limit, tau, name)
     solution, view = _observable(problem, replace(laws, degrees=degrees), tau, name)
-    steps = [Step(degrees, _rms(left_out(solution, _all(laws, degrees), cluster)), None, True)]
+    given = splits(solution, cluster)
+    held = left_out(given, _all(laws, degrees))
+    steps = [Step(degrees, _rms(held), None, True)]
     while True:
-        down = [_step(solution, group, cluster) for group in range(3) if solution.laws.degrees[group]]
+        down = [_step(solution, group, given) for group in range(3) if solution.laws.degrees[group]]
         steps += down
-        before = _rms(left_out(solution, _all(laws, solution.laws.degrees), cluster))
+        before = _rms(held)
         fine = [step for step in down if (step.probability or 0) > _INSIGNIFICANT and _no_worse(step.left_out, before)]
         if not fine:
             break
         best = max(fine, key=lambda step: step.probability or 0.0)
         solution, view = _observable(problem, replace(laws, degrees=best.degrees), tau, name)
+        given = splits(solution, cluster)
+        held = left_out(given, _all(laws, best.degrees))
     chosen = solution.laws.degrees
     unique = {step.degrees: replace(step, chosen=step.degrees == chosen) for step in steps}
-    held = left_out(solution, _all(laws, chosen), cluster)
     return solution, list(unique.values()), _at(held, problem, cluster), view
 
 
@@ -172,7 +197,7 @@ def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> t
     return solution, view
 
 
-def _step(solution: Solution, group: int, cluster: NDArray[np.int64]) -> Step:
+def _step(solution: Solution, group: int, given: Sequence[Split]) -> Step:
     """Return what is lost where the highest power of one kind is left out: Wald's test, and the prediction."""
     degrees = list(solution.laws.degrees)
     kept = np.ones(solution.laws.size, dtype=np.bool_)
@@ -187,7 +212,7 @@ def _step(solution: Solution, group: int, cluster: NDArray[np.int64]) -> Step:
     freedom = min(solution.degrees_of_freedom(row) for row in np.eye(len(kept))[gone])
     degrees[group] -= 1
     probability = tail(square, len(value), freedom)
-    return Step((degrees[0], degrees[1], degrees[2]), _rms(left_out(solution, kept, cluster)), probability)
+    return Step((degrees[0], degrees[1], degrees[2]), _rms(left_out(given, kept)), probability)
 
 
 def tail(square: float, count: int, freedom: float) -> float:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from imulab.errors import ObservabilityError
 from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.thermal.choices import DEGREES
-from imulab.procedures.thermal.degrees import Degrees, LeftOut, clusters_of, left_out, tail
+from imulab.procedures.thermal.degrees import Degrees, LeftOut, clusters_of, left_out, splits, tail
 from imulab.procedures.thermal.gyroholds import RatesAtRest
 from imulab.procedures.thermal.lag import ALL, Drift, tested, untold
 from imulab.procedures.thermal.model import Laws
@@ -116,7 +116,7 @@ def fit_gyroscopes(
     drift = _drift(held, solution, sensitivity, tau)
     if drift.free:
         solution = solve(held, laws, tau, sensitivity=sensitivity, free=drift.free) or solution
-    found = left_out(solution, np.ones(len(solution.coefficients), dtype=np.bool_), cluster)
+    found = left_out(splits(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
     places = [
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
         for e in found
@@ -154,9 +154,10 @@ def _lower(solution: Solution, laws: Laws, cluster: NDArray[np.int64]) -> Laws |
     kept = np.ones(len(solution.coefficients), dtype=np.bool_)
     if not wald(solution, top) > _SIGNIFICANT:
         return None
-    before = _rms(left_out(solution, kept, cluster))
+    given = splits(solution, cluster)
+    before = _rms(left_out(given, kept))
     kept[top] = False
-    after = _rms(left_out(solution, kept, cluster))
+    after = _rms(left_out(given, kept))
     if before is not None and after is not None and after > _NO_WORSE * before:
         return None
     return replace(laws, degrees=(degree - 1, 0, 0))
