@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from imulab.cli.fit_options import one_of, reading, with_options
+from imulab.cli.fit_options import READ, one_of, reading, with_options
 from imulab.cli.options import (
     AsJson,
     GivenFiles,
@@ -176,7 +176,7 @@ def fit(
 _OF_THE_CHECK = ("gravity", "latitude", "height", "tilt", "turn_on_scatter", "settle", "temperature_column")
 
 
-@with_options([option for option in OPTIONS if option.name not in ("degrees", "prior")])
+@with_options((*(option for option in OPTIONS if option.name in _OF_THE_CHECK), *READ))
 def check(
     record: RecordFile,
     files: Annotated[list[str], typer.Argument(metavar="FILE...", help="New recordings, one power cycle each.")],

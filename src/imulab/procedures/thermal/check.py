@@ -185,6 +185,8 @@ def check_thermal(
             "the record does not say how far biases move from one power cycle to the next, so an offset that a whole "
             "recording has in common is not tested: state --turn-on-scatter"
         )
+    if thermal_of(held).model.gyro is not None:
+        notes.append(Note("the record's accelerometers alone are tested, not its gyroscopes"))
     notes += [*([local.note] if local.note else []), *_known(held, given)]
     return ThermalCheck(holds, *tested, local, largest, tuple(notes))
 
