@@ -284,6 +284,15 @@ def test_degrees_taken_for_radians_are_said_by_the_turns(turned):
     assert any("the scale factors are off by" in each and "is the unit" in each for each in record.warnings)
 
 
+@pytest.mark.parametrize("change", [{"gyro_x": "gyro_y", "gyro_y": "gyro_x"}, {"gyro_z": "-"}])
+def test_swapped_and_reversed_axes_are_refused(turned, change):
+    made = [{**c, **{a: -c[a] if b == "-" else c[b] for a, b in change.items()}} for c in turned[2]]
+    with pytest.raises(
+        il.ImulabError, match=r"^soak_\d.csv: columns gyro_x gyro_y gyro_z: the turns miss .*swapped or"
+    ):
+        il.fit_thermal(recordings(made), gravity=G, with_="gyro", degrees="3,2,1")
+
+
 def test_lost_samples_and_saturated_turns_are_named(turned):
     made = [dict(columns) for columns in turned[2]]
     for a in "xyz":

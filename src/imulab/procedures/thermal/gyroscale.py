@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.device.unit import DeviceUnit
-from imulab.errors import DataError, ImulabError
+from imulab.errors import DataError, SegmentError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import leave_out
 from imulab.procedures.thermal.degrees import clusters_of
@@ -41,6 +41,7 @@ _LAW_AT = 3
 """Temperatures with turns at which the scale factor follows them."""
 _SIGNIFICANT = 0.01
 _WORST = 0.1
+_LARGE_MISS, _ASKEW = 2.0, 0.2  # deg, rad
 
 
 @dataclass(frozen=True)
@@ -105,11 +106,11 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
         return np.ones(3)
     found, why = [], "no recording has nine attitudes"
     for number, attitudes in enumerate(holds.attitudes):
-        if len(attitudes) < _FEWEST or attitudes.trace is None:
+        if not _turns(attitudes):
             continue
         try:
             solved = solve_turns(*_case(holds, number, record, np.ones(3), None, unit), "auto")
-        except ImulabError as error:
+        except SegmentError as error:
             why = str(error)
             continue
         found.append(solved.scale * (1 + solved.theta[:3]))
@@ -121,10 +122,20 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
     return np.asarray(np.mean(found, axis=0), dtype=np.float64)
 
 
+def _turns(attitudes: Attitudes) -> bool:
+    """Whether a recording has attitudes enough for turns to tell anything; one that rests while it drifts has one."""
+    return attitudes.pieces is not None and len(np.unique(attitudes.pieces[:, 2])) >= _FEWEST
+
+
 def scale_from_turns(
     holds: Holds, problem: Problem, solution: Solution, record: Calibration, gyros: Gyroscopes, reading: Array
 ) -> ScaleLaws | None:
     """Return the laws of scale factors and misalignments, None where no recording tells them.
+
+    Raises
+    ------
+    DataError
+        The turns miss the change of gravity's direction by far: swapped or reversed axes.
 
     Parameters
     ----------
@@ -138,12 +149,12 @@ def scale_from_turns(
     found: list[Turned] = []
     notes: list[str] = []
     for number, attitudes in enumerate(holds.attitudes):
-        if len(attitudes) < _FEWEST or attitudes.trace is None:
+        if not _turns(attitudes):
             continue
         case, time = _case(holds, number, record, gyros.held.size, gyros, "rad/s")
         try:
             solved = solve_turns(case, time, "no")
-        except ImulabError as error:
+        except SegmentError as error:
             notes.append(Note(f"gyro: no scale factors from {error}"))
             continue
         notes += [f"{holds.recordings[number].name}: {note}" for note in solved.notes]
@@ -235,6 +246,13 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
         )
     turns = sum(each.turns for each in found)
     miss = float(np.sqrt(sum(each.cost for each in found) / turns))
+    if np.degrees(miss) > _LARGE_MISS or np.abs(coefficients[size:]).max() > _ASKEW:
+        notes.append(
+            Bad(
+                f"gyro: the turns miss the change of gravity's direction by {np.degrees(miss):.2g} deg rms, with axes "
+                f"askew by up to {1e3 * np.abs(coefficients[size:]).max():.0f} mrad: swapped or reversed axes?"
+            )
+        )
     return ScaleLaws(laws, coefficients, matrix, len(found), turns, miss, square, freedom, tuple(notes))
 
 
