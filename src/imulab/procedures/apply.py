@@ -12,8 +12,6 @@ from typing import Any, Unpack
 
 from imulab.columns import KINDS, triad
 from imulab.device.blob import Blob
-from imulab.device.gyroscopes import beyond_message as gyroscopes_beyond
-from imulab.device.gyroscopes import beyond_rates
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.power_on import with_power_on_temperature
@@ -21,7 +19,7 @@ from imulab.procedures.inputs import Data, Reading, Record, as_record, as_record
 from imulab.procedures.loading import load_any
 from imulab.procedures.order import check_after, check_order, entry, thermals_of
 from imulab.procedures.procedure import Section
-from imulab.procedures.registry import procedure_of, section
+from imulab.procedures.registry import joined_of, procedure_of, section
 from imulab.procedures.unit_tables import tables_of
 from imulab.quantities import in_si
 from imulab.recording import Recording
@@ -310,10 +308,8 @@ def beyond_tests_of(record: Calibration | Blob) -> list[tuple[Calibration, _Beyo
     """Return what counts samples far beyond what the record was made at, and what says so, each with the record."""
     if isinstance(record, Blob):
         return []
-    of = procedure_of(record)
-    found = [] if of.beyond is None or of.beyond_message is None else [(record, of.beyond, of.beyond_message)]
-    if "largest_rate" in record.model and record.procedure != "rate":
-        found.append(
-            (record, beyond_rates, gyroscopes_beyond)
-        )  # of gyroscopes that joined a record of another procedure
-    return found
+    return [
+        (record, of.beyond, of.beyond_message)
+        for of in (procedure_of(record), *joined_of(record))
+        if of.beyond is not None and of.beyond_message is not None
+    ]

@@ -190,6 +190,8 @@ class Procedure:
     beyond
         Record and recording to how many samples lie beyond what the record was made at, and the largest specific force
         among them, m/s^2; None where no such limit is known.
+    joined
+        Record of another procedure, whose ``fit`` and ``data`` hold this one's under its name, to what it shows of it.
     beyond_message
         Record, that number and that force to what a user should know.
     """
@@ -219,6 +221,7 @@ class Procedure:
     heading: Callable[[Calibration], Callable[[Recording], Recording]] | None = None
     beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None
     beyond_message: Callable[[Calibration, int, float], str] | None = None
+    joined: Callable[[Calibration], Exhibits] | None = None
 
     def section(self, kind: str) -> Section:
         """Return one of its kinds of section."""

@@ -39,6 +39,12 @@ def procedure_of(record: Calibration) -> Procedure:
     raise RecordError(f"unknown procedure {record.procedure!r}; known procedures: {known}")
 
 
+def joined_of(record: Calibration) -> list[Procedure]:
+    """Return the other procedures whose results a record holds beside its own."""
+    others = (entry for entry in PROCEDURES.values() if entry.joined is not None and entry.name != record.procedure)
+    return [entry for entry in others if entry.name in record.fit]
+
+
 def sections() -> Iterator[Section]:
     """Yield every kind of section that a unit's tables can have."""
     for entry in PROCEDURES.values():

@@ -10,7 +10,7 @@ from imulab import report
 from imulab.atomic_write import write_page
 from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.procedure import Row
-from imulab.procedures.registry import procedure_of
+from imulab.procedures.registry import joined_of, procedure_of
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
 from imulab.report.elements import Exhibits
@@ -33,12 +33,13 @@ def exhibits_of(record: Calibration) -> Exhibits:
         Its procedure is not known, or it lacks the data that they need.
     """
     exhibits: Exhibits = procedure_of(record).exhibits(record)
-    if "rate" not in record.fit or record.procedure == "rate":
-        return exhibits
-    from imulab.procedures.rate.figures import exhibits_of_joined
-
-    joined = exhibits_of_joined(record)
-    return replace(exhibits, headline=f"{exhibits.headline} {joined.headline}", items=[*exhibits.items, *joined.items])
+    for entry in joined_of(record):
+        assert entry.joined is not None
+        more = entry.joined(record)
+        exhibits = replace(
+            exhibits, headline=f"{exhibits.headline} {more.headline}", items=[*exhibits.items, *more.items]
+        )
+    return exhibits
 
 
 def change_unit(change: Change, record: Calibration) -> tuple[float, str]:

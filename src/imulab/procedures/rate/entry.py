@@ -25,6 +25,7 @@ ENTRY = Procedure(
         ),
     ),
     elsewhere="{target} wants accelerometers too, and a rate record holds gyroscopes alone",
+    joined=deferred(f"{_HERE}.figures:exhibits_of_joined"),
     rows=deferred(f"{_HERE}.engineering:rows"),
     beyond=deferred("imulab.device.gyroscopes:beyond_rates"),
     beyond_message=deferred("imulab.device.gyroscopes:beyond_message"),
