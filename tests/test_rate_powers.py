@@ -63,7 +63,7 @@ def test_auto_gives_each_gyroscope_its_powers_and_apply_inverts_them(tmp_path):
     np.testing.assert_allclose(il.apply(record, flight).triad("gyro") * DEGREE, rates, atol=2e-5)
     record.save(tmp_path / "r.json")
     il.write_report(il.load(tmp_path / "r.json"), tmp_path / "r.html")
-    assert ">powers</th>" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert ">powers leave</th>" in (tmp_path / "r.html").read_text(encoding="utf-8")
     il.export("blob", il.load(tmp_path / "r.json"), tmp_path / "fw")
     assert (tmp_path / "fw" / "unit.blob").read_bytes()[8] == 2
     by_blob = il.apply(str(tmp_path / "fw" / "unit.blob"), flight).triad("gyro") * DEGREE
