@@ -59,3 +59,46 @@ def soak(triad, rng, temperature, count, noise=60e-6 * G, turn_on=0.0):
     offset = turn_on * rng.standard_normal(3)
     means = [triad.output(G * u, temperature, offset) for u in directions(rng, count)]
     return np.array(means) + noise * rng.standard_normal((count, 3)), np.full(count, temperature)
+
+
+def natural_spline(knots, values, t):
+    """Natural cubic spline through values at knots, at one t (de Boor 1978; Thomas' algorithm)."""
+    n = len(knots)
+    h = [knots[i + 1] - knots[i] for i in range(n - 1)]
+    slope = [(values[i + 1] - values[i]) / h[i] for i in range(n - 1)]
+    upper, right = [0.0] * n, [0.0] * n
+    for i in range(1, n - 1):
+        pivot = 2 * (h[i - 1] + h[i]) - h[i - 1] * upper[i - 1]
+        upper[i] = h[i] / pivot
+        right[i] = (6 * (slope[i] - slope[i - 1]) - h[i - 1] * right[i - 1]) / pivot
+    second = [0.0] * n
+    for i in range(n - 2, 0, -1):
+        second[i] = right[i] - upper[i] * second[i + 1]
+    i = next((k for k in range(n - 2) if t < knots[k + 1]), n - 2)
+    a, b = (knots[i + 1] - t) / h[i], (t - knots[i]) / h[i]
+    bent = ((a**3 - a) * second[i] + (b**3 - b) * second[i + 1]) * h[i] ** 2 / 6
+    return a * values[i] + b * values[i + 1] + bent
+
+
+class BentTriad(Triad):
+    """A triad whose biases have more than a cubic: a kink of 0.25 mg/K, bends of some 25 K, or splines of their own."""
+
+    def __init__(self, rng, law, knots=(), bend=1.4e-4 * G):
+        super().__init__(rng)
+        self.law, self.knots, self.bend = law, knots, bend
+        self.place, self.sign = rng.uniform(0, 40), rng.choice([-1.0, 1.0], 3)
+        self.size, self.phase = rng.uniform(0.3, 1.0, 3), rng.uniform(0, 2 * np.pi, 3)
+        self.values = 5e-3 * G * rng.standard_normal((3, len(knots)))
+
+    def at(self, temperature):
+        bias, scale, misalignment = super().at(temperature)
+        if self.law == "kink":
+            bias = [
+                b + s * 2.5e-4 * G * max(temperature - self.place, 0.0) for b, s in zip(bias, self.sign, strict=True)
+            ]
+        elif self.law == "rough":
+            bend = self.bend * self.size * np.sin(temperature / 8.0 + self.phase)
+            bias = [b + more for b, more in zip(bias, bend.tolist(), strict=True)]
+        else:
+            bias = [natural_spline(self.knots, own, temperature) for own in self.values.tolist()]
+        return bias, scale, misalignment

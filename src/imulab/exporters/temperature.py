@@ -78,12 +78,16 @@ def offset_law(
     temperature = middle + half * _NODES
     held = laws.parameters(temperature)
     design = ((temperature - about) / half)[:, None] ** np.arange(4)
-    offset = np.linalg.lstsq(design, held[:, 3:6] * held[:, :3])[0]
+    exact = held[:, 3:6] * held[:, :3]
+    offset = np.linalg.lstsq(design, exact)[0]
+    bent = float(np.abs(design @ offset - exact).max())
     scale = 2 / (held[:, 3:6].max(axis=0) + held[:, 3:6].min(axis=0))
     error = (laws.output(_FORCES, temperature) - (design @ offset)[:, None, :]) * scale - _FORCES
     slope = np.abs(np.diff(design @ offset, axis=0) / np.diff(temperature)[:, None]).max() * scale.max()
     size = half ** np.arange(4.0)[:, None]
     rest, costs, follows = _rest(over[0], target, temperature, design)
+    if len(laws.knots) > 2:
+        costs = [f"the bends of the bias beyond a cubic, up to {text_in_g(bent)}", *costs]
     lost = _settle(target, laws, error, float(slope), costs, options) + follows
     return OffsetLaw(
         laws.low,
@@ -121,12 +125,12 @@ def _rest(
 
 
 def _settle(
-    target: str, laws: AccelerometerLaws, error: Array, slope: float, gyro: list[str], options: ExportOptions
+    target: str, laws: AccelerometerLaws, error: Array, slope: float, costs: list[str], options: ExportOptions
 ) -> list[str]:
-    """Refuse what would be lost, that of gyroscopes included, or return the comments that say so, and tell them."""
+    """Refuse what would be lost, the costs of all else included, or return the comments that say so, and tell them."""
     span = f"from {laws.low:g} to {laws.high:g} degC"
     follows = [f"the offset changes by up to {text_in_g(slope)} per K {span}"]
-    worst, left = float(np.abs(error).max()), list(gyro)
+    worst, left = float(np.abs(error).max()), list(costs)
     if worst > _NEGLIGIBLE * STANDARD_GRAVITY:
         rms = float(np.sqrt(np.mean(error**2)))
         left.insert(

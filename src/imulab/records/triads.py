@@ -42,19 +42,33 @@ class Gyroscopes:
 class AccelerometerLaws:
     """``M = S(T) (T(T) f + b(T))`` over temperature: laws of the nine parameters in powers of theta, unit of M.
 
-    ``theta`` goes from -1 at `low` to 1 at `high`, degC, and stays at its end outside; `coefficient` (9, terms) has
-    the rows b_x b_y b_z, S_x S_y S_z, m_yx m_zx m_zy.
+    ``theta`` goes from -1 at one of the `knots`, degC, to 1 at the next, and stays at its end outside; `coefficient`
+    (pieces, 9, terms) has for each piece between knots the rows b_x b_y b_z, S_x S_y S_z, m_yx m_zx m_zy.
     """
 
-    low: float
-    high: float
+    knots: Array
     coefficient: Array
     unit: str
 
+    @property
+    def low(self) -> float:
+        """The lower end of the range, degC."""
+        return float(self.knots[0])
+
+    @property
+    def high(self) -> float:
+        """The upper end of the range, degC."""
+        return float(self.knots[-1])
+
     def parameters(self, temperature: Array) -> Array:
         """Return the nine parameters at temperatures (n,), shape (n, 9)."""
-        theta = (np.clip(temperature, self.low, self.high) - 0.5 * (self.low + self.high)) * 2 / (self.high - self.low)
-        return np.asarray(np.polynomial.polynomial.polyval(theta, self.coefficient.T).T, dtype=np.float64)
+        held = np.clip(temperature, self.low, self.high)
+        piece = np.clip(np.searchsorted(self.knots, held, side="right") - 1, 0, len(self.knots) - 2)
+        start, stop = self.knots[piece], self.knots[piece + 1]
+        theta = (2 * held - start - stop) / (stop - start)
+        powers = theta[:, None] ** np.arange(self.coefficient.shape[2])
+        found: Array = np.einsum("nk,nik->ni", powers, self.coefficient[piece])
+        return found
 
     def output(self, force: Array, temperature: Array) -> Array:
         """Return the outputs for specific forces (k, 3) at temperatures (n,), shape (n, k, 3)."""
@@ -67,9 +81,10 @@ class AccelerometerLaws:
 
 @dataclass(frozen=True)
 class GyroscopeLaws:
-    """``M = S(T) (T w + G f + b(T))`` over temperature; low, high, coefficient (6, terms) as in `AccelerometerLaws`.
+    """``M = S(T) (T w + G f + b(T))`` over temperature: laws in powers of theta, -1 at `low` to 1 at `high`, degC.
 
-    The rows are b_x b_y b_z, rad/s, and S_x S_y S_z, unit of M per rad/s; matrix T (3, 3) and sensitivity G (3, 3).
+    The rows of `coefficient` (6, terms) are b_x b_y b_z, rad/s, and S_x S_y S_z, unit of M per rad/s; matrix T (3, 3)
+    and sensitivity G (3, 3).
     """
 
     low: float

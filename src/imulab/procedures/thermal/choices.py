@@ -14,6 +14,8 @@ TEMPERATURES = "-20,0,25,45,60"
 APART = 5.0
 """K: temperatures that lie closer count as one."""
 LEAST_SPAN = 10.0
+LEAST_KNOTS = 5
+"""Temperatures from which a spline of the bias is tried."""
 SETTLE = 300.0
 
 
@@ -39,12 +41,34 @@ def degrees_of(text: str, option: str) -> str | tuple[int, int, int]:
     OptionError
         It is neither.
     """
+    found, spline = laws_of(text, option)
+    if spline:
+        raise OptionError(f"{option} {text!r}: expected degrees such as 3,2,1; a spline is for a fit")
+    return found
+
+
+def laws_of(text: str, option: str) -> tuple[str | tuple[int, int, int], bool]:
+    """Return ``auto`` or the degrees that a text states, and whether the bias is a spline: ``3,2,1``, ``spline,2,1``.
+
+    Raises
+    ------
+    OptionError
+        It is none of them.
+    """
     if text == "auto":
-        return text
+        return text, False
     parts = [part.strip() for part in text.split(",")]
-    if len(parts) != 3 or not all(part.isdecimal() and int(part) <= HIGHEST for part in parts):
+    spline = parts[0] == "spline"
+    degrees = [str(DEGREES[0]), *parts[1:]] if spline else parts
+    if len(degrees) != 3 or not all(part.isdecimal() and int(part) <= HIGHEST for part in degrees):
         raise OptionError(
             f"{option} {text!r}: expected auto, or the degrees of bias, scale factor and misalignment, 0 to {HIGHEST}, "
-            "such as 3,2,1"
+            "such as 3,2,1, or spline,2,1 for a bias with a knot at each temperature"
         )
-    return int(parts[0]), int(parts[1]), int(parts[2])
+    return (int(degrees[0]), int(degrees[1]), int(degrees[2])), spline
+
+
+def degrees_text(text: str, option: str) -> str:
+    """Return a text that `laws_of` can read; raises OptionError as it does."""
+    laws_of(text, option)
+    return text

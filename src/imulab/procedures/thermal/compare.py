@@ -29,20 +29,20 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
         ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
         raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
     both = all(model.gyro is not None for model in models)
-    degrees = [max(of) for of in zip(*([law[2] for law in _laws(model, both)] for model in models), strict=True)]
+    counts = [max(of) for of in zip(*([law[2] for law in _laws(model, both)] for model in models), strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
-    nodes = [np.linspace(low, high, degree + 1) if degree else np.array([0.5 * (low + high)]) for degree in degrees]
+    nodes = [np.linspace(low, high, count) if count > 1 else np.array([0.5 * (low + high)]) for count in counts]
     nodes = [np.round(places, 1) for places in nodes]
     return _at(first, nodes, both), _at(second, nodes, both)
 
 
 def _laws(model: Model, gyroscopes: bool) -> list[tuple[str, tuple[str, ...], int]]:
-    """Return the kinds of parameters that follow the temperature, with their axes and degrees."""
+    """Return the kinds of parameters that follow the temperature, with their axes and numbers of coefficients."""
     found: list[tuple[str, tuple[str, ...], int]] = [
-        (kind, axes, degree) for (kind, axes), degree in zip(GROUPS, model.degrees.each, strict=True)
+        (kind, axes, count) for (kind, axes), count in zip(GROUPS, model.laws.terms, strict=True)
     ]
     if gyroscopes and model.gyro is not None:
-        found.append(("gyro_bias", AXES, model.gyro.degrees.bias))
+        found.append(("gyro_bias", AXES, model.gyro.degrees.bias + 1))
     return found
 
 
@@ -55,14 +55,17 @@ def _at(record: Calibration, nodes: list[Array], gyroscopes: bool) -> Calibratio
         scatters["gyro_bias"] = fit.gyro.between_recordings.bias, fit.gyro.between_recordings.rank
     rows, values, labels, units = [], [], [], []
     known: dict[str, float | None] = {}
-    for (kind, axes, degree), own in zip(_laws(sections.model, gyroscopes), nodes, strict=True):
-        powers = (own[:, None] - sections.model.reference_temperature.value) ** np.arange(degree + 1)
+    laws, about = sections.model.laws, sections.model.reference_temperature.value
+    for group, ((kind, axes, count), own) in enumerate(zip(_laws(sections.model, gyroscopes), nodes, strict=True)):
+        accelerometers = group < len(GROUPS)
+        functions = laws.recorded(group, own, about) if accelerometers else (own[:, None] - about) ** np.arange(count)
         for axis in axes:
-            used, _ = law_names(f"{kind}_{axis}", "", degree)
+            law = f"{kind}_{axis}"
+            used = laws.named(group, law) if accelerometers else law_names(law, "", count - 1)[0]
             row = np.zeros((len(own), len(names)))
-            row[:, [names.index(name) for name in used]] = powers
+            row[:, [names.index(name) for name in used]] = functions
             rows.append(row)
-            values.append(powers @ np.array([record.value(name) for name in used]))
+            values.append(functions @ np.array([record.value(name) for name in used]))
             labels += [f"{kind}_{axis} at {temperature:.1f} degC" for temperature in own]
             units += [record.parameters[used[0]].unit] * len(own)
         # What recordings scatter by is told by few of them, and is most of what these values are uncertain by.

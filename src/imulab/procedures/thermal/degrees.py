@@ -1,7 +1,9 @@
 """How the degrees of the laws are chosen, and how well temperatures are predicted that were left out whole.
 
 From the highest degrees *down*, a step at a time, where a step is insignificant (F at 1 %) and interior temperatures,
-left out whole, are predicted no worse: upward selection stops short where a law has a kink.
+left out whole, are predicted no worse: upward selection stops short where a law has a kink. The same is done with a
+natural cubic spline of the bias. It is taken where it predicts the temperatures left out at most a tenth worse than
+polynomials do: without one of its knots it must bridge twice the distance, which costs polynomials nothing.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from numpy.typing import NDArray
 
 from imulab.errors import ObservabilityError
 from imulab.estimation.least_squares import Observability, observability
-from imulab.procedures.thermal.choices import APART, DEGREES
-from imulab.procedures.thermal.model import GROUPS, Laws
+from imulab.procedures.thermal.choices import APART, DEGREES, LEAST_KNOTS
+from imulab.procedures.thermal.model import GROUPS, Laws, cardinal_spline
 from imulab.procedures.thermal.rows import Problem, Rows, together, whitener
 from imulab.procedures.thermal.solve import Solution, solve
 from imulab.recording import Array
@@ -23,6 +25,8 @@ from imulab.recording import Array
 Degrees = tuple[int, int, int]
 _INSIGNIFICANT = 0.01
 _NO_WORSE = 1.0
+_HANDICAP = 1.1
+"""Error at temperatures left out, over that of polynomials, up to which a spline is taken."""
 _TOLD = 2000.0
 
 
@@ -38,12 +42,26 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Step:
-    """Degrees that were compared: rms over the temperatures left out (g), probability of the step, whether chosen."""
+    """Degrees that were compared: rms over the temperatures left out (g), probability of the step, whether chosen.
+
+    `knots`: how many the spline of the bias had, 0 of a polynomial.
+    """
 
     degrees: Degrees
     left_out: float | None
     probability: float | None
     chosen: bool = False
+    knots: int = 0
+
+
+@dataclass(frozen=True)
+class Found:
+    """Laws that were fitted: the solution, what was compared on the way, temperatures left out, what the rows tell."""
+
+    solution: Solution
+    steps: list[Step]
+    left_out: list[LeftOut]
+    view: Observability
 
 
 def clusters_of(temperature: Array) -> NDArray[np.int64]:
@@ -66,7 +84,10 @@ def seen(solution: Solution) -> Observability:
 
 @dataclass(frozen=True)
 class Split:
-    """One temperature left out: its rows with their V, and all others whitened; the Jacobians have every column."""
+    """One temperature left out: its rows with their V, and all others whitened; the Jacobians have every column.
+
+    `untold` are the columns of a spline that has a knot there: fits to all other temperatures do without them.
+    """
 
     number: int
     jacobian: Array
@@ -74,6 +95,7 @@ class Split:
     covariance: Array
     rest: Array
     rest_target: Array
+    untold: tuple[int, ...] = ()
 
 
 def splits(solution: Solution, cluster: NDArray[np.int64]) -> list[Split]:
@@ -84,12 +106,29 @@ def splits(solution: Solution, cluster: NDArray[np.int64]) -> list[Split]:
     target = rows.jacobian @ whole - rows.residual
     at = np.where(rows.owner >= 0, cluster[rows.owner], -1)
     for number in range(1, int(cluster.max(initial=0))):
+        jacobian, untold = _without_knot(rows.jacobian, solution.laws, number)
         train, test = at != number, (at == number) & rows.magnitude
         white = whitener(_part(rows, train), solution.excess**2, solution.scatter.tau)
         own = together(_part(rows, test), solution.excess**2, solution.scatter.tau)
-        given = rows.jacobian[train], target[train]
-        found.append(Split(number, rows.jacobian[test], target[test], own, white(given[0]), white(given[1])))
+        rest = white(jacobian[train]), white(target[train])
+        found.append(Split(number, jacobian[test], target[test], own, *rest, untold))
     return found
+
+
+def _without_knot(jacobian: Array, laws: Laws, number: int) -> tuple[Array, tuple[int, ...]]:
+    """Return the Jacobian by the coefficients of the spline without one of its knots, and by one that bends there.
+
+    The columns of the latter, one for each axis, are returned too; without a spline nothing changes.
+    """
+    if not laws.knots:
+        return jacobian, ()
+    fewer = np.delete(laws.knots, number)
+    basis = np.insert(cardinal_spline(tuple(fewer.tolist()))(laws.knots), number, 0.0, axis=1)
+    basis[number, number] = 1.0
+    changed = jacobian.copy()
+    for part in laws.parts[:3]:
+        changed[:, part] = jacobian[:, part] @ basis
+    return changed, tuple(part.start + number for part in laws.parts[:3])
 
 
 def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOut]:
@@ -98,6 +137,7 @@ def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOut]:
     for split in given:
         columns = np.ones(split.rest.shape[1], dtype=np.bool_)
         columns[: len(kept)] = kept
+        columns[list(split.untold)] = False
         rest, jacobian = split.rest[:, columns], split.jacobian[:, columns]
         values = np.linalg.svd(rest / np.maximum(np.linalg.norm(rest, axis=0), 1e-300), compute_uv=False)
         if not values[-1] > values[0] / _TOLD or len(rest) < rest.shape[1]:
@@ -125,10 +165,10 @@ def _part(rows: Rows, which: NDArray[np.bool_]) -> Rows:
     )
 
 
-def choose(problem: Problem, laws: Laws, wanted: str | Degrees, tau: float | None, name: str) -> tuple[
-    Solution, list[Step], list[LeftOut], Observability
-]:  # fmt: skip
-    """Solve with the degrees wanted, or with those that data and prediction support.
+def choose(
+    problem: Problem, laws: Laws, wanted: str | Degrees, tau: float | None, name: str, *, spline: bool = False
+) -> Found:
+    """Solve with the degrees wanted, or with those that data and prediction support; `spline` that of the bias.
 
     Raises
     ------
@@ -136,50 +176,100 @@ def choose(problem: Problem, laws: Laws, wanted: str | Degrees, tau: float | Non
         The holds cannot separate the coefficients; the message names them.
     """
     cluster = clusters_of(problem.temperature)
-    limit = max(int(cluster.max(initial=0)) + 1 - 2, 0)
+    knots = _knots(problem.temperature, cluster, laws)
     if wanted != "auto":
-        degrees = (int(wanted[0]), int(wanted[1]), int(wanted[2]))
-        if max(degrees) > int(cluster.max(initial=0)):
+        own = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots * spline)
+        if max(own.degrees) >= len(knots) or (spline and len(knots) < LEAST_KNOTS):
+            needed = f"{LEAST_KNOTS} temperatures or more" if spline else "a degree below their number"
             raise ObservabilityError(
-                f"{name}: degrees {','.join(map(str, degrees))} at {int(cluster.max()) + 1} temperatures (5 K apart); "
-                "expected a degree below their number: record at more temperatures"
+                f"{name}: degrees {own.spelled} at {len(knots)} temperatures (5 K apart); expected {needed}: record at "
+                "more temperatures"
             )
-        solution, view = _observable(problem, replace(laws, degrees=degrees), tau, name)
-        return solution, [], _at(left_out(splits(solution, cluster), _all(laws, degrees)), problem, cluster), view
-    degrees = _start(problem, laws, limit, tau, name)
-    solution, view = _observable(problem, replace(laws, degrees=degrees), tau, name)
+        solution, view = _observable(problem, own, tau, name)
+        solution = _bounded(problem, solution, tau)
+        held = left_out(splits(solution, cluster), np.ones(own.size, dtype=np.bool_))
+        return Found(solution, [], _at(held, problem, cluster), view)
+    limit = max(len(knots) - 2, 0)
+    highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
+    found = _descended(problem, highest, cluster, tau, name)
+    steps = found.steps
+    if len(knots) >= LEAST_KNOTS:
+        try:
+            bent = _descended(problem, replace(highest, knots=knots), cluster, tau, name)
+        except ObservabilityError:
+            pass  # the holds do not tell so many values of the bias
+        else:
+            steps = steps + bent.steps
+            if _predicts(bent.left_out, found.left_out):
+                solution = _bounded(problem, bent.solution, tau)
+                held = left_out(splits(solution, cluster), np.ones(solution.laws.size, dtype=np.bool_))
+                found = replace(bent, solution=solution, left_out=held)
+    own = found.solution.laws
+    unique = {
+        (step.degrees, step.knots): replace(step, chosen=(step.degrees, step.knots) == (own.degrees, len(own.knots)))
+        for step in steps
+    }
+    return replace(found, steps=list(unique.values()), left_out=_at(found.left_out, problem, cluster))
+
+
+def _bounded(problem: Problem, solution: Solution, tau: float | None) -> Solution:
+    """Return a spline's solution with the scatter between power cycles that polynomials leave, if it cannot tell it.
+
+    A spline takes the offset of the only recording at a knot for the law. What polynomials leave is that scatter and
+    the bends that they do not follow: a bound.
+    """
+    if not solution.laws.knots or solution.scatter.rank or tau is not None:
+        return solution
+    scatter = solve(problem, replace(solution.laws, knots=())).scatter
+    again = solve(problem, solution.laws, tau=float(scatter.tau[0]))
+    return replace(again, scatter=replace(scatter, bound=True)) if scatter.rank and again.converged else solution
+
+
+def _knots(temperature: Array, cluster: NDArray[np.int64], laws: Laws) -> tuple[float, ...]:
+    """Return the temperatures that were calibrated, degC, the outer ones at the ends of the range."""
+    inner = [float(temperature[cluster == number].mean()) for number in range(1, int(cluster.max(initial=0)))]
+    return (laws.low, *inner, laws.high)
+
+
+def _descended(problem: Problem, highest: Laws, cluster: NDArray[np.int64], tau: float | None, name: str) -> Found:
+    """Return the fit with the degrees to which steps down lead; a spline stays."""
+    solution, view = _highest(problem, highest, tau, name)
     given = splits(solution, cluster)
-    held = left_out(given, _all(laws, degrees))
-    steps = [Step(degrees, _rms(held), None, True)]
+    held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
+    steps = [Step(solution.laws.degrees, _rms(held), None, knots=len(highest.knots))]
     while True:
-        down = [_step(solution, group, given) for group in range(3) if solution.laws.degrees[group]]
+        free = [group for group in range(3) if solution.laws.degrees[group] and not (group == 0 and highest.knots)]
+        down = [_step(solution, group, given) for group in free]
         steps += down
         before = _rms(held)
         fine = [step for step in down if (step.probability or 0) > _INSIGNIFICANT and _no_worse(step.left_out, before)]
         if not fine:
-            break
+            return Found(solution, steps, held, view)
         best = max(fine, key=lambda step: step.probability or 0.0)
-        solution, view = _observable(problem, replace(laws, degrees=best.degrees), tau, name)
+        solution, view = _observable(problem, replace(solution.laws, degrees=best.degrees), tau, name)
         given = splits(solution, cluster)
-        held = left_out(given, _all(laws, best.degrees))
-    chosen = solution.laws.degrees
-    unique = {step.degrees: replace(step, chosen=step.degrees == chosen) for step in steps}
-    return solution, list(unique.values()), _at(held, problem, cluster), view
+        held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
 
 
-def _start(problem: Problem, laws: Laws, limit: int, tau: float | None, name: str) -> Degrees:
-    """Return the highest degrees, of those from which auto starts, that the holds determine."""
-    tried = [min(degree, limit) for degree in DEGREES]
-    while any(tried):
-        degrees = (tried[0], tried[1], tried[2])
+def _highest(problem: Problem, laws: Laws, tau: float | None, name: str) -> tuple[Solution, Observability]:
+    """Return the fit of the highest degrees, down from those given, that the holds determine."""
+    while True:
+        lowered = list(laws.degrees)
+        free = [group for group in range(3) if lowered[group] and not (group == 0 and laws.knots)]
         try:
-            _observable(problem, replace(laws, degrees=degrees), tau, name)
+            return _observable(problem, laws, tau, name)
         except ObservabilityError:
-            group = max((k for k in range(3) if tried[k]), key=lambda k: (k, tried[k]))
-            tried[group] -= 1
-            continue
-        return degrees
-    return (0, 0, 0)
+            if not free:
+                raise
+        lowered[max(free, key=lambda group: (group, lowered[group]))] -= 1
+        laws = replace(laws, degrees=(lowered[0], lowered[1], lowered[2]))
+
+
+def _predicts(bent: Sequence[LeftOut], straight: Sequence[LeftOut]) -> bool:
+    """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
+    both = {each.temperature for each in bent} & {each.temperature for each in straight}
+    errors = [_rms([each for each in given if each.temperature in both]) for given in (bent, straight)]
+    return errors[0] is not None and errors[1] is not None and errors[0] <= _HANDICAP * errors[1]
 
 
 def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> tuple[Solution, Observability]:
@@ -191,7 +281,7 @@ def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> t
         confused = ", ".join(view.confused(names)[:6])
         raise ObservabilityError(
             f"{name}: {len(problem.reading)} holds determine {view.rank} of the {size} unknowns of degrees "
-            f"{','.join(map(str, laws.degrees))}; they cannot separate {confused}; more attitudes at each temperature, "
+            f"{laws.spelled}; they cannot separate {confused}; more attitudes at each temperature, "
             "or lower --degrees, would help"
         )
     return solution, view
@@ -199,20 +289,17 @@ def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> t
 
 def _step(solution: Solution, group: int, given: Sequence[Split]) -> Step:
     """Return what is lost where the highest power of one kind is left out: Wald's test, and the prediction."""
-    degrees = list(solution.laws.degrees)
-    kept = np.ones(solution.laws.size, dtype=np.bool_)
-    at = 0
-    for kind, degree in enumerate(solution.laws.degrees):
-        for _ in range(3):
-            at += degree + 1
-            kept[at - 1] = kept[at - 1] and kind != group
-    gone = np.flatnonzero(~kept)
+    laws, degrees = solution.laws, list(solution.laws.degrees)
+    gone = np.array([part.stop - 1 for part in laws.parts[3 * group : 3 * group + 3]])
+    kept = np.ones(laws.size, dtype=np.bool_)
+    kept[gone] = False
     value = solution.coefficients[gone]
     square = float(value @ np.linalg.solve(solution.covariance[np.ix_(gone, gone)], value)) / len(value)
     freedom = min(solution.degrees_of_freedom(row) for row in np.eye(len(kept))[gone])
     degrees[group] -= 1
     probability = tail(square, len(value), freedom)
-    return Step((degrees[0], degrees[1], degrees[2]), _rms(left_out(given, kept)), probability)
+    lower = (degrees[0], degrees[1], degrees[2])
+    return Step(lower, _rms(left_out(given, kept)), probability, knots=len(laws.knots))
 
 
 def tail(square: float, count: int, freedom: float) -> float:
@@ -220,10 +307,6 @@ def tail(square: float, count: int, freedom: float) -> float:
     from imulab.estimation.special import chdtrc, fdtrc
 
     return float(fdtrc(count, freedom, square) if np.isfinite(freedom) else chdtrc(count, count * square))
-
-
-def _all(laws: Laws, degrees: Degrees) -> NDArray[np.bool_]:
-    return np.ones(replace(laws, degrees=degrees).size, dtype=np.bool_)
 
 
 def _rms(found: Sequence[LeftOut]) -> float | None:
@@ -240,6 +323,7 @@ def _at(found: Sequence[LeftOut], problem: Problem, cluster: NDArray[np.int64]) 
     return [replace(each, temperature=float(problem.temperature[cluster == each.temperature].mean())) for each in found]
 
 
-def spoken_degrees(degrees: Degrees) -> str:
-    """Return degrees as messages say them: ``bias 3, scale factor 2, misalignment 1``."""
-    return ", ".join(f"{kind.replace('_', ' ')} {degree}" for (kind, _), degree in zip(GROUPS, degrees, strict=True))
+def spoken_degrees(degrees: Degrees, knots: int = 0) -> str:
+    """Return degrees as messages say them: ``bias 3, scale factor 2, misalignment 1``, or a spline of the bias."""
+    said = [f"{kind.replace('_', ' ')} {degree}" for (kind, _), degree in zip(GROUPS, degrees, strict=True)]
+    return ", ".join([f"bias by a spline with {knots} knots", *said[1:]] if knots else said)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,8 @@ from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
 from imulab.procedures.thermal.gyrodevice import gyro_table_of
-from imulab.procedures.thermal.model import GROUPS, Laws
-from imulab.procedures.thermal.sections import thermal_of
+from imulab.procedures.thermal.model import cardinal_spline
+from imulab.procedures.thermal.sections import Model, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.triads import AccelerometerLaws
@@ -23,7 +24,9 @@ _NODES = np.linspace(-1.0, 1.0, 65)
 
 
 def laws_of(record: Calibration) -> Array:
-    """Return the coefficients of the nine laws in powers of theta, -1 to 1 over the range, SI, shape (9, terms).
+    """Return the coefficients of the nine laws in powers of theta, SI, shape (pieces, 9, terms).
+
+    Theta goes from -1 to 1 over the range, or from each knot of the bias to the next.
 
     Raises
     ------
@@ -31,17 +34,21 @@ def laws_of(record: Calibration) -> Array:
         The record lacks a coefficient, or has one in another unit, or a scale factor is 0 within the range.
     """
     model = thermal_of(record).model
-    low, high = model.range
-    laws = Laws(low, high, model.degrees.each)
-    terms = max(laws.degrees) + 1
-    found, units = np.zeros((9, terms)), laws.units(model.output_unit)
-    values = iter([values_of(record, [name], unit)[0] for name, unit in zip(laws.names(), units, strict=True)])
-    place = Polynomial([laws.middle - model.reference_temperature.value, laws.half])
-    for row, degree in enumerate(np.repeat(laws.degrees, len(GROUPS)).tolist()):
-        law = Polynomial([next(values) for _ in range(degree + 1)])(place)
-        found[row, : len(law.coef)] = law.coef
-    scale = np.polynomial.polynomial.polyval(_NODES, found[3:6].T)
-    if not (np.sign(scale) == np.sign(scale[:, :1])).all() or not scale.all():
+    laws, units = model.laws, model.laws.units(model.output_unit)
+    values = np.array([values_of(record, [name], unit)[0] for name, unit in zip(laws.names(), units, strict=True)])
+    edges = knots_of(model)
+    found = np.zeros((len(edges) - 1, 9, max(laws.degrees) + 1))
+    for piece, (start, stop) in enumerate(pairwise(edges.tolist())):
+        middle, half = 0.5 * (start + stop), 0.5 * (stop - start)
+        for row, part in enumerate(laws.parts):
+            if row < 3 and laws.knots:
+                cubic, about = cardinal_spline(laws.knots).c[::-1, piece] @ values[part], start
+            else:
+                cubic, about = values[part], model.reference_temperature.value
+            law = Polynomial(cubic)(Polynomial([middle - about, half])).coef
+            found[piece, row, : len(law)] = law
+    scale = np.polynomial.polynomial.polyval(_NODES, found[:, 3:6].reshape(-1, found.shape[2]).T).reshape(-1, 3, 65)
+    if not (np.sign(scale) == np.sign(scale[:1, :, :1])).all() or not scale.all():
         raise RecordError("the record has a scale factor of 0 within its range of temperature")
     return found
 
@@ -49,18 +56,22 @@ def laws_of(record: Calibration) -> Array:
 def accelerometers(record: Calibration) -> AccelerometerLaws:
     """Return the laws as exporters take them; errors as for `laws_of`."""
     model = thermal_of(record).model
-    low, high = model.range
-    return AccelerometerLaws(low, high, laws_of(record), model.output_unit)
+    return AccelerometerLaws(knots_of(model), laws_of(record), model.output_unit)
+
+
+def knots_of(model: Model) -> Array:
+    """Return the temperatures between which each piece of the laws holds, degC: the range, or the bias's knots."""
+    return np.array(model.knots or model.range)
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """Return the tables of a thermal record; errors as for `laws_of`."""
     model, laws = thermal_of(record).model, laws_of(record)
     fields = (
-        Field("pieces", whole(1)),
-        Field("terms", whole(laws.shape[1])),
-        Field("knot", np.array(model.range), pointed=True),
-        Field("coefficient", laws[None], pointed=True),
+        Field("pieces", whole(len(laws))),
+        Field("terms", whole(laws.shape[2])),
+        Field("knot", knots_of(model), pointed=True),
+        Field("coefficient", laws, pointed=True),
     )
     column = str(record.options.get("temperature_column") or "temperature")
     known = {"temperature": column, "range": list(model.range)}

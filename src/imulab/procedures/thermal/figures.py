@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.engineering import rows as engineering_rows
 from imulab.procedures.thermal.gyrofigures import COLOURS, gyro_exhibits
 from imulab.procedures.thermal.model import AXES, GROUPS
@@ -33,13 +34,17 @@ def exhibits(record: Calibration) -> Exhibits:
     values, spread = predicted(record, temperature)
     fit = found.fit
     worst = float(spread[:3].max()) * _MICRO_G
-    degrees = ", ".join(map(str, found.model.degrees.each))
+    laws, rms = found.model.laws, plain_number(fit.rms.value * _MICRO_G, 3)
+    kind = (
+        spoken_degrees(laws.degrees, len(laws.knots)) if laws.knots else "degrees " + ", ".join(map(str, laws.degrees))
+    )
     headline = (
-        f"{low:.0f} to {high:.0f} degC, degrees {degrees}: |f| - g is {plain_number(fit.rms.value * _MICRO_G, 3)} µg "
-        f"rms over {fit.holds} holds; biases are known to {plain_number(worst, 2)} µg or better."
+        f"{low:.0f} to {high:.0f} degC, {kind}: |f| - g is {rms} µg rms over {fit.holds} holds; "
+        f"biases are known to {plain_number(worst, 2)} µg or better."
     )
     tau = fit.between_recordings
     told = "not known" if tau.from_ == "unknown" else f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg ({tau.from_})"
+    told = told.replace("(polynomials)", "or less (what polynomials leave)")
     facts = [
         ("recordings", str(fit.recordings)),
         ("temperatures", str(fit.temperatures)),
@@ -92,10 +97,13 @@ def _coefficients(record: Calibration) -> ReportTable:
         value, u = format_uncertain(row.value, row.standard_uncertainty)
         rows.append([row.name, value, u, row.unit])
     reference = record.model["reference_temperature"]["value"]
+    knots = ", ".join(f"{knot:.4g}" for knot in record.model.get("knots", ())) + " degC"
+    knots = knots if record.model.get("knots") else ""
     return ReportTable(
         f"Coefficients of powers of T - {reference:g} degC",
         "bias_x is the value at that temperature, bias_x_t1 its change per kelvin, bias_x_t2 the coefficient of the "
-        "square ... Outside the range each law is held at its end.",
+        "square ... Outside the range each law is held at its end."
+        + (f" Of a spline, bias_x_at_1 ... are the values at {knots}." if knots else ""),
         ["parameter", "value", "u", "unit"],
         rows,
     )
@@ -176,7 +184,9 @@ def _compared(found: Thermal) -> ReportTable:
         chosen = number if row.chosen else chosen
         rows.append(
             [
-                ", ".join(map(str, row.degrees)),
+                ", ".join(
+                    [f"spline with {row.knots} knots" if row.knots else str(row.degrees[0]), *map(str, row.degrees[1:])]
+                ),
                 "–" if row.left_out is None else plain_number(row.left_out * _MICRO_G, 3),
                 "–" if row.probability is None else f"{row.probability:.3f}",
             ]
@@ -185,7 +195,7 @@ def _compared(found: Thermal) -> ReportTable:
         "Degrees compared",
         f"Of {', '.join(kind.replace('_', ' ') for kind, _ in GROUPS)} on axes {' '.join(AXES)}. A lower degree is "
         "taken where its step is insignificant (probability above 0.01) and left-out temperatures are predicted "
-        "no worse.",
+        "no worse; a spline of the bias where it predicts them at most a tenth worse, since it then lacks a knot.",
         ["degrees", "left out, µg", "probability"],
         rows,
         highlight=chosen,

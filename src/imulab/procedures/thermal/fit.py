@@ -15,7 +15,7 @@ from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.thermal.checks import check_holds, prepared
-from imulab.procedures.thermal.choices import degrees_of, further_of
+from imulab.procedures.thermal.choices import further_of, laws_of
 from imulab.procedures.thermal.degrees import Degrees, LeftOut, Step, choose
 from imulab.procedures.thermal.gyro import fit_gyroscopes
 from imulab.procedures.thermal.gyroholds import check_gyroscopes, rates_at_rest
@@ -90,7 +90,8 @@ def fit_thermal(
     data
         One recording or several: files, recordings or data frames with columns ``accel_*`` and ``temperature``.
     degrees
-        Of bias, scale factor and misalignment, as ``"3,2,1"``; ``"auto"``: from there down, as data allow.
+        Of bias, scale factor and misalignment, as ``"3,2,1"``; ``"spline,2,1"``: the bias a natural cubic spline with
+        a knot at each temperature; ``"auto"``: from 3,2,1 down, as data allow, or the spline where it predicts as well.
     gravity, latitude, height
         As for `fit_tumble`.
     prior
@@ -128,7 +129,7 @@ def fit_thermal(
     """
     given = _several(data)
     further = further_of(with_, "with_")
-    wanted = degrees_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
+    wanted, spline = laws_of(",".join(map(str, degrees)) if isinstance(degrees, tuple) else degrees, "degrees")
     settling = None if settle is None else in_si(settle, "settle", "time", "s")
     recordings = prepared([as_recording(one, reading, fit_thermal) for one in given], temperature_column, settling)
     if further:
@@ -147,13 +148,13 @@ def fit_thermal(
     problem = _problem(holds, scale, zero, leaning, known)
     laws = Laws(float(holds.temperature.min()), float(holds.temperature.max()), (0, 0, 0))
     name = recordings[0].name + (f" and {len(recordings) - 1} more" if len(recordings) > 1 else "")
-    solution, steps, held, view = choose(problem, laws, wanted, scatter, name)
-    drift = drift_of(problem, solution, scatter)
+    found = choose(problem, laws, wanted, scatter, name, spline=spline)
+    drift = drift_of(problem, found.solution, scatter)
     if drift.free:
         problem = replace(problem, free=drift.free)
-        solution, steps, held, view = choose(problem, laws, wanted, scatter, name)
+        found = choose(problem, laws, wanted, scatter, name, spline=spline)
     options = {
-        "degrees": wanted if isinstance(wanted, str) else list(wanted),
+        "degrees": wanted if isinstance(wanted, str) else ["spline", *wanted[1:]] if spline else list(wanted),
         "gravity": local.value,
         "tilt": leaning,
         "with": list(further) or None,
@@ -163,10 +164,10 @@ def fit_thermal(
         "settle": settling,
     }
     options = {key: value for key, value in options.items() if value is not None}
-    record = make_record(holds, problem, solution, drift, steps, held, view, local, scale, options, name)
+    record = make_record(holds, problem, found, drift, local, scale, options, name)
     if further:
-        record = _with_gyroscopes(record, holds, problem, solution, scale, wanted, rates, name)
-    return ThermalFit(record, view, tuple(steps), tuple(held))
+        record = _with_gyroscopes(record, holds, problem, found.solution, scale, wanted, rates, name)
+    return ThermalFit(record, found.view, tuple(found.steps), tuple(found.left_out))
 
 
 def _several(data: Data | Sequence[Data]) -> list[Any]:

@@ -193,6 +193,8 @@ def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Arra
     model = thermal_of(record).model
     assert model.gyro is not None
     low, high = model.range
+    degree = model.gyro.degrees.bias
     offset = np.clip(temperature, low, high) - model.reference_temperature.value
-    found = [law_at(record, f"gyro_bias_{axis}", model.gyro.degrees.bias, offset) for axis in AXES]
+    powers = offset[:, None] ** np.arange(degree + 1)
+    found = [law_at(record, law_names(f"gyro_bias_{axis}", "", degree)[0], powers) for axis in AXES]
     return np.array([values for values, _ in found]), np.array([spread for _, spread in found])

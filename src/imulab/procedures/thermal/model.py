@@ -3,18 +3,24 @@
     M = S(T) (A + b(T)),  A = s,  s = [[1, 0, 0], [m_yx(T), 1, 0], [m_zx(T), m_zy(T), 1]] f
 
 Each parameter is a polynomial of ``theta = (T - T0) / H`` from -1 to 1, T0 the middle of the measured range and H half
-of it; the fit works in Chebyshev polynomials, records hold powers of T - T0. Outside the range the law's value at its
-end is held. A turn of the whole triad by heat is not seen (gauge).
+of it; the fit works in Chebyshev polynomials, records hold powers of T - T0. The bias may be a natural cubic spline
+instead, whose coefficients are its values at the knots. Outside the range the law's value at its end is held. A turn of
+the whole triad by heat is not seen (gauge).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from imulab.recording import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 AXES = ("x", "y", "z")
 MISALIGNMENTS = tuple(f"gyro_misalignment_{a}{b}" for a in AXES for b in AXES if a != b)
@@ -26,11 +32,15 @@ GROUPS = (("bias", AXES), ("scale_factor", AXES), ("misalignment", ("yx", "zx", 
 
 @dataclass(frozen=True)
 class Laws:
-    """The range of temperature, degC, and the degrees of the polynomials of bias, scale factor and misalignment."""
+    """The range of temperature, degC, and the degrees of the polynomials of bias, scale factor and misalignment.
+
+    With `knots`, degC, from one end of the range to the other, the bias is a natural cubic spline, of degree 3.
+    """
 
     low: float
     high: float
     degrees: tuple[int, int, int]
+    knots: tuple[float, ...] = ()
 
     @property
     def middle(self) -> float:
@@ -43,9 +53,27 @@ class Laws:
         return 0.5 * (self.high - self.low)
 
     @property
+    def terms(self) -> tuple[int, int, int]:
+        """Number of coefficients of one law of each kind."""
+        bias, scale_factor, misalignment = (degree + 1 for degree in self.degrees)
+        return len(self.knots) or bias, scale_factor, misalignment
+
+    @property
     def size(self) -> int:
         """Number of coefficients."""
-        return 3 * sum(degree + 1 for degree in self.degrees)
+        return 3 * sum(self.terms)
+
+    @property
+    def parts(self) -> list[slice]:
+        """Where the coefficients of each of the nine laws stand."""
+        ends = np.cumsum(np.repeat(self.terms, 3)).tolist()
+        return [slice(start, stop) for start, stop in zip([0, *ends], ends, strict=False)]
+
+    @property
+    def spelled(self) -> str:
+        """The laws as the option ``--degrees`` states them: ``3,2,1`` or ``spline,2,1``."""
+        bias, *others = map(str, self.degrees)
+        return ",".join(["spline" if self.knots else bias, *others])
 
     def place(self, temperature: Array) -> Array:
         """Return theta, clipped to the range."""
@@ -54,66 +82,106 @@ class Laws:
 
     def design(self, temperature: Array) -> Array:
         """Return the derivatives of the nine parameters by the coefficients, shape (n, 9, size)."""
-        return self._spread(np.asarray(chebyshev.chebvander(self.place(temperature), max(self.degrees)), np.float64))
+        functions = np.asarray(chebyshev.chebvander(self.place(temperature), max(self.degrees)), np.float64)
+        return self._spread(functions, self.cardinal(temperature) if self.knots else functions)
 
     def slope(self, temperature: Array) -> Array:
         """Return the derivatives of `design` by the temperature, 1/K."""
         highest = max(self.degrees)
         change = chebyshev.chebder(np.eye(highest + 1)) if highest else np.zeros((1, 1))
-        values = chebyshev.chebvander(self.place(temperature), max(highest - 1, 0)) @ change
-        return self._spread(values / self.half)
+        values = chebyshev.chebvander(self.place(temperature), max(highest - 1, 0)) @ change / self.half
+        return self._spread(values, self.cardinal(temperature, derivative=1) if self.knots else values)
 
-    def _spread(self, functions: Array) -> Array:
-        design, at = np.zeros((len(functions), 9, self.size)), 0
-        for group, degree in enumerate(self.degrees):
-            for axis in range(3):
-                design[:, 3 * group + axis, at : at + degree + 1] = functions[:, : degree + 1]
-                at += degree + 1
+    def cardinal(self, temperature: Array, derivative: int = 0) -> Array:
+        """Return the splines that are 1 at one knot and 0 at all others, or a derivative of them, shape (n, knots)."""
+        found: Array = cardinal_spline(self.knots)(np.clip(temperature, self.low, self.high), derivative)
+        return found
+
+    def _spread(self, functions: Array, of_bias: Array) -> Array:
+        design = np.zeros((len(functions), 9, self.size))
+        for law, part in enumerate(self.parts):
+            design[:, law, part] = (of_bias if law < 3 else functions)[:, : part.stop - part.start]
         return design
 
+    def constant(self, parameters: Array) -> Array:
+        """Return the coefficients of laws that keep these nine parameters at every temperature."""
+        found = np.zeros(self.size)
+        for law, part in enumerate(self.parts):
+            of_spline = law < 3 and self.knots
+            found[part if of_spline else part.start] = parameters[law]
+        return found
+
     def to_powers(self) -> Array:
-        """Return the matrix from the fit's coefficients to those of powers of T - T0 in K, shape (size, size)."""
-        matrix, at = np.zeros((self.size, self.size)), 0
-        for degree in self.degrees:
-            block = np.zeros((degree + 1, degree + 1))
-            for k in range(degree + 1):
-                powers = chebyshev.cheb2poly([0.0] * k + [1.0])
-                block[: len(powers), k] = powers
-            block /= self.half ** np.arange(degree + 1.0)[:, None]
-            for _ in AXES:
-                matrix[at : at + degree + 1, at : at + degree + 1] = block
-                at += degree + 1
+        """Return the matrix from the fit's coefficients to a record's, shape (size, size).
+
+        Those are of powers of T - T0 in K, or the values at knots.
+        """
+        matrix = np.zeros((self.size, self.size))
+        for law, part in enumerate(self.parts):
+            count = part.stop - part.start
+            matrix[part, part] = np.eye(count) if law < 3 and self.knots else self._powers(count)
         return matrix
 
+    def _powers(self, count: int) -> Array:
+        block = np.zeros((count, count))
+        for k in range(count):
+            block[: k + 1, k] = chebyshev.cheb2poly([0.0] * k + [1.0])
+        block /= self.half ** np.arange(float(count))[:, None]
+        return block
+
+    def recorded(self, group: int, temperature: Array, about: float) -> Array:
+        """Return what a record's coefficients of one law are multiplied by at temperatures, shape (n, terms).
+
+        `about` is the record's reference temperature, degC.
+        """
+        if group == 0 and self.knots:
+            return self.cardinal(temperature)
+        offset = np.clip(temperature, self.low, self.high) - about
+        found: Array = offset[:, None] ** np.arange(self.degrees[group] + 1)
+        return found
+
     def names(self) -> list[str]:
-        """Return the names of the coefficients in a record: ``bias_x``, ``bias_x_t1`` (per K), ``bias_x_t2`` ..."""
+        """Return the names of the coefficients in a record: ``bias_x``, ``bias_x_t1`` (per K), ``bias_x_t2`` ...
+
+        Values at knots are ``bias_x_at_1``, ``bias_x_at_2`` ...
+        """
         return [
-            f"{kind}_{axis}" + (f"_t{power}" if power else "")
-            for (kind, axes), degree in zip(GROUPS, self.degrees, strict=True)
-            for axis in axes
-            for power in range(degree + 1)
+            name for group, (kind, axes) in enumerate(GROUPS) for a in axes for name in self.named(group, f"{kind}_{a}")
         ]
+
+    def named(self, group: int, law: str) -> list[str]:
+        """Return the names of the coefficients of one law in a record."""
+        if group == 0 and self.knots:
+            return [f"{law}_at_{number}" for number in range(1, len(self.knots) + 1)]
+        return law_names(law, "", self.degrees[group])[0]
 
     def spoken(self) -> list[str]:
         """Return what messages call the coefficients."""
         changes = ("", "change of {} with temperature", "curvature of {} with temperature")
-        return [
-            changes[min(power, 2)].format(name) if power else name
-            for (kind, axes), degree in zip(GROUPS, self.degrees, strict=True)
-            for name in (f"{kind}_{axis}" for axis in axes)
-            for power in range(degree + 1)
-        ]
+        found = []
+        for group, (kind, axes) in enumerate(GROUPS):
+            for name in (f"{kind}_{axis}" for axis in axes):
+                if group == 0 and self.knots:
+                    found += [f"{name} at {knot:.0f} degC" for knot in self.knots]
+                else:
+                    found += [name, *(changes[min(k, 2)].format(name) for k in range(1, self.degrees[group] + 1))]
+        return found
 
     def units(self, output: str) -> list[str]:
         """Return the units of the coefficients in a record."""
-        own = ("m/s^2", f"{output}/(m/s^2)", "rad")
-        per = ("", "/K", "/K^2", "/K^3", "/K^4", "/K^5")
-        return [
-            unit + per[power]
-            for unit, degree in zip(own, self.degrees, strict=True)
-            for _ in AXES
-            for power in range(degree + 1)
-        ]
+        found = []
+        for group, unit in enumerate(("m/s^2", f"{output}/(m/s^2)", "rad")):
+            of_spline = group == 0 and self.knots
+            found += 3 * ([unit] * len(self.knots) if of_spline else law_names("", unit, self.degrees[group])[1])
+        return found
+
+
+@lru_cache(maxsize=256)
+def cardinal_spline(knots: tuple[float, ...]) -> CubicSpline:
+    """Return the natural cubic splines that are 1 at one knot and 0 at all others."""
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(knots, np.eye(len(knots)), bc_type="natural")
 
 
 def law_names(name: str, unit: str, degree: int) -> tuple[list[str], list[str]]:

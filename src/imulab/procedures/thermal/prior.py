@@ -42,13 +42,13 @@ def at_temperature(record: Calibration, temperature: float | None, name: str) ->
             "the thermal record does not know how far biases move from one power cycle to the next, and cannot be a "
             "prior: fit it with more recordings, or with --turn-on-scatter"
         )
-    offset = float(np.clip(temperature, low, high)) - found.model.reference_temperature.value
+    laws, about = found.model.laws, found.model.reference_temperature.value
     names, rows = list(record.covariance.names), []
     labels = [f"{kind}_{axis}" for kind, axes in GROUPS for axis in axes]
-    for label, degree in zip(labels, np.repeat(found.model.degrees.each, len(GROUPS)).tolist(), strict=True):
-        row = np.zeros(len(names))
-        for power in range(degree + 1):
-            row[names.index(label + (f"_t{power}" if power else ""))] = offset**power
+    for number, label in enumerate(labels):
+        group, row = number // 3, np.zeros(len(names))
+        functions = laws.recorded(group, np.array([temperature]), about)[0]
+        row[[names.index(name) for name in laws.named(group, label)]] = functions
         rows.append(row)
     design = np.array(rows)
     values = design @ np.array([record.value(each) for each in names])

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from imulab.estimation.least_squares import Observability, coverage_factor
+from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
-from imulab.procedures.thermal.degrees import LeftOut, Step, clusters_of, spoken_degrees
+from imulab.procedures.thermal.degrees import Found, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
-from imulab.procedures.thermal.model import AXES, GROUPS, Laws, law_names
+from imulab.procedures.thermal.model import AXES, GROUPS, Laws
 from imulab.procedures.thermal.rows import Problem, together
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Solution
@@ -25,6 +25,8 @@ _MOST_NAMED = 6
 _WORSE = 3.0
 _MOVES = (0.01, 0.005)
 """What biases (g) and scale factors hardly move by from one power cycle to the next."""
+_TOLD = ("unknown", "recordings", "polynomials")
+"""How the scatter between power cycles is known, if it was not stated."""
 _SAME = 1e-9
 """Of two values of gravity that are one."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
@@ -33,18 +35,16 @@ _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every
 def make_record(
     holds: Holds,
     problem: Problem,
-    solution: Solution,
+    found: Found,
     drift: Drift,
-    steps: Sequence[Step],
-    left_out: Sequence[LeftOut],
-    view: Observability,
     gravity: Gravity,
     scale: Array,
     options: Mapping[str, Any],
     name: str,
 ) -> Calibration:
     """Turn a solution in units of g into the record."""
-    laws, g = solution.laws, gravity.value
+    solution, g = found.solution, gravity.value
+    laws = solution.laws
     values, matrix = in_si_powers(solution, gravity, scale)
     names, units = laws.names(), laws.units(holds.unit)
     freedom = [solution.degrees_of_freedom(row) for row in laws.to_powers()]
@@ -52,6 +52,8 @@ def make_record(
         key: Parameter(float(value), float(u), unit, interval_95=interval_of(float(value), float(u), nu))
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(matrix)), units, freedom, strict=True)
     }
+    if laws.knots:
+        parameters = _at_reference(laws, values, matrix) | parameters
     residual, uncertainty = _residuals(problem, solution)
     sensor = {
         key: text for key in ("serial", "model", "element") for r in holds.recordings if (text := r.metadata.get(key))
@@ -64,31 +66,33 @@ def make_record(
         model={
             "order": 1,
             "degrees": {kind: degree for (kind, _), degree in zip(GROUPS, laws.degrees, strict=True)},
+            **({"knots": list(laws.knots)} if laws.knots else {}),
             "range": [laws.low, laws.high],
             "reference_temperature": {"value": laws.middle, "unit": "degC"},
             "gravity": gravity.entry(),
             "output_unit": holds.unit,
             "gauge": _GAUGE,
         },
-        fit=_fit(holds, residual, solution, steps, left_out, view, options, g) | entries(drift, g),
+        fit=_fit(holds, residual, found, options, g) | entries(drift, g),
         options=dict(options),
         data=_data(holds, g * residual, g * uncertainty),
         sensor=sensor,
         sources=sources,
-        warnings=tuple(_findings(holds, solution, drift, left_out, gravity, options, name)),
+        warnings=tuple(_findings(holds, found, drift, gravity, options, name)),
     )
 
 
-def _fit(
-    holds: Holds,
-    residual: Array,
-    solution: Solution,
-    steps: Sequence[Step],
-    left_out: Sequence[LeftOut],
-    view: Observability,
-    options: Mapping[str, Any],
-    g: float,
-) -> dict[str, Any]:
+def _at_reference(laws: Laws, values: Array, covariance: Array) -> dict[str, Parameter]:
+    """Return the biases at T0 that a spline has there, by the name that those of polynomials have."""
+    weights, found = laws.cardinal(np.array([laws.middle]))[0], {}
+    for axis, part in zip(AXES, laws.parts[:3], strict=True):
+        u = float(np.sqrt(weights @ covariance[part, part] @ weights))
+        found[f"bias_{axis}"] = Parameter(float(weights @ values[part]), u, "m/s^2")
+    return found
+
+
+def _fit(holds: Holds, residual: Array, found: Found, options: Mapping[str, Any], g: float) -> dict[str, Any]:
+    solution = found.solution
     return {
         "recordings": len(holds.recordings),
         "holds": len(holds),
@@ -97,11 +101,11 @@ def _fit(
         "excess": {"value": g * solution.excess, "unit": "m/s^2"},
         "chi_square": solution.chi_square,
         "degrees_of_freedom": solution.freedom,
-        "condition_number": view.condition,
+        "condition_number": found.view.condition,
         "between_recordings": _turn_on(solution, options, g),
         "left_out_temperature": [
             {"temperature": e.temperature, "holds": e.holds, "rms": g * e.rms, "chi_square": e.chi_square}
-            for e in left_out
+            for e in found.left_out
         ],
         "degrees": [
             {
@@ -109,8 +113,9 @@ def _fit(
                 "left_out": None if step.left_out is None else g * step.left_out,
                 "probability": step.probability,
                 "chosen": step.chosen,
+                "knots": step.knots,
             }
-            for step in steps
+            for step in found.steps
         ],
     }
 
@@ -146,16 +151,19 @@ def in_si_powers(solution: Solution, gravity: Gravity, scale: Array) -> tuple[Ar
     ``b = beta g``, ``S = scale sigma / g``; an error of gravity moves biases by dg/g and scale factors by -dg/g.
     """
     laws, g = solution.laws, gravity.value
-    factor, share = [], []
-    for group, degree in enumerate(laws.degrees):
-        for axis in range(3):
-            factor += [(g, float(scale[axis]) / g, 1.0)[group]] * (degree + 1)
-            share += [(1.0, -1.0, 0.0)[group]] * (degree + 1)
-    matrix = np.array(factor)[:, None] * laws.to_powers()
+    factor, share = _factors(laws, g, scale)
+    matrix = factor[:, None] * laws.to_powers()
     values = matrix @ solution.coefficients[: laws.size]
-    shared = np.array(share) * values * gravity.standard_uncertainty / g
+    shared = share * values * gravity.standard_uncertainty / g
     covariance: Array = matrix @ solution.covariance[: laws.size, : laws.size] @ matrix.T + np.outer(shared, shared)
     return values, covariance
+
+
+def _factors(laws: Laws, gravity: float, scale: Array) -> tuple[Array, Array]:
+    """Return the factor of each coefficient from units of g to SI, and what it changes by relative to gravity's."""
+    each = np.concatenate([np.full(3, gravity), scale / gravity, np.ones(3)])
+    counts = np.repeat(laws.terms, 3)
+    return np.repeat(each, counts), np.repeat(np.repeat([1.0, -1.0, 0.0], 3), counts)
 
 
 def _unlike(solution: Solution, name: str) -> list[str]:
@@ -182,22 +190,19 @@ def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[
     whose part is taken out of the covariance then.
     """
     model = thermal_of(record).model
-    laws = Laws(model.range[0], model.range[1], model.degrees.each)
-    names, factor, share = laws.names(), list[float](), list[float]()
-    scale = [gravity * abs(record.value(f"scale_factor_{axis}")) for axis in AXES]
-    for group, degree in enumerate(laws.degrees):
-        for axis in range(3):
-            factor += [(gravity, scale[axis] / gravity, 1.0)[group]] * (degree + 1)
-            share += [(1.0, -1.0, 0.0)[group]] * (degree + 1)
-    inverse = np.linalg.inv(np.array(factor)[:, None] * laws.to_powers())
+    laws = model.laws
+    names = laws.names()
+    scale = np.array([gravity * abs(record.value(f"scale_factor_{axis}")) for axis in AXES])
+    factor, share = _factors(laws, gravity, scale)
+    inverse = np.linalg.inv(factor[:, None] * laws.to_powers())
     values, covariance = np.array([record.value(name) for name in names]), record.cov(*names)
     stated = float(record.model["gravity"].get("standard_uncertainty") or 0.0) / model.gravity.value
     same = abs(model.gravity.value / gravity - 1) < _SAME
     if same:
-        shared = np.array(share) * values * stated
+        shared = share * values * stated
         covariance = covariance - np.outer(shared, shared)
     common = 0.0 if same else (uncertainty / gravity) ** 2
-    return laws, inverse @ values, inverse @ covariance @ inverse.T, np.array(scale), common
+    return laws, inverse @ values, inverse @ covariance @ inverse.T, scale, common
 
 
 def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
@@ -216,25 +221,28 @@ def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[s
         "scale_factor": {"value": float(scatter.tau[1]), "unit": "1"},
         "rank": scatter.rank,
         "resolution": {"value": g * float(np.sqrt(max(scatter.spread[0] - scatter.tau[0] ** 2, 0.0))), "unit": "m/s^2"},
-        "from": "argument" if known else "recordings" if scatter.rank else "unknown",
+        "from": "argument" if known else _TOLD[bool(scatter.rank) + scatter.bound],
     }
 
 
 def _findings(
-    holds: Holds,
-    solution: Solution,
-    drift: Drift,
-    left_out: Sequence[LeftOut],
-    gravity: Gravity,
-    options: Mapping[str, Any],
-    name: str,
+    holds: Holds, fitted: Found, drift: Drift, gravity: Gravity, options: Mapping[str, Any], name: str
 ) -> list[str]:
+    solution = fitted.solution
     found = [*(note for r in holds.recordings for note in r.notes), *holds.notes]
     found += gravity_findings(gravity, holds.recordings[0])
     if not solution.scatter.rank and "turn_on_scatter" not in options:
         found.append(
             f"{name}: too few recordings to tell how far biases move from one power cycle to the next, so no "
             "uncertainty holds that: record more temperatures or come back to some, or state --turn-on-scatter"
+        )
+    if solution.scatter.bound:
+        found.append(
+            Note(
+                f"{name}: a spline cannot tell the offset of a power cycle from the law where a temperature has one "
+                f"recording; {1e3 * solution.scatter.tau[0]:.2g} mg, what polynomials of degree 3 leave, counts as the "
+                "scatter between power cycles, an upper bound: come back to temperatures to learn more"
+            )
         )
     found += _unlike(solution, name)
     if options["degrees"] == "auto" and not solution.laws.degrees[0] and solution.scatter.tau[0] > 0:
@@ -244,8 +252,8 @@ def _findings(
             "temperatures or more, or state --degrees"
         )
     if options["degrees"] == "auto":
-        found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees)}"))
-    far = [each for each in left_out if each.chi_square > _WORSE**2]
+        found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
+    far = [each for each in fitted.left_out if each.chi_square > _WORSE**2]
     found += [
         f"{each.temperature:.0f} degC, left out, is missed by {1e6 * each.rms:.0f} ug rms, more than its uncertainty "
         "explains: the unit's law has a bend between the temperatures; record one more there"
@@ -264,21 +272,19 @@ def _findings(
     return found
 
 
-def law_at(record: Calibration, name: str, degree: int, offset: Array) -> tuple[Array, Array]:
-    """Return a law and its standard uncertainty, SI, at offsets from T0, K, shapes (n,)."""
-    names, _ = law_names(name, "", degree)
-    powers = offset[:, None] ** np.arange(degree + 1)
-    values: Array = powers @ np.array([record.value(each) for each in names])
-    return values, np.sqrt(np.einsum("ni,ij,nj->n", powers, record.covariance.block(names), powers))
+def law_at(record: Calibration, names: Sequence[str], functions: Array) -> tuple[Array, Array]:
+    """Return a law and its standard uncertainty, SI, shapes (n,), from what its coefficients are multiplied by."""
+    values: Array = functions @ np.array([record.value(each) for each in names])
+    return values, np.sqrt(np.einsum("ni,ij,nj->n", functions, record.covariance.block(names), functions))
 
 
 def predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the nine parameters over temperature and their standard uncertainties, SI, shapes (9, n)."""
-    low, high = record.model["range"]
-    offset = np.clip(temperature, low, high) - float(record.model["reference_temperature"]["value"])
+    model = thermal_of(record).model
+    laws, about = model.laws, model.reference_temperature.value
     found = [
-        law_at(record, f"{kind}_{axis}", degree, offset)
-        for (kind, axes), degree in zip(GROUPS, thermal_of(record).model.degrees.each, strict=True)
+        law_at(record, laws.named(group, f"{kind}_{axis}"), laws.recorded(group, temperature, about))
+        for group, (kind, axes) in enumerate(GROUPS)
         for axis in axes
     ]
     return np.array([values for values, _ in found]), np.array([spread for _, spread in found])

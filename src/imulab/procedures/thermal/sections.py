@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal, TypeVar
 
 from imulab.errors import RecordError
+from imulab.procedures.thermal.model import Laws
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Length, Part, Positive, Quantity, Size, part
 
@@ -51,7 +52,7 @@ class GyroModel(Part):
 
 
 class Model(Part):
-    """``model``; the range of temperature in degC."""
+    """``model``; the range of temperature and the knots of the bias in degC, None where it is a polynomial."""
 
     order: int
     degrees: Kinds
@@ -59,7 +60,13 @@ class Model(Part):
     reference_temperature: Quantity
     gravity: Gravity
     output_unit: str
+    knots: list[float] | None = None
     gyro: GyroModel | None = None
+
+    @property
+    def laws(self) -> Laws:
+        """The laws of the accelerometers."""
+        return Laws(self.range[0], self.range[1], self.degrees.each, tuple(self.knots or ()))
 
 
 class LeftOut(Part):
@@ -78,6 +85,7 @@ class Degrees(Part):
     left_out: Size | None
     probability: float | None
     chosen: bool
+    knots: int = 0
 
 
 class TurnOn(Part):
@@ -192,6 +200,14 @@ def check(record: Calibration) -> None:
     low, high = found.model.range
     if not low < high:
         raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
+    knots = found.model.knots
+    if knots is not None and not (
+        len(knots) > 2 and [low, high] == [knots[0], knots[-1]] and sorted(set(knots)) == knots
+    ):
+        raise RecordError(
+            f"model.knots: expected three temperatures or more in rising order, from {low:g} to {high:g}, the ends of "
+            f"the range; found {' '.join(f'{knot:g}' for knot in knots)}"
+        )
 
 
 def thermal_of(record: Calibration) -> Thermal:

@@ -33,12 +33,16 @@ _TELLS = 0.1
 
 @dataclass(frozen=True)
 class Scatter:
-    """Between recordings: tau of bias and scale factor, rank q that free offsets add, variance of one offset."""
+    """Between recordings: tau of bias and scale factor, rank q that free offsets add, variance of one offset.
+
+    `bound`: tau is what polynomials leave, of a spline that takes the offset of each recording for the law.
+    """
 
     tau: Array = field(default_factory=lambda: np.zeros(2))
     rank: int = 0
     spread: Array = field(default_factory=lambda: np.zeros(2))
     probability: float | None = None
+    bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,25 +122,15 @@ def concluded(
 
 def _start(problem: Problem, laws: Laws) -> Array:
     """Return the coefficients to start from: those of a fit without temperature, its outliers not told yet."""
-    flat = replace(laws, degrees=(0, 0, 0))
+    flat = replace(laws, degrees=(0, 0, 0), knots=())
     start = nominal(flat, problem.zero)
     start, _, _, _ = _iterate(problem, flat, start, _directions(problem, flat, start), _LOOSE**2, np.zeros(2), 1e-3)
-    whole, at = np.zeros(laws.size), 0
-    for group, degree in enumerate(laws.degrees):
-        for axis in range(3):
-            whole[at] = start[3 * group + axis]
-            at += degree + 1
-    return whole
+    return laws.constant(start)
 
 
 def nominal(laws: Laws, zero: Array) -> Array:
     """Return the coefficients of an ideal sensor with these biases, shape (3,)."""
-    start, at = np.zeros(laws.size), 0
-    for group, degree in enumerate(laws.degrees):
-        for axis in range(3):
-            start[at] = (zero[axis], 1.0, 0.0)[group]
-            at += degree + 1
-    return start
+    return laws.constant(np.concatenate([zero, np.ones(3), np.zeros(3)]))
 
 
 def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:

@@ -16,7 +16,7 @@ from imulab.procedures.options import (
     text_option,
 )
 from imulab.procedures.procedure import Files, Task
-from imulab.procedures.thermal.choices import degrees_of, further_of
+from imulab.procedures.thermal.choices import degrees_text, further_of
 
 if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
@@ -40,8 +40,8 @@ GRAVITY = (
 OPTIONS = (
     Option(
         "degrees",
-        "Of the laws of bias, scale factor and misalignment, 3,2,1; auto: from there down, as far as data allow.",
-        degrees_of,
+        "Of the laws of bias, scale factor and misalignment, 3,2,1, or spline,2,1; auto: from there down, or a spline.",
+        degrees_text,
         "auto",
         "auto|B,S,M",
     ),
