@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from imulab.errors import RecordError
-from imulab.procedures.thermal.model import AXES, GROUPS, law_names
+from imulab.procedures.thermal.model import AXES, GROUPS, Laws
 from imulab.procedures.thermal.sections import Model, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -29,21 +29,19 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
         ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
         raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
     both = all(model.gyro is not None for model in models)
-    counts = [max(of) for of in zip(*([law[2] for law in _laws(model, both)] for model in models), strict=True)]
+    terms = [[laws.terms[group] for _, _, laws, group in _laws(model, both)] for model in models]
+    counts = [max(of) for of in zip(*terms, strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
     nodes = [np.linspace(low, high, count) if count > 1 else np.array([0.5 * (low + high)]) for count in counts]
     nodes = [np.round(places, 1) for places in nodes]
     return _at(first, nodes, both), _at(second, nodes, both)
 
 
-def _laws(model: Model, gyroscopes: bool) -> list[tuple[str, tuple[str, ...], int]]:
-    """Return the kinds of parameters that follow the temperature, with their axes and numbers of coefficients."""
-    found: list[tuple[str, tuple[str, ...], int]] = [
-        (kind, axes, count) for (kind, axes), count in zip(GROUPS, model.laws.terms, strict=True)
-    ]
-    if gyroscopes and model.gyro is not None:
-        found.append(("gyro_bias", AXES, model.gyro.degrees.bias + 1))
-    return found
+def _laws(model: Model, gyroscopes: bool) -> list[tuple[str, tuple[str, ...], Laws, int]]:
+    """Return the kinds of parameters that follow the temperature: name, axes, laws, and which of these are its own."""
+    found: list[tuple[str, tuple[str, ...], Laws, int]] = []
+    found += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
+    return [*found, ("gyro_bias", AXES, model.gyro_laws, 0)] if gyroscopes else found
 
 
 def _at(record: Calibration, nodes: list[Array], gyroscopes: bool) -> Calibration:
@@ -55,13 +53,11 @@ def _at(record: Calibration, nodes: list[Array], gyroscopes: bool) -> Calibratio
         scatters["gyro_bias"] = fit.gyro.between_recordings.bias, fit.gyro.between_recordings.rank
     rows, values, labels, units = [], [], [], []
     known: dict[str, float | None] = {}
-    laws, about = sections.model.laws, sections.model.reference_temperature.value
-    for group, ((kind, axes, count), own) in enumerate(zip(_laws(sections.model, gyroscopes), nodes, strict=True)):
-        accelerometers = group < len(GROUPS)
-        functions = laws.recorded(group, own, about) if accelerometers else (own[:, None] - about) ** np.arange(count)
+    about = sections.model.reference_temperature.value
+    for (kind, axes, laws, group), own in zip(_laws(sections.model, gyroscopes), nodes, strict=True):
+        functions = laws.recorded(group, own, about)
         for axis in axes:
-            law = f"{kind}_{axis}"
-            used = laws.named(group, law) if accelerometers else law_names(law, "", count - 1)[0]
+            used = laws.named(group, f"{kind}_{axis}")
             row = np.zeros((len(own), len(names)))
             row[:, [names.index(name) for name in used]] = functions
             rows.append(row)

@@ -2,8 +2,9 @@
 
 From the highest degrees *down*, a step at a time, where a step is insignificant (F at 1 %) and interior temperatures,
 left out whole, are predicted no worse: upward selection stops short where a law has a kink. The same is done with a
-natural cubic spline of the bias. It is taken where it predicts the temperatures left out at most a tenth worse than
-polynomials do: without one of its knots it must bridge twice the distance, which costs polynomials nothing.
+natural cubic spline of the bias. It is taken where its values at the knots differ significantly from a cubic, as far as
+recordings tell that, and it predicts the temperatures left out at most a tenth worse than polynomials do: without one
+of its knots it must bridge twice the distance, which costs polynomials nothing.
 """
 
 from __future__ import annotations
@@ -178,7 +179,7 @@ def choose(
     cluster = clusters_of(problem.temperature)
     knots = _knots(problem.temperature, cluster, laws)
     if wanted != "auto":
-        own = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots * spline)
+        own = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots if spline else ())
         if max(own.degrees) >= len(knots) or (spline and len(knots) < LEAST_KNOTS):
             needed = f"{LEAST_KNOTS} temperatures or more" if spline else "a degree below their number"
             raise ObservabilityError(
@@ -200,7 +201,7 @@ def choose(
             pass  # the holds do not tell so many values of the bias
         else:
             steps = steps + bent.steps
-            if _predicts(bent.left_out, found.left_out):
+            if _bends(bent.solution, tau) and _predicts(bent.left_out, found.left_out):
                 solution = _bounded(problem, bent.solution, tau)
                 held = left_out(splits(solution, cluster), np.ones(solution.laws.size, dtype=np.bool_))
                 found = replace(bent, solution=solution, left_out=held)
@@ -265,6 +266,22 @@ def _highest(problem: Problem, laws: Laws, tau: float | None, name: str) -> tupl
         laws = replace(laws, degrees=(lowered[0], lowered[1], lowered[2]))
 
 
+def _bends(solution: Solution, tau: float | None) -> bool:
+    """Return whether a spline's values at the knots lie on no cubic (F at 1 %), or nobody can tell.
+
+    That is where a spline takes the offset of the only recording at a knot for the law.
+    """
+    if not solution.scatter.rank and tau is None:
+        return True
+    laws, count = solution.laws, len(solution.laws.knots)
+    cubics = np.vander(laws.place(np.array(laws.knots)), 4)
+    beside = np.linalg.qr(cubics, mode="complete").Q[:, 4:].T
+    weights = np.zeros((3 * (count - 4), laws.size))
+    for axis, part in enumerate(laws.parts[:3]):
+        weights[axis * (count - 4) : (axis + 1) * (count - 4), part] = beside
+    return _wald(solution, weights) < _INSIGNIFICANT
+
+
 def _predicts(bent: Sequence[LeftOut], straight: Sequence[LeftOut]) -> bool:
     """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
     both = {each.temperature for each in bent} & {each.temperature for each in straight}
@@ -293,13 +310,18 @@ def _step(solution: Solution, group: int, given: Sequence[Split]) -> Step:
     gone = np.array([part.stop - 1 for part in laws.parts[3 * group : 3 * group + 3]])
     kept = np.ones(laws.size, dtype=np.bool_)
     kept[gone] = False
-    value = solution.coefficients[gone]
-    square = float(value @ np.linalg.solve(solution.covariance[np.ix_(gone, gone)], value)) / len(value)
-    freedom = min(solution.degrees_of_freedom(row) for row in np.eye(len(kept))[gone])
     degrees[group] -= 1
-    probability = tail(square, len(value), freedom)
     lower = (degrees[0], degrees[1], degrees[2])
-    return Step(lower, _rms(left_out(given, kept)), probability, knots=len(laws.knots))
+    return Step(lower, _rms(left_out(given, kept)), _wald(solution, np.eye(laws.size)[gone]), knots=len(laws.knots))
+
+
+def _wald(solution: Solution, weights: Array) -> float:
+    """Return the probability of such ``weights . coefficients``, shape (k, laws.size), if the true ones were 0."""
+    size = solution.laws.size
+    value = weights @ solution.coefficients[:size]
+    covariance = weights @ solution.covariance[:size, :size] @ weights.T
+    square = float(value @ np.linalg.solve(covariance, value)) / len(value)
+    return tail(square, len(value), min(solution.degrees_of_freedom(row) for row in weights))
 
 
 def tail(square: float, count: int, freedom: float) -> float:

@@ -35,16 +35,19 @@ def exhibits(record: Calibration) -> Exhibits:
     fit = found.fit
     worst = float(spread[:3].max()) * _MICRO_G
     laws, rms = found.model.laws, plain_number(fit.rms.value * _MICRO_G, 3)
-    kind = (
-        spoken_degrees(laws.degrees, len(laws.knots)) if laws.knots else "degrees " + ", ".join(map(str, laws.degrees))
-    )
+    kind = "degrees " + ", ".join(map(str, laws.degrees))
+    if laws.knots:
+        kind = spoken_degrees(laws.degrees, len(laws.knots))
     headline = (
         f"{low:.0f} to {high:.0f} degC, {kind}: |f| - g is {rms} µg rms over {fit.holds} holds; "
         f"biases are known to {plain_number(worst, 2)} µg or better."
     )
     tau = fit.between_recordings
-    told = "not known" if tau.from_ == "unknown" else f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg ({tau.from_})"
-    told = told.replace("(polynomials)", "or less (what polynomials leave)")
+    told = f"{plain_number(tau.bias.value * _MICRO_G, 2)} µg"
+    told = {
+        "unknown": "not known",
+        "polynomials": f"at most {told}",
+    }.get(tau.from_, f"{told} ({tau.from_})")
     facts = [
         ("recordings", str(fit.recordings)),
         ("temperatures", str(fit.temperatures)),
@@ -97,13 +100,12 @@ def _coefficients(record: Calibration) -> ReportTable:
         value, u = format_uncertain(row.value, row.standard_uncertainty)
         rows.append([row.name, value, u, row.unit])
     reference = record.model["reference_temperature"]["value"]
-    knots = ", ".join(f"{knot:.4g}" for knot in record.model.get("knots", ())) + " degC"
-    knots = knots if record.model.get("knots") else ""
+    knots = ", ".join(f"{knot:.4g}" for knot in record.model.get("knots", ()))
     return ReportTable(
         f"Coefficients of powers of T - {reference:g} degC",
         "bias_x is the value at that temperature, bias_x_t1 its change per kelvin, bias_x_t2 the coefficient of the "
         "square ... Outside the range each law is held at its end."
-        + (f" Of a spline, bias_x_at_1 ... are the values at {knots}." if knots else ""),
+        + (f" Of a spline, bias_x_at_1 ... are the values at {knots} degC." if knots else ""),
         ["parameter", "value", "u", "unit"],
         rows,
     )
@@ -195,7 +197,8 @@ def _compared(found: Thermal) -> ReportTable:
         "Degrees compared",
         f"Of {', '.join(kind.replace('_', ' ') for kind, _ in GROUPS)} on axes {' '.join(AXES)}. A lower degree is "
         "taken where its step is insignificant (probability above 0.01) and left-out temperatures are predicted "
-        "no worse; a spline of the bias where it predicts them at most a tenth worse, since it then lacks a knot.",
+        "no worse; a spline of the bias where it is no cubic (the same test, as far as recordings tell) and predicts "
+        "them at most a tenth worse, since it then lacks a knot.",
         ["degrees", "left out, µg", "probability"],
         rows,
         highlight=chosen,

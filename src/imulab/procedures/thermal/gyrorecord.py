@@ -191,10 +191,7 @@ def _drifts(gyros: Gyroscopes, name: str) -> list[str]:
 def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the three biases over temperature and their standard uncertainties, rad/s, shapes (3, n)."""
     model = thermal_of(record).model
-    assert model.gyro is not None
-    low, high = model.range
-    degree = model.gyro.degrees.bias
-    offset = np.clip(temperature, low, high) - model.reference_temperature.value
-    powers = offset[:, None] ** np.arange(degree + 1)
-    found = [law_at(record, law_names(f"gyro_bias_{axis}", "", degree)[0], powers) for axis in AXES]
+    laws = model.gyro_laws
+    powers = laws.recorded(0, temperature, model.reference_temperature.value)
+    found = [law_at(record, laws.named(0, f"gyro_bias_{axis}"), powers) for axis in AXES]
     return np.array([values for values, _ in found]), np.array([spread for _, spread in found])

@@ -25,8 +25,6 @@ _MOST_NAMED = 6
 _WORSE = 3.0
 _MOVES = (0.01, 0.005)
 """What biases (g) and scale factors hardly move by from one power cycle to the next."""
-_TOLD = ("unknown", "recordings", "polynomials")
-"""How the scatter between power cycles is known, if it was not stated."""
 _SAME = 1e-9
 """Of two values of gravity that are one."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
@@ -216,12 +214,13 @@ def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
 def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[str, Any]:
     scatter = solution.scatter
     known = "turn_on_scatter" in options
+    told = "polynomials" if scatter.bound else "recordings" if scatter.rank else "unknown"
     return {
         "bias": {"value": g * float(scatter.tau[0]), "unit": "m/s^2"},
         "scale_factor": {"value": float(scatter.tau[1]), "unit": "1"},
         "rank": scatter.rank,
         "resolution": {"value": g * float(np.sqrt(max(scatter.spread[0] - scatter.tau[0] ** 2, 0.0))), "unit": "m/s^2"},
-        "from": "argument" if known else _TOLD[bool(scatter.rank) + scatter.bound],
+        "from": "argument" if known else told,
     }
 
 

@@ -68,6 +68,12 @@ class Model(Part):
         """The laws of the accelerometers."""
         return Laws(self.range[0], self.range[1], self.degrees.each, tuple(self.knots or ()))
 
+    @property
+    def gyro_laws(self) -> Laws:
+        """The laws of the gyroscopes' biases."""
+        assert self.gyro is not None
+        return Laws(self.range[0], self.range[1], (self.gyro.degrees.bias, 0, 0))
+
 
 class LeftOut(Part):
     """One row of ``fit.left_out_temperature``: degC, and rms in m/s^2."""
@@ -90,6 +96,8 @@ class Degrees(Part):
 
 class TurnOn(Part):
     """``fit.between_recordings``: what biases and scale factors move by from one power cycle to the next.
+
+    `from_` says how that is known: ``recordings``, ``argument``, ``unknown``, or ``polynomials``, an upper bound.
 
     `resolution` is the standard uncertainty of one such offset; None in records that do not say it.
     """
@@ -208,6 +216,8 @@ def check(record: Calibration) -> None:
             f"model.knots: expected three temperatures or more in rising order, from {low:g} to {high:g}, the ends of "
             f"the range; found {' '.join(f'{knot:g}' for knot in knots)}"
         )
+    if knots is not None and found.model.degrees.bias != 3:
+        raise RecordError(f"model.degrees.bias: expected 3 of a spline, found {found.model.degrees.bias}")
 
 
 def thermal_of(record: Calibration) -> Thermal:
