@@ -183,11 +183,45 @@ def test_a_file_of_foreign_columns_asks_for_a_layout(workbench, new_page):
     drop(page, "phone2.csv", "t,q\n0,1\n1,2\n2,3\n")
     page.locator("[data-name='imulab-files/phone2.csv']").click()
     page.get_by_role("heading", name="phone2.csv").wait_for()
-    page.get_by_text("How the file is read").click()
+    page.locator(".file .refused").wait_for()  # and with it, the form of "How the file is read" is open
     page.locator("#reading-layout").fill("imulab-files/mine.toml")
     page.get_by_role("button", name="Read it so").click()
     page.locator("svg.plot", has_text="accel [g]").wait_for()
     assert "--layout imulab-files/mine.toml" in command(page)
+
+
+def test_an_older_list_of_files_takes_no_file_off(workbench, new_page):
+    page = new_page(workbench.address)
+    held: list[Any] = []
+    page.route("**/api/workbench/files", lambda route: held.append((route, route.fetch())))
+    page.reload()
+    page.wait_for_function("document.querySelector('.drop')")
+    while not held:
+        page.wait_for_timeout(20)
+    drop(page, "phone.csv", "t;a\n1;x\n")
+    entry = page.locator("[data-name='imulab-files/phone.csv']")
+    entry.wait_for()
+    assert held[0][1].json()["files"] == []
+    for route, answer in reversed(held):
+        route.fulfill(response=answer)
+    page.wait_for_timeout(300)
+    assert entry.count() == 1
+
+
+def test_a_file_that_comes_late_does_not_hide_the_one_that_was_clicked_on(workbench, new_page):
+    page = new_page(workbench.address)
+    drop(page, "one.csv", "t;a\n1;x\n")
+    page.get_by_role("heading", name="one.csv").wait_for()
+    held: list[Any] = []
+    page.route("**/api/workbench/files/*", lambda route: held.append(route))
+    drop(page, "two.csv", "t;a\n1;x\n")
+    while not held:
+        page.wait_for_timeout(20)
+    page.locator("[data-name='imulab-files/one.csv']").click()
+    held[0].continue_()
+    page.locator("[data-name='imulab-files/two.csv']").wait_for()
+    page.wait_for_timeout(300)
+    assert page.get_by_role("heading", name="one.csv").count() == 1
 
 
 def test_nothing_of_a_files_text_is_executed(workbench, new_page, folder):

@@ -14,6 +14,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 from shlex import join
 from typing import IO, Any, ClassVar
@@ -62,6 +63,7 @@ class Workbench(Part):
         self._hub = Hub()
         self._jobs, self._openings = Jobs(self._tell_job), Openings(self._tell_opening)
         self._coming: set[str] = set()
+        self._lists = count()
         shown = to_json(list(forms.values()))
         self.routes = [
             Route(f"{_HERE}/files", self._list),
@@ -97,7 +99,9 @@ class Workbench(Part):
         self._openings.end()
 
     def _list_message(self) -> Message:
-        return {"type": "files", "folder": str(self._files.folder), "files": self._files.entries()}
+        """Return the list of files, numbered: an answer and a message can reach a page in the other order."""
+        number = next(self._lists)
+        return {"type": "files", "number": number, "folder": str(self._files.folder), "files": self._files.entries()}
 
     def _tell_job(self, job: Job) -> None:
         self._hub.tell(_job_message(job))

@@ -14,6 +14,8 @@ let page = null;
 let place = null;
 let files = [];
 let folder = "";
+let newest = -1;
+let clicks = 0;
 let forms = [];
 let chosen = null;
 let opening = null;
@@ -65,7 +67,9 @@ export function shown() {
   ask("files").then(listed).catch(fail);
 }
 
+// What has come is shown, unless another file was clicked on meanwhile.
 async function take(given) {
+  const before = clicks;
   for (const file of given) {
     const part = h("progress", { max: 1, value: 0, "aria-label": `receiving ${file.name}` });
     const row = h("li", {}, file.name, part);
@@ -73,7 +77,7 @@ async function take(given) {
     try {
       const name = await send(file, gone => { part.value = gone; });
       if (!files.some(each => each.name === name)) listed(await ask("files"));
-      if (chosen?.name !== name) choose(name);
+      if (clicks === before && chosen?.name !== name) choose(name);
     } catch (error) {
       fail(error);
     }
@@ -82,9 +86,10 @@ async function take(given) {
 }
 
 function listed(message) {
-  ({ files, folder } = message);
+  if (message.number < newest) return; // an answer that a later message has overtaken
+  ({ files, folder, number: newest } = message);
   const row = each => h("li", {}, h("button", {
-    type: "button", class: "entry", "aria-current": each.name === chosen?.name ? "true" : null, "data-name": each.name, onclick: () => choose(each.name),
+    type: "button", class: "entry", "aria-current": each.name === chosen?.name ? "true" : null, "data-name": each.name, onclick: () => { clicks += 1; choose(each.name); },
   }, h("span", { class: "filename" }, each.short), h("span", { class: "kind" }, `${KINDS[each.kind]}${each.kind === "folder" ? "" : `, ${bytes(each.size)}`}`)));
   const focused = document.activeElement?.dataset?.name;
   ui.list.replaceChildren(...files.map(row));
@@ -100,7 +105,7 @@ function listed(message) {
 function leave() {
   chosen = null;
   show(ui.file, false);
-  listed({ files, folder });
+  listed({ files, folder, number: newest });
 }
 
 function choose(name) {
