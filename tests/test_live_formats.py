@@ -14,6 +14,7 @@ import pytest
 from imulab.errors import ReadError
 from imulab.live.formats import STRAIGHTENED, Stream, UnknownFormatError
 from imulab.live.sources import open_source
+from imulab.live.stamps import Counts
 from imulab.readers import Layout, load_layout
 from imulab.recording import Recording
 from streams import drawn, mavlink, motioncal, msp, native, terminal, ximu3
@@ -144,6 +145,101 @@ def test_a_device_that_starts_again_goes_on_in_time():
     assert len(found) == 600
     assert np.diff(found.columns["time"]).min() > 0
     assert stream.counts.restarts == 1
+
+
+TITLES = b"time [ms],accel_x [g],accel_y [g],accel_z [g]\n"
+
+
+def stamped(stamps: list[float]) -> tuple[Stream, Recording]:
+    """Samples whose accel_z is their number, with these stamps, in pieces of five."""
+    rows = [f"{stamp:.0f},1,0,{k}\n".encode() for k, stamp in enumerate(stamps)]
+    return decoded([TITLES, *(b"".join(rows[k : k + 5]) for k in range(0, len(rows), 5))], step=0.05)
+
+
+@pytest.mark.parametrize("wild", [7_217_000, 3_499, 0, 95_000, 4_294_967_000])
+@pytest.mark.parametrize("at", [0, 299, 304, 455])  # the first of all, and each place in a piece
+def test_one_wild_stamp_costs_its_sample_and_no_other(wild, at):
+    stamps = [100_000.0 + 10 * k for k in range(600)]
+    stamps[at] = wild
+    stream, found = stamped(stamps)
+    kept = np.delete(np.arange(600), at)
+    np.testing.assert_array_equal(found.columns["accel_z"], kept)
+    np.testing.assert_array_equal(found.columns["time"], 100_000 + 10 * kept)
+    counts = stream.counts
+    assert (counts.stray, counts.restarts, counts.lost) == (1, 0, int(at > 0))
+
+
+@pytest.mark.parametrize("length", [2**16, 2**32])
+def test_counters_of_milliseconds_wrap_around(length):
+    stream, found = stamped([(length - 3000 + 10.0 * k) % length for k in range(600)])
+    np.testing.assert_array_equal(np.diff(found.columns["time"]), 10)
+    assert vars(stream.counts) == vars(Counts())
+
+
+def test_a_gap_is_believed_and_a_clock_that_was_set_is_no_gap():
+    gap = [10.0 * k + 5_000 * (k >= 303) for k in range(600)]
+    stream, found = stamped(gap)
+    np.testing.assert_array_equal(found.columns["time"], gap)
+    assert (stream.counts.gaps, stream.counts.lost, stream.counts.restarts) == (1, 500, 0)
+    stream, found = stamped([10.0 * k + 7e9 * (k >= 303) for k in range(600)])
+    assert len(found) == 600
+    assert np.ptp(found.columns["time"]) == 5990 - 10 + 1000
+    assert (stream.counts.restarts, stream.counts.stray) == (1, 0)
+
+
+def test_a_sample_that_is_sent_twice_is_counted_once():
+    stream, found = stamped([10.0 * (k // 2) for k in range(600)])
+    np.testing.assert_array_equal(found.columns["accel_z"], 2 * np.arange(300))
+    assert vars(stream.counts) == vars(Counts(repeated=300))
+
+
+def test_another_rate_is_no_loss():
+    stamps = np.cumsum([10.0] * 300 + [25.0] * 300)
+    stream, found = stamped(stamps.tolist())
+    np.testing.assert_array_equal(found.columns["time"], stamps)
+    assert stream.counts.lost <= 10  # those of the piece in which it changes
+
+
+def test_stamps_of_bursts_lose_nothing():
+    """A driver that stamps at arrival: sixteen samples within a millisecond, then nothing for 160 ms."""
+    stamps = [160.0 * (k // 16) + 0.0625 * (k % 16) for k in range(1600)]
+    rows = [f"{stamp},1,0,{k}\n".encode() for k, stamp in enumerate(stamps)]
+    stream, found = decoded([TITLES, *rows])
+    np.testing.assert_array_equal(found.columns["time"], stamps)
+    assert stream.counts.stray == stream.counts.restarts == 0
+
+
+def test_titles_that_come_again_in_another_order_are_followed():
+    rows = [f"{10 * k},1,2,{k}\n".encode() for k in range(600)]
+    rows[300:] = [f"{10 * k},2,1,{k}\n".encode() for k in range(300, 600)]
+    again = b"time [ms],accel_y [g],accel_x [g],accel_z [g]\n"
+    stream, found = decoded([TITLES, *rows[:300], again, *rows[300:]])
+    np.testing.assert_array_equal(found.columns["accel_x"], 1)
+    np.testing.assert_array_equal(found.columns["accel_y"], 2)
+    assert stream.counts.damaged == 0
+    cut = [TITLES, *rows[:300], b"time [ms],accel_x [g]\n", TITLES[:-3] + b"\n", *rows[:300]]
+    assert decoded(cut)[0].counts.damaged == 2
+
+
+def test_titles_that_become_others_end_the_stream_with_one_line():
+    rows = [f"{10 * k},1,2,{k}\n".encode() for k in range(600)]
+    stream, found = decoded([TITLES, *rows[:300], TITLES.replace(b"[g]", b"[m/s^2]"), *rows[300:]])
+    assert stream.over.startswith("device: the stream's titles have changed from 'time [ms],accel_x [g],")
+    assert stream.over.endswith(": expected the same columns and units to the end")
+    assert len(found) == 300
+
+
+def test_titles_of_a_layout_that_come_again_in_another_order_are_followed(tmp_path):
+    (tmp_path / "l.toml").write_text(
+        'delimiter = ","\n[columns]\n'
+        + "".join(f'accel_{a} = {{ from = "a{a}", unit = "g" }}\n' for a in "xyz")
+        + 'time = { from = "t", unit = "s" }\n'
+    )
+    rows = [b"t,ax,ay,az\n", *(f"{k / 100},1,2,3\n".encode() for k in range(300))]
+    rows += [b"t,az,ay,ax\n", *(f"{k / 100},3,2,1\n".encode() for k in range(300, 600))]
+    stream, found = decoded(rows, load_layout(tmp_path / "l.toml"))
+    np.testing.assert_array_equal(found.columns["accel_x"], 1)
+    assert (len(found), stream.counts.damaged) == (600, 0)
 
 
 def test_arrival_times_are_straightened():

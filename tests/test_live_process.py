@@ -108,6 +108,48 @@ def test_killed_twenty_times(tmp_path, reduced):
     kills(tmp_path, 5 if reduced else 20, 2)
 
 
+def rows_of(recording: il.Recording, seconds: int) -> list[str]:
+    """Titles, and each sample as a row; every sample of the last `seconds` twice, one with a stamp of hours ahead."""
+    values = np.column_stack([recording.time, recording.triad("accel")])
+    rows = [",".join(f"{value:.4f}" for value in row) for row in values.tolist()]
+    rows[1700] = f"7217.0000,{rows[1700].partition(',')[2]}"
+    last = len(rows) - 100 * seconds
+    rows[last:] = [row for row in rows[last:] for _ in (0, 1)]
+    return ["time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2]", *rows]
+
+
+def from_standard_input(folder: Path, lines: list[str]) -> subprocess.CompletedProcess[str]:
+    words = ["live", "-", "--plain", "--attitudes", "40", *FIT, "--save", "rec.csv", "-o", "live.json"]
+    return subprocess.run(
+        [sys.executable, "-m", "imulab", *words],
+        cwd=folder, input="\n".join([*lines, ""]), capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+def test_what_was_wrong_with_a_stream_is_said_and_left_out(tmp_path):
+    recording = tumble(14)
+    done = from_standard_input(tmp_path, rows_of(recording, 10))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("a sample whose time fits neither those before nor those after is left out") == 1
+    assert "samples came again and are left out: is each sent once?" in done.stdout
+    count = len(recording) - 1
+    left = "1 lost, 1000 came again and left out, 1 with a time that fits nowhere and left out"
+    assert f"imulab: note: of what came beside {count} samples: {left}\n" in done.stderr
+    np.testing.assert_array_equal(il.read(tmp_path / "rec.csv").time, np.delete(recording.time, 1700).round(4))
+
+
+def test_titles_that_become_others_end_a_session_that_can_be_gone_on_with(tmp_path):
+    lines = rows_of(tumble(14), 0)
+    lines.insert(4000, lines[0].replace("accel_x", "gyro_x"))
+    done = from_standard_input(tmp_path, lines)
+    assert done.returncode == 2
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith("imulab: standard input: the stream's titles have changed from 'time [s],accel_x ")
+    assert ": expected the same columns and units to the end. rec.csv keeps " in said
+    assert said.endswith(" attitudes: --resume goes on with it")
+    assert len(il.read(tmp_path / "rec.csv")) == 3999 - 1
+
+
 def test_unplugged_in_the_middle(tmp_path):
     with device(lines_of(tumble(20)), 100 * SPEED) as unit:
         words = [f"serial:{unit.port}", "--plain", "--save", "rec.csv", "-o", "live.json", *FIT]

@@ -119,6 +119,8 @@ def _in_terminal(runner: Runner, made: Callable[[], Calibration], *, plain: bool
     """Guide the test in the terminal, make its record, and show corrected readings until the end."""
     (_plain if plain else _drawn)(runner, typed=typed)
     runner.recorder.close()
+    if wrong := runner.session.view().counts.summary():
+        note(f"of what came beside {runner.recorder.rows} samples: {wrong}")
     record = made()
     if not plain and typed:
         _corrected(runner, record)

@@ -41,6 +41,7 @@ class Decoder(Protocol):
 
     name: str
     metadata: dict[str, str]
+    over: str
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -76,6 +77,7 @@ class Stream:
         self._asked: float | None = None
         self._decoder: Decoder | None = None
         self._device: DeviceClock | None = None
+        self._again: Array | None = None
         self._arrival: ArrivalClock | None = None
 
     def feed(self, data: bytes, arrival: float) -> list[Recording]:
@@ -111,6 +113,11 @@ class Stream:
             return blocks
         return blocks + self._timed([(self._decoder.finish(), self._held[-1][1])])
 
+    @property
+    def over(self) -> str:
+        """Why nothing more of the stream can be read; empty while it can."""
+        return f"{self._source}: {self._decoder.over}" if self._decoder is not None and self._decoder.over else ""
+
     def _begin(self) -> list[Recording]:
         head = b"".join(data for data, _ in self._held)
         self._decoder = decoder = self._recognised(head)
@@ -138,10 +145,13 @@ class Stream:
     def _recording(self, rows: Array, arrival: float) -> Recording:
         assert self._decoder is not None
         units = dict(self._decoder.units)
+        if self._again is not None:
+            rows = np.concatenate([self._again, rows])
         columns = dict(zip(units, rows.T, strict=True))
         metadata = {"format": self.format, **self._decoder.metadata}
         if self._device is not None:
-            times, kept = self._device.times(columns["time"], arrival)
+            times, kept, again = self._device.times(columns["time"])
+            self._again = rows[-1:] if again else None
             columns = {name: np.ascontiguousarray(column[kept]) for name, column in columns.items()}
             columns["time"] = times[kept]
         elif self._arrival is not None:

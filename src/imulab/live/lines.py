@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from imulab.columns import parse_column_title, triad
-from imulab.errors import OptionError, ReadError, UnitError
+from imulab.errors import OptionError, ReadError, UnitError, quoted
 from imulab.live.stamps import Counts
 from imulab.readers.layout import Layout
 from imulab.recording import Array
@@ -34,7 +34,7 @@ _EXTRA = {b"M": units_of("mag", "1"), b"T": {"temperature": "degC"}}
 class LineDecoder:
     """What all streams of lines share: cutting bytes into lines, and counting those that cannot be read."""
 
-    name = ""
+    name = over = ""
     units: Mapping[str, str] = {}
 
     def __init__(self, counts: Counts) -> None:
@@ -44,7 +44,7 @@ class LineDecoder:
         self._begun = False
 
     def rows(self, data: bytes) -> Array:
-        """Return the rows that these bytes complete, shape (n, columns)."""
+        """Return the rows that these bytes complete, shape (n, columns); none behind a line that ends the stream."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _LONGEST:
             self.counts.damaged += 1
@@ -52,6 +52,8 @@ class LineDecoder:
         rows: Rows = []
         for line in lines:
             line = line.strip()
+            if self.over:
+                break
             if not line:
                 continue
             try:
@@ -80,7 +82,7 @@ class LineDecoder:
 
 
 class Native(LineDecoder):
-    """Rows below a line of titles ``name [unit]``, as in files; the titles may come again."""
+    """Rows below a line of titles ``name [unit]``, as in files; the titles may come again, in another order too."""
 
     name = "titles with units"
 
@@ -88,23 +90,40 @@ class Native(LineDecoder):
         super().__init__(counts)
         self.units = native_units(titles)
         self._titles = titles.encode()
-        self._reached = False
+        self._places: list[int] | None = None
 
     def _row(self, line: bytes) -> list[float] | None:
-        if line == self._titles:
-            self._reached = True
+        if line == self._titles and self._places is None:
+            self._places = list(range(len(self.units)))
+            return None
+        if b"[" in line and not line.startswith(b"#") and self._places is not None:
+            self._tell_again(line.decode("utf-8", "replace"))
             return None
         if line.startswith(b"#"):
             key, colon, value = line[1:].decode("utf-8", "replace").partition(":")
             if colon:
                 self.metadata[key.strip()] = value.strip()
             return None
-        if not self._reached:
+        if self._places is None:
             return None
         fields = line.split(b",")
         if len(fields) != len(self.units):
             raise ValueError
-        return list(map(float, fields))
+        return [float(fields[place]) for place in self._places]
+
+    def _tell_again(self, titles: str) -> None:
+        """Take titles that come again; what is no whole line of them is damage."""
+        words = titles.split(",")
+        if len(words) < len(self.units) or not all(word.endswith("]") for word in words):
+            raise ValueError
+        units = native_units(titles) if is_titles(titles) else {}
+        if units == self.units:
+            self._places = [list(units).index(name) for name in self.units]
+        else:
+            self.over = (
+                f"the stream's titles have changed from {quoted(self._titles.decode('utf-8', 'replace'))} to "
+                f"{quoted(titles)}: expected the same columns and units to the end"
+            )
 
 
 class MotionCal(LineDecoder):
@@ -168,8 +187,9 @@ class LayoutDecoder(LineDecoder):
         self._count = 0
         self._places: list[int] | None = None
         origins = [column.origin for column in layout.columns.values()]
+        self._titled = not all(isinstance(origin, int) for origin in origins)
         self._keys = [str(origin) for origin in origins]
-        if all(isinstance(origin, int) for origin in origins):
+        if not self._titled:
             self._places = [int(origin) for origin in origins]
 
     def _row(self, line: bytes) -> list[float] | None:
@@ -182,10 +202,12 @@ class LayoutDecoder(LineDecoder):
         if found is None:
             return None
         fields = found
-        if self._places is None:
+        if self._titled:
             titles = [field.strip('"') for field in fields]
             if all(key in titles for key in self._keys):
                 self._places = [titles.index(key) for key in self._keys]
+                return None
+        if self._places is None:
             return None
         if self._layout.decimal == ",":
             fields = [field.replace(",", ".") for field in fields]

@@ -45,7 +45,7 @@ _POLL = b"$M<\x00" + bytes([MSP_RAW_IMU, MSP_RAW_IMU])
 class PacketDecoder:
     """What both kinds of packets share: a buffer, and the search for the next frame after damage."""
 
-    name = ""
+    name = over = ""
     units: Mapping[str, str] = {}
 
     def __init__(self, counts: Counts) -> None:

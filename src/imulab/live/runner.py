@@ -60,7 +60,8 @@ class Runner:
         Raises
         ------
         ReadError
-            The connection is lost, or the stream is none of the known; the recording so far is kept.
+            The connection is lost, or the stream is none of the known, or its columns have changed; the recording so
+            far is kept.
         OptionError
             The recording cannot be written on.
         DataError
@@ -69,17 +70,18 @@ class Runner:
         events: list[Event] = []
         arrived = self.source.get(wait)
         for one in arrived:
-            blocks = [one.data] if isinstance(one.data, Recording) else self._stream.feed(one.data, one.time)
-            events += self._take(blocks, one.time)
+            events += self._take(self._fed(one.data, one.time), one.time)
             self._answer()
         now = self.source.now()
         if not arrived:
-            events += self._take(self._stream.feed(b"", now), now)
+            events += self._take(self._fed(b"", now), now)
             self._answer()
             self.recorder.tick(now)
         if self.source.ended:
             events += self._take(self._stream.finish(), now)
         events += self._check_silence(bool(arrived), now)
+        if self._stream.over:
+            raise ReadError(f"{self._stream.over}. {self.kept()}")
         if self.source.lost:
             raise ReadError(f"{self.source.lost} {self.kept()}")
         events += self._further_triads(events)
@@ -115,7 +117,7 @@ class Runner:
         """Return the samples that have come, after `wait` seconds at most, without session and recording."""
         blocks: list[Recording] = []
         for one in self.source.get(wait):
-            blocks += [one.data] if isinstance(one.data, Recording) else self._stream.feed(one.data, one.time)
+            blocks += self._fed(one.data, one.time)
             self._answer()
         return [block for block in blocks if len(block)]
 
@@ -125,6 +127,9 @@ class Runner:
             self._further.close()
         self.source.close()
         self.recorder.close()
+
+    def _fed(self, data: bytes | Recording, time: float) -> list[Recording]:
+        return [data] if isinstance(data, Recording) else self._stream.feed(data, time)
 
     def _take(self, blocks: list[Recording], now: float) -> list[Event]:
         events: list[Event] = []

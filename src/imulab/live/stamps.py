@@ -10,14 +10,20 @@ from numpy.typing import NDArray
 from imulab.recording import Array
 from imulab.units import parse_unit
 
-_WRAPS = 2**32
-"""Counters of microseconds and of milliseconds begin again after so many."""
-_SOON = 10.0
-"""A stamp that goes on within so many seconds behind a wrap-around has wrapped around, s."""
+_WRAPS = ((2**32, 1e-6), (2**32, 1e-3), (2**24, 1e-6), (2**16, 1e-3))
+"""Counters that begin again: after how many ticks, and how long a tick is, s."""
+_NEAR, _NEAR_STEPS = 0.25, 10.0
+"""A stamp at most so far behind the last, s or usual steps, goes on from it."""
+_SOON, _SOON_PART = 10.0, 0.005
+"""A stamp that goes on within both behind a wrap-around, s and part of the counter's length, has wrapped around."""
 _RESTART = 1.0
 """Stamps that jump back by more than this, s, are those of a device that has started again."""
+_SET_ANEW = 600.0
+"""Stamps that jump ahead by more than this, s, are those of a clock that was set: nobody waits so long in a test."""
 _LATE = 1.5
 """Steps in time longer than so many usual ones have lost samples between them."""
+_ALIKE = 5
+"""So many steps that are alike tell the rate."""
 _POINTS, _APART = 48, 0.5
 _PAUSE, _PAUSE_STEPS = 0.5, 20.0
 """A stream without stamps that falls behind by more than both, s and steps, has paused."""
@@ -35,45 +41,78 @@ class Counts:
         Places where they are missing.
     repeated, reordered
         Samples that came again, or behind later ones; they are left out.
+    stray
+        Samples whose stamp fits neither those before nor those after; they are left out.
     damaged
         Lines or messages that could not be read, or stretches of bytes between them.
     restarts
-        Times that the device began to count its time anew.
+        Times that the device began to count its time anew, or that its clock was set.
     """
 
     lost: int = 0
     gaps: int = 0
     repeated: int = 0
     reordered: int = 0
+    stray: int = 0
     damaged: int = 0
     restarts: int = 0
 
+    def summary(self) -> str:
+        """Return in words what was wrong; nothing where nothing was."""
+        parts = (
+            (self.lost, "lost"),
+            (self.repeated, "came again and left out"),
+            (self.reordered, "came late and left out"),
+            (self.stray, "with a time that fits nowhere and left out"),
+            (self.damaged, "damaged lines or messages"),
+            (self.restarts, "times that the device started again or its clock was set"),
+        )
+        return ", ".join(f"{number} {words}" for number, words in parts if number)
+
 
 class DeviceClock:
-    """Stamps of a device in their own unit, without wrap-around; they rise from sample to sample."""
+    """Stamps of a device in their own unit, without wrap-around; they rise from sample to sample.
+
+    A stamp that jumps is believed once the next one goes on from it: a damaged digit moves one stamp, while a gap, a
+    counter that begins again or a device that does moves all that follow.
+    """
 
     def __init__(self, unit: str, counts: Counts) -> None:
-        self._factor = parse_unit(unit).factor
-        self._wraps = sorted(_WRAPS * tick / self._factor for tick in (1e-6, 1e-3))
+        factor = parse_unit(unit).factor
+        self._restart, self._set_anew = _RESTART / factor, _SET_ANEW / factor
+        self._near = _NEAR / factor
+        lengths = sorted(count * tick for count, tick in _WRAPS)
+        self._wraps = [(length / factor, min(_SOON, _SOON_PART * length) / factor) for length in lengths]
         self._counts = counts
         self._offset = 0.0
         self._last: float | None = None
         self._step: float | None = None
 
-    def times(self, stamps: Array, arrival: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Return times in the stamps' unit, and which samples to keep, both of shape (n,)."""
+    def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], bool]:
+        """Take stamps on.
+
+        Returns
+        -------
+        times, kept, again
+            Times in the stamps' unit and which samples to keep, both of shape (n,); whether the last sample is to be
+            given again with the next ones, because only they can tell what its stamp is worth.
+        """
         times = stamps + self._offset
-        steps = np.diff(times, prepend=times[0] - 1.0 if self._last is None else self._last)
-        kept = np.ones(len(times), dtype=np.bool_)
-        if steps.min() <= 0:
-            times, kept = self._mended(stamps.tolist())
+        steps = np.diff(times) if self._last is None else np.diff(times, prepend=self._last)
+        again = False
+        if self._last is None or steps.min() <= 0 or steps.max() > self._reach(steps):
+            times, kept, again = self._judged(stamps.tolist(), self._reach(steps))
+        else:
+            kept = np.ones(len(times), dtype=np.bool_)
         good = times[kept]
         if not good.size:
-            return times, kept
+            return times, kept, again
         steps = np.diff(good) if self._last is None else np.diff(good, prepend=self._last)
         if steps.size:
             usual = float(np.median(steps))
             step = usual if self._step is None else self._step
+            if len(steps) >= _ALIKE and steps.max() < _LATE * steps.min():
+                step = usual  # all steps are alike: those of another rate, and no losses
             late = steps > _LATE * step
             if late.any():
                 self._counts.gaps += int(late.sum())
@@ -81,30 +120,48 @@ class DeviceClock:
             # The usual step follows slowly, and no further than a jitter, so that gaps do not become usual.
             self._step = step + 0.05 * (min(usual, _LATE * step) - step)
         self._last = float(good[-1])
-        return times, kept
+        return times, kept, again
 
-    def _mended(self, stamps: list[float]) -> tuple[Array, NDArray[np.bool_]]:
-        """Go through a block with a stamp that does not rise."""
+    def _reach(self, steps: Array) -> float:
+        """Return how far a stamp goes on from the last at most; `steps` tell it where no step is known yet."""
+        step = self._step
+        if step is None:
+            step = float(np.median(np.abs(steps))) if steps.size else 0.0
+        return max(self._near, _NEAR_STEPS * step)
+
+    def _judged(self, stamps: list[float], reach: float) -> tuple[Array, NDArray[np.bool_], bool]:
+        """Go through a block with a stamp that does not rise, or jumps ahead."""
         last = self._last
-        times, kept = np.empty(len(stamps)), np.ones(len(stamps), dtype=np.bool_)
+        times, kept = np.empty(len(stamps)), np.zeros(len(stamps), dtype=np.bool_)
         for index, stamp in enumerate(stamps):
-            time = stamp + self._offset
-            if last is not None and time <= last:
-                back = (last - time) * self._factor
-                wrap = next((w for w in self._wraps if 0 < time + w - last <= _SOON / self._factor), None)
-                if wrap is not None:
-                    self._offset += wrap
-                elif back > _RESTART:
-                    self._counts.restarts += 1
-                    self._offset = last + _RESTART / self._factor - stamp
-                else:
-                    kept[index] = False
-                    self._counts.repeated += time == last
-                    self._counts.reordered += time < last
+            step = None if last is None else stamp + self._offset - last
+            if step is not None and -self._restart <= step <= 0:
+                self._counts.repeated += step == 0
+                self._counts.reordered += step < 0
+                continue
+            if step is None or not 0 < step <= reach:
+                after = next((other for other in stamps[index + 1 :] if other != stamp), None)
+                if after is None:
+                    self._counts.repeated += len(stamps) - 1 - index
+                    return times, kept, True
+                if not 0 < after - stamp <= reach:
+                    self._counts.stray += 1
                     continue
-                time = stamp + self._offset
-            times[index], last = time, time
-        return times, kept
+                if last is not None:
+                    self._jump(stamp, last)
+            kept[index] = True
+            times[index] = last = stamp + self._offset
+        return times, kept, False
+
+    def _jump(self, stamp: float, last: float) -> None:
+        """Take a jump of the stamps out of the time, where it is none of time."""
+        step = stamp + self._offset - last
+        wrap = next((w for w, soon in self._wraps if step < 0 < step + w <= soon and stamp < w), None)
+        if wrap is not None:
+            self._offset += wrap
+        elif step < 0 or step > self._set_anew:
+            self._counts.restarts += 1
+            self._offset = last + self._restart - stamp
 
 
 class ArrivalClock:

@@ -107,14 +107,29 @@ class Watch:
     def counts(self, counts: Counts, samples: int) -> list[str]:
         """Look at what the stream has lost."""
         found = []
-        if samples > _FEWEST and counts.lost > _LOST * samples:
+        if samples > _FEWEST:
+            came = samples + counts.repeated + counts.reordered + counts.stray
+            for key, number, text in (
+                ("lost", counts.lost, f"of {samples + counts.lost} samples are lost: a lower rate, or a faster link?"),
+                ("damaged", counts.damaged, "lines or messages were damaged: is the cable all right?"),
+                ("repeated", counts.repeated, f"of {came} samples came again and are left out: is each sent once?"),
+                (
+                    "late",
+                    counts.reordered,
+                    f"of {came} samples came too late and are left out: a faster link?",
+                ),
+            ):
+                if number > _LOST * samples:
+                    found += self._once(key, f"{number} {text}")
+        if counts.stray:
             found += self._once(
-                "lost", f"{counts.lost} of {samples + counts.lost} samples are lost: a lower rate, or a faster link?"
+                "stray",
+                "a sample whose time fits neither those before nor those after is left out, as any more will be: is "
+                "the cable all right?",
             )
-        if samples > _FEWEST and counts.damaged > _LOST * samples:
-            found += self._once("damaged", f"{counts.damaged} lines or messages were damaged: is the cable all right?")
         if counts.restarts:
             found += self._once(
-                f"restart {counts.restarts}", "the device has started again: its power or its cable is loose"
+                f"restart {counts.restarts}",
+                "the device has started again, or its clock was set: is its power or its cable loose?",
             )
         return found
