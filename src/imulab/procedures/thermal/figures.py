@@ -8,10 +8,10 @@ import numpy as np
 
 from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.engineering import rows as engineering_rows
-from imulab.procedures.thermal.gyrofigures import COLOURS, gyro_exhibits
+from imulab.procedures.thermal.gyrofigures import COLOURS, gyro_exhibits, own_points
 from imulab.procedures.thermal.model import AXES, GROUPS
 from imulab.procedures.thermal.record import predicted
-from imulab.procedures.thermal.sections import Thermal, thermal_of
+from imulab.procedures.thermal.sections import Own, Thermal, thermal_of
 from imulab.records.calibration import Calibration
 from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
 from imulab.report.traces import DASHES, axis, band, rounded, scatter
@@ -57,7 +57,7 @@ def exhibits(record: Calibration) -> Exhibits:
     ]
     items: list[Figure | ReportTable] = [
         _coefficients(record),
-        *(_over_temperature(k, temperature, values, spread) for k in range(3)),
+        *(_over_temperature(k, temperature, values, spread, found.data.calibrations) for k in range(3)),
         _residuals(found),
     ]
     if found.model.gyro is not None:
@@ -111,23 +111,29 @@ def _coefficients(record: Calibration) -> ReportTable:
     )
 
 
-def _over_temperature(group: int, temperature: Any, values: Any, spread: Any) -> Figure:
+def _over_temperature(group: int, temperature: Any, values: Any, spread: Any, alone: Own | None) -> Figure:
     name, factor, unit = _READ[group]
     traces: list[dict[str, Any]] = []
     for k in range(3):
-        own, u = values[3 * group + k], 2 * spread[3 * group + k]
-        if group == 1:
-            middle = own[len(own) // 2]
-            own, u = own / middle - 1, u / middle
-        label = GROUPS[group][1][k]
+        row, label = 3 * group + k, GROUPS[group][1][k]
+        middle = values[row][len(temperature) // 2]
+
+        def read(each: Any, zero: float = 0.0, middle: float = middle) -> Any:
+            return (each / middle - zero if group == 1 else each) * factor
+
+        own, u = read(values[row], 1.0), 2 * np.abs(read(spread[row]))
         traces += [
-            band(temperature, (own - u) * factor, (own + u) * factor, COLOURS[k], showlegend=False),
-            scatter(rounded(temperature), rounded(own * factor), "lines", name=label,
+            band(temperature, own - u, own + u, COLOURS[k], showlegend=False),
+            scatter(rounded(temperature), rounded(own), "lines", name=label,
                     line={"color": COLOURS[k], "dash": DASHES[k]}),
         ]  # fmt: skip
+        if alone is not None:
+            point, reach = np.array(alone.values)[:, row], np.array(alone.standard_uncertainty)[:, row]
+            traces.append(own_points(np.array(alone.temperature), read(point, 1.0), 2 * read(reach), k, label))
     return Figure(
         title=f"{name.capitalize()} over temperature",
         caption="Bands: two standard uncertainties, all that power cycles differ by included."
+        + (" Points: what each recording at a steady temperature gives alone, bars two of its own." if alone else "")
         + (f" Change from the value at {temperature[len(temperature) // 2]:.3g} degC." if group == 1 else ""),
         traces=traces,
         layout={

@@ -11,7 +11,7 @@ from imulab.procedures.thermal.gyro import Gyroscopes
 from imulab.procedures.thermal.gyroscale import ScaleLaws, block_diagonal, joint_covariance, rescaled
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import entries
-from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, law_names
+from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, Laws, law_names
 from imulab.procedures.thermal.record import interval_of, law_at
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.recording import Array
@@ -186,6 +186,16 @@ def _drifts(gyros: Gyroscopes, name: str) -> list[str]:
             "cooling, which corrected outputs keep"
         )
     return found
+
+
+def gyro_scale_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
+    """Return the three scale factors over temperature and their standard uncertainties, SI, shapes (3, n)."""
+    model = thermal_of(record).model
+    assert model.gyro is not None
+    laws = Laws(model.range[0], model.range[1], (model.gyro.degrees.scale_factor, 0, 0))
+    powers = laws.recorded(0, temperature, model.reference_temperature.value)
+    found = [law_at(record, laws.named(0, f"gyro_scale_factor_{axis}"), powers) for axis in AXES]
+    return np.array([values for values, _ in found]), np.array([spread for _, spread in found])
 
 
 def gyro_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:

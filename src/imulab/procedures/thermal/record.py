@@ -9,6 +9,7 @@ import numpy as np
 
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
+from imulab.procedures.thermal.calibrations import Own, own_calibrations
 from imulab.procedures.thermal.degrees import Found, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
@@ -73,7 +74,8 @@ def make_record(
         },
         fit=_fit(holds, residual, found, options, g) | entries(drift, g),
         options=dict(options),
-        data=_data(holds, g * residual, g * uncertainty),
+        data=_data(holds, g * residual, g * uncertainty)
+        | _alone(own_calibrations(problem, solution), holds, np.append(np.full(3, g), scale / g)),
         sensor=sensor,
         sources=sources,
         warnings=tuple(_findings(holds, found, drift, gravity, options, name)),
@@ -131,6 +133,22 @@ def _data(holds: Holds, residual: Array, uncertainty: Array) -> dict[str, Any]:
             "mean": holds.mean.tolist(),
             "residual": residual.tolist(),
             "standard_uncertainty": uncertainty.tolist(),
+        }
+    }
+
+
+def _alone(calibrations: list[Own], holds: Holds, factor: Array) -> dict[str, Any]:
+    """Return what each recording gives alone; `factor` makes biases and scale factors SI, shape (6,)."""
+    if not calibrations:
+        return {}
+    each = np.append(factor, np.ones(3))
+    names = ["prior" if own.recording < 0 else holds.recordings[own.recording].name for own in calibrations]
+    return {
+        "calibrations": {
+            "recording": names,
+            "temperature": [own.temperature for own in calibrations],
+            "values": [(each * own.values).tolist() for own in calibrations],
+            "standard_uncertainty": [(each * own.standard_uncertainty).tolist() for own in calibrations],
         }
     }
 

@@ -12,7 +12,9 @@ from imulab.records.sections import Length, Part, Positive, Quantity, Size, part
 T = TypeVar("T")
 PerHold = Annotated[list[T], "holds"]
 PerGyroHold = Annotated[list[T], "holds of gyroscopes"]
+PerCalibration = Annotated[list[T], "calibrations"]
 Three = Annotated[list[T], 3]
+Nine = Annotated[list[T], 9]
 
 
 class Gravity(Part):
@@ -187,10 +189,23 @@ class GyroHeld(Part):
     residual: PerGyroHold[Three[float]]
 
 
+class Own(Part):
+    """``data.calibrations``: the nine parameters that each steady recording gives alone, SI, at its temperature, degC.
+
+    In the order of bias, scale factor and misalignment, as in the record's parameters.
+    """
+
+    recording: PerCalibration[str]
+    temperature: PerCalibration[float]
+    values: PerCalibration[Nine[float]]
+    standard_uncertainty: PerCalibration[Nine[float]]
+
+
 class Data(Part):
     """``data``."""
 
     holds: Held
+    calibrations: Own | None = None
     gyro: GyroHeld | None = None
 
 

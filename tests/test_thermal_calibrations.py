@@ -1,0 +1,82 @@
+"""What each recording gives alone, beside the laws: held against a tumble calibration of that recording."""
+
+import numpy as np
+
+import imulab as il
+from imulab.procedures.thermal.gyrorecord import gyro_scale_predicted
+from reference import thermal as reference
+
+G = reference.G
+NOISE = 60e-6
+NAMES = [
+    *(f"bias_{a}" for a in "xyz"),
+    *(f"scale_factor_{a}" for a in "xyz"),
+    *(f"misalignment_{ij}" for ij in ("yx", "zx", "zy")),
+]
+
+
+def soaks(attitudes, offset=0.0):
+    """Tables of attitudes at five temperatures; `offset` moves all biases of the third, g."""
+    rng = np.random.default_rng(41)
+    triad, made = reference.Triad(rng), []
+    for number, at in enumerate((-20, 0, 20, 40, 60)):
+        moved = np.full(3, offset * G * (number == 2))
+        outputs = np.array([triad.output(G * u, at, moved) for u in reference.directions(rng, attitudes)])
+        outputs += NOISE * G * rng.standard_normal(outputs.shape)
+        columns = {f"accel_{a}": outputs[:, k] for k, a in enumerate("xyz")}
+        columns |= {f"std_accel_{a}": np.full(attitudes, NOISE * G) for a in "xyz"}
+        units = dict.fromkeys(columns, "m/s^2") | {"temperature": "degC"}
+        columns["temperature"] = np.full(attitudes, float(at))
+        made.append(il.Recording(columns, units, {"gravity": f"{G} m/s^2"}, f"soak_{number}"))
+    return triad, made
+
+
+def report_of(record, folder):
+    il.write_report(record, folder / "r.html")
+    return (folder / "r.html").read_text(encoding="utf-8")
+
+
+def test_each_equals_the_tumble_calibration_of_its_recording():
+    _, given = soaks(24)
+    record = il.fit_thermal(given, degrees="3,2,1", gravity=f"{G}+-0").calibration
+    alone = record.data["calibrations"]
+    assert alone["recording"] == [each.name for each in given]
+    assert alone["temperature"] == [-20, 0, 20, 40, 60]
+    for row, u, recording in zip(alone["values"], alone["standard_uncertainty"], given, strict=True):
+        tumble = il.fit_tumble(recording, order=1, gravity=f"{G}+-0").calibration
+        expected = np.array([tumble.value(name) for name in NAMES])
+        stated = np.sqrt(np.diag(tumble.cov(*NAMES)))
+        assert np.abs((np.array(row) - expected) / stated).max() < 0.05
+        # A tumble test estimates the scatter of its attitudes from these alone.
+        np.testing.assert_allclose(u, stated, rtol=0.3)
+
+
+def test_each_is_the_truth_within_its_uncertainty_whatever_its_power_cycle_did(tmp_path):
+    triad, given = soaks(24, offset=3e-4)
+    record = il.fit_thermal(given, degrees="3,2,1", gravity=f"{G}+-0").calibration
+    alone = record.data["calibrations"]
+    truth = np.array([np.concatenate(triad.at(at)) for at in alone["temperature"]])
+    truth[:, :3] += np.outer(np.arange(5) == 2, np.full(3, 3e-4 * G))
+    standard = (np.array(alone["values"]) - truth) / np.array(alone["standard_uncertainty"])
+    assert 18 < (standard**2).sum() < 85  # chi-square of 45: 1 in 10,000 either way
+    assert "Points: what each recording at a steady temperature gives alone" in report_of(record, tmp_path)
+
+
+def test_too_few_attitudes_give_none(tmp_path):
+    record = il.fit_thermal(soaks(8)[1], degrees="1,0,0").calibration
+    assert "calibrations" not in record.data
+    assert "Points: what each" not in report_of(record, tmp_path)
+
+
+def test_scale_factors_of_gyroscopes_are_drawn_over_temperature(tmp_path):
+    made = il.simulate_thermal((-20, 0, 20, 40, 60), attitudes=14, gyro=True, seed=3)
+    record = il.fit_thermal(list(made), with_="gyro").calibration
+    at = np.array(record.model["range"])
+    values, u = gyro_scale_predicted(record, at)
+    for k, axis in enumerate("xyz"):
+        names = [n for n in record.parameters if n.startswith(f"gyro_scale_factor_{axis}")]
+        powers = (at - record.model["reference_temperature"]["value"])[:, None] ** np.arange(len(names))
+        np.testing.assert_allclose(values[k], powers @ [record.value(n) for n in names], rtol=1e-12)
+        expected = np.sqrt(np.einsum("ni,ij,nj->n", powers, record.cov(*names), powers))
+        np.testing.assert_allclose(u[k], expected, rtol=1e-6)
+    assert "Scale factor of the gyroscopes over temperature" in report_of(record, tmp_path)
