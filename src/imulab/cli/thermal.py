@@ -173,7 +173,16 @@ def fit(
     finish(run_task("thermal", files, options, GivenFiles()), output, report, json=json)
 
 
-_OF_THE_CHECK = ("gravity", "latitude", "height", "tilt", "turn_on_scatter", "settle", "temperature_column")
+_OF_THE_CHECK = (
+    "gravity",
+    "latitude",
+    "height",
+    "tilt",
+    "turn_on_scatter",
+    "gyro_turn_on_scatter",
+    "settle",
+    "temperature_column",
+)
 
 
 @with_options((*(option for option in OPTIONS if option.name in _OF_THE_CHECK), *READ))

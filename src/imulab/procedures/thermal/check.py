@@ -8,20 +8,19 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.errors import DataError, OptionError, RecordError, UnitError
-from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.result import Drawn
 from imulab.procedures.thermal.checks import check_holds, prepared
-from imulab.procedures.thermal.degrees import tail
+from imulab.procedures.thermal.gyrocheck import GyroCheck, check_gyros
 from imulab.procedures.thermal.holds import Holds, find_holds
 from imulab.procedures.thermal.model import Laws, forces
+from imulab.procedures.thermal.parted import parted
 from imulab.procedures.thermal.record import of_record
-from imulab.procedures.thermal.rows import Problem, Rows, linearise, together
+from imulab.procedures.thermal.rows import Problem, linearise, together
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.quantities import in_si
 from imulab.recording import Array, Recording
@@ -32,7 +31,6 @@ from imulab.verdict import Note
 
 FALSE_ALARM = 0.05
 _BEYOND = 1.0  # K outside the record's range: its laws say nothing there
-_SEEN = 1e-6
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,6 +54,8 @@ class ThermalCheck(Drawn):
         Largest ``| |f| - g |`` that passes, m/s^2; None: the test alone decides.
     notes
         What a user must know of the test, a sentence each.
+    gyro
+        The gyroscopes' outputs at rest under the record's laws; None where the record or the recordings have none.
     """
 
     holds: Holds
@@ -66,6 +66,7 @@ class ThermalCheck(Drawn):
     gravity: Gravity
     limit: float | None
     notes: tuple[str, ...]
+    gyro: GyroCheck | None = None
 
     subject: ClassVar[str] = "Thermal check"
 
@@ -84,8 +85,9 @@ class ThermalCheck(Drawn):
 
     @property
     def probability(self) -> float:
-        """Of the less likely of the two tests, as one of two (Bonferroni)."""
-        made = [p for p in (self.within, self.between) if p is not None]
+        """Of the least likely of the tests, as one of so many (Bonferroni)."""
+        gyro = [] if self.gyro is None else [self.gyro.within, self.gyro.between]
+        made: list[float] = [p for p in (self.within, self.between, *gyro) if p is not None]
         return min([1.0, *(len(made) * p for p in made)])
 
     @property
@@ -110,6 +112,7 @@ def check_thermal(
     height: float | str | None = None,
     tilt: float | str = "0.2 mrad",
     turn_on_scatter: float | str | None = None,
+    gyro_turn_on_scatter: float | str | None = None,
     settle: float | str | None = None,
     temperature_column: str | None = None,
     **reading: Unpack[Reading],
@@ -119,7 +122,7 @@ def check_thermal(
     ``r' V^-1 r`` with r the residuals ``|f| - g`` under the record and V the covariance from noise, laws, temperature
     and the offsets of a power cycle. It is parted into what all holds of a recording have in common, as an offset of
     the biases (F, since few power cycles told their scatter), and the rest (chi-square); a record that holds fails
-    once in twenty tests.
+    once in twenty tests. The gyroscopes of a record that has them are tested in the same way, by their outputs at rest.
 
     Parameters
     ----------
@@ -135,6 +138,8 @@ def check_thermal(
         Standard deviation of the direction of a hold in which the temperature drifts, rad.
     turn_on_scatter
         Standard deviation of each bias from one power cycle to the next, m/s^2; that of the record if not given.
+    gyro_turn_on_scatter
+        The same of the gyroscopes' biases, rad/s.
     settle, temperature_column
         As for `fit_thermal`; the column as in the record's fit if not given.
     reading
@@ -179,16 +184,16 @@ def check_thermal(
     check_holds(holds, local.value, conversion_factor(unit, "m/s^2") if unit in ("m/s^2", "g", "mg") else None)
     leaning, tau = _sizes(tilt, turn_on_scatter, held, local.value)
     rank = None if tau is None else 0 if turn_on_scatter is not None else thermal_of(held).fit.between_recordings.rank
-    tested = _tested(held, holds, local, leaning, tau, rank)
+    tested, force = _tested(held, holds, local, leaning, tau, rank)
     if tau is None:
         notes.append(
             "the record does not say how far biases move from one power cycle to the next, so an offset that a whole "
             "recording has in common is not tested: state --turn-on-scatter"
         )
-    if thermal_of(held).model.gyro is not None:
-        notes.append(Note("the record's accelerometers alone are tested, not its gyroscopes"))
+    gyro, said = check_gyros(held, holds, force, gyro_turn_on_scatter)
+    notes += said
     notes += [*([local.note] if local.note else []), *_known(held, given)]
-    return ThermalCheck(holds, *tested, local, largest, tuple(notes))
+    return ThermalCheck(holds, *tested, local, largest, tuple(notes), gyro)
 
 
 def _in_unit_of(record: Calibration, recording: Recording) -> Recording:
@@ -288,8 +293,8 @@ def _known(record: Calibration, recordings: Sequence[Recording]) -> list[str]:
 
 def _tested(
     record: Calibration, holds: Holds, gravity: Gravity, tilt: float, tau: float | None, rank: int | None
-) -> tuple[Array, Array, float | None, float | None]:
-    """Return residuals and their uncertainties, m/s^2, and the probabilities of the two tests."""
+) -> tuple[tuple[Array, Array, float | None, float | None], Array]:
+    """Return residuals, their uncertainties, m/s^2, and the probabilities of the two tests; and f, g, shape (n, 3)."""
     g, fit = gravity.value, thermal_of(record).fit
     laws, coefficients, covariance, scale, common = of_record(record, g, gravity.standard_uncertainty)
     problem = Problem(
@@ -303,10 +308,11 @@ def _tested(
     jacobian = rows.jacobian[:, : laws.size]
     whole = together(rows, excess, np.array([tau or 0.0, of_scale])) + jacobian @ covariance @ jacobian.T
     whole += common * np.outer(rows.magnitude, rows.magnitude)
-    within, between = _parted(rows, whole, noise, laws, rank)
+    within, between = parted(rows, whole, noise, rows.jacobian[:, laws.size :], rank)
     order = np.argsort(rows.owner[rows.magnitude])
     own = g * np.sqrt(np.diag(whole)[rows.magnitude])[order]
-    return g * rows.residual[rows.magnitude][order], own, within, between
+    force, _ = forces(laws.design(problem.temperature) @ coefficients, problem.reading)
+    return (g * rows.residual[rows.magnitude][order], own, within, between), force
 
 
 def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
@@ -315,44 +321,4 @@ def _directions(problem: Problem, laws: Laws, coefficients: Array) -> Array:
     count = int(problem.group.max(initial=-1)) + 1
     found = np.array([force[problem.group == k].mean(axis=0) for k in range(count)]).reshape(-1, 3)
     found /= np.linalg.norm(found, axis=1)[:, None]
-    return found
-
-
-def _parted(rows: Rows, whole: Array, noise: Array, laws: Laws, rank: int | None) -> tuple[float | None, float | None]:
-    """Return the probabilities of the residuals within recordings, and of what each has in common as an offset.
-
-    `rank` is that of the offsets that told the scatter between power cycles, 0 where it was stated; where it is None
-    nothing is known of it, and what is in common is not tested.
-    """
-    from scipy.linalg import solve_triangular
-
-    factor = np.linalg.cholesky(whole)
-
-    def white(columns: Array) -> Array:
-        found: Array = solve_triangular(factor, columns, lower=True, check_finite=False)
-        return found
-
-    turns = _basis(white(rows.jacobian[:, laws.size :]))
-    offsets = white(rows.offsets[0])
-    offsets = _basis(offsets - turns @ (turns.T @ offsets))
-    residual = white(rows.residual)
-    residual = residual - turns @ (turns.T @ residual)
-    shared = offsets.T @ residual
-    rest, spare = residual - offsets @ shared, len(residual) - turns.shape[1] - offsets.shape[1]
-    within = chi_square_probability(float(rest @ rest), spare) if spare else None
-    if rank is None or not len(shared):
-        return within, None
-    inner = white(white(noise).T)
-    share = 1 - float(np.trace(offsets.T @ inner @ offsets)) / len(shared)
-    freedom = rank / max(share, 1e-3) ** 2 if rank else np.inf
-    return within, tail(float(shared @ shared) / len(shared), len(shared), freedom)
-
-
-def _basis(columns: Array) -> Array:
-    """Return an orthonormal basis of the columns, shape (n, rank)."""
-    if not columns.shape[1]:
-        return columns
-    u, values, _ = np.linalg.svd(columns, full_matrices=False)
-    kept: NDArray[np.bool_] = values > _SEEN * max(float(values[0]), 1e-300)
-    found: Array = u[:, kept]
     return found

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imulab._version import VERSION
+from imulab.procedures.thermal.gyrofigures import own_points
+from imulab.procedures.thermal.model import AXES
 from imulab.records.calibration import Calibration
 from imulab.report import render_page
-from imulab.report.elements import BAD, GOOD, QUIET, Exhibits, Figure, ReportTable
+from imulab.report.elements import BAD, GOOD, LEGEND, QUIET, Exhibits, Figure, ReportTable
 from imulab.report.traces import axis, rounded, scatter
 from imulab.units import from_si
 from imulab.verdict import Bad, Note, verdict_of
@@ -30,18 +32,23 @@ def _p(value: float | None) -> str:
     return "not tested" if value is None else f"p = {value:.2g}" if value >= 1e-12 else "p below 1e-12"
 
 
+_SAID = (
+    "|f| differs from g between attitudes or temperatures by more than the record explains",
+    "an offset that whole recordings have in common is larger than power cycles explain",
+    "the gyroscopes at rest differ between attitudes or temperatures by more than the record explains",
+    "an offset of the gyroscopes that whole recordings have in common is larger than power cycles explain",
+)
+
+
 def meaning(check: ThermalCheck) -> str:
     """Return what the test says, in words."""
     if check.passed:
         return "the recordings agree with the record"
     if check.probability >= 0.05:
         return "no change of the unit is shown, but a hold is beyond the limit"
-    common = check.between is not None and (check.within is None or check.between < check.within)
-    what = (
-        "an offset that whole recordings have in common is larger than power cycles explain"
-        if common
-        else "|f| differs from g between attitudes or temperatures by more than the record explains"
-    )
+    gyro = check.gyro
+    each = (check.within, check.between, *((gyro.within, gyro.between) if gyro else ()))
+    what = _SAID[int(np.argmin([2.0 if p is None else p for p in each]))]
     return f"{what}: the unit has changed since the record was made, or gravity, unit or temperature are not as assumed"
 
 
@@ -58,6 +65,13 @@ def as_text(check: ThermalCheck, verdict: str) -> str:
         f"{_p(check.probability)} over {len(check.holds)} holds (within recordings {_p(check.within)}, common to each "
         f"{_p(check.between)}), largest |f| - g {_ug(check.residuals[worst])} ug ({check.holds.label(worst)})"
     )
+    if check.gyro is not None:
+        gyro, (row, k) = check.gyro, check.gyro.worst
+        lines.append(
+            f"gyroscopes: within recordings {_p(gyro.within)}, common to each {_p(gyro.between)}, largest law less "
+            f"output {_hourly(gyro.residuals[row, k]):+.3g} ± {_hourly(gyro.standard_uncertainty[row, k]):.2g} deg/h "
+            f"({AXES[k]}, {check.holds.label(int(gyro.holds[row]))})"
+        )
     pairs = zip(check.residuals.tolist(), check.standard_uncertainty.tolist(), strict=True)
     for index, (value, u) in enumerate(pairs):
         beyond = "  beyond the limit" if check.limit is not None and abs(value) > check.limit else ""
@@ -81,7 +95,21 @@ def as_json(check: ThermalCheck) -> dict[str, Any]:
             {"label": check.holds.label(k), "temperature": at, "residual": value, "standard_uncertainty": u}
             for k, (at, value, u) in enumerate(rows)
         ],
+        **({} if check.gyro is None else {"gyro": _gyro_as_json(check)}),
         "notes": [str(note) for note in check.notes],
+    }
+
+
+def _gyro_as_json(check: ThermalCheck) -> dict[str, Any]:
+    gyro = check.gyro
+    assert gyro is not None
+    rows = zip(gyro.holds.tolist(), gyro.residuals.tolist(), gyro.standard_uncertainty.tolist(), strict=True)
+    return {
+        "p_within": gyro.within,
+        "p_between": gyro.between,
+        "holds": [
+            {"label": check.holds.label(k), "residual": residual, "standard_uncertainty": u} for k, residual, u in rows
+        ],
     }
 
 
@@ -95,6 +123,14 @@ def exhibits_of_check(check: ThermalCheck) -> Exhibits:
                 ("p, if nothing changed", check.probability),
                 ("p within recordings", check.within),
                 ("p of what each has in common", check.between),
+                *(
+                    (
+                        ("gyroscopes: p within recordings", check.gyro.within),
+                        ("gyroscopes: p of what each has in common", check.gyro.between),
+                    )
+                    if check.gyro
+                    else ()
+                ),
             )
         ),
         ("largest |f| − g", worst),
@@ -110,7 +146,11 @@ def exhibits_of_check(check: ThermalCheck) -> Exhibits:
         ["hold", "|f| − g, µg", "u, µg", "(|f| − g) / u"],
         rows,
     )
-    return Exhibits(f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}.", facts, [_figure(check), table])
+    return Exhibits(
+        f"{'Pass' if check.passed else 'Fail'}: {meaning(check)}.",
+        facts,
+        [_figure(check), *([_gyro_figure(check)] if check.gyro else []), table],
+    )
 
 
 def _figure(check: ThermalCheck) -> Figure:
@@ -134,6 +174,33 @@ def _figure(check: ThermalCheck) -> Figure:
         traces=traces,
         layout={"xaxis": axis("temperature, degC"), "yaxis": axis("|f| − g, µg", zeroline=True), "showlegend": False},
     )
+
+
+def _gyro_figure(check: ThermalCheck) -> Figure:
+    gyro = check.gyro
+    assert gyro is not None
+    at = check.holds.temperature[gyro.holds]
+    residual, u = (from_si(values, "deg/h") for values in (gyro.residuals, gyro.standard_uncertainty))
+    far = int((np.abs(residual) > _BEYOND * u).sum())
+    traces = [
+        own_points(at, residual[:, k], _BEYOND * u[:, k], k, name) | {"name": name, "showlegend": True}
+        for k, name in enumerate(AXES)
+    ]
+    return Figure(
+        title="The gyroscopes at rest under the record, over temperature",
+        message=f"{far} of {residual.size} outputs lie beyond twice the standard uncertainty.",
+        caption="Bars: twice the standard uncertainty, from laws, power cycle, temperature, Earth's rate and noise.",
+        traces=traces,
+        layout={
+            "xaxis": axis("temperature, degC"),
+            "yaxis": axis("law less output, deg/h", zeroline=True),
+            "legend": LEGEND,
+        },
+    )
+
+
+def _hourly(rate: float) -> float:
+    return float(from_si(float(rate), "deg/h"))
 
 
 def check_page(

@@ -120,6 +120,7 @@ def _fit(gyros: Gyroscopes, *, known: bool) -> dict[str, Any]:
         "between_recordings": {
             "bias": {"value": float(solution.scatter.tau[0]), "unit": "rad/s"},
             "rank": solution.scatter.rank,
+            "resolution": {"value": solution.scatter.resolution, "unit": "rad/s"},
             "from": "argument" if known else "recordings" if solution.scatter.rank else "unknown",
         },
         "g_sensitivity_probability": gyros.probability,

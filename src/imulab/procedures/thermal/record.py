@@ -237,7 +237,7 @@ def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[s
         "bias": {"value": g * float(scatter.tau[0]), "unit": "m/s^2"},
         "scale_factor": {"value": float(scatter.tau[1]), "unit": "1"},
         "rank": scatter.rank,
-        "resolution": {"value": g * float(np.sqrt(max(scatter.spread[0] - scatter.tau[0] ** 2, 0.0))), "unit": "m/s^2"},
+        "resolution": {"value": g * scatter.resolution, "unit": "m/s^2"},
         "from": "argument" if known else told,
     }
 

@@ -124,6 +124,7 @@ class GyroTurnOn(Part):
     bias: Length
     rank: int
     from_: str
+    resolution: Length | None = None
 
 
 class GyroTurns(Part):

@@ -44,6 +44,11 @@ class Scatter:
     probability: float | None = None
     bound: bool = False
 
+    @property
+    def resolution(self) -> float:
+        """Standard uncertainty of one offset of a bias, as the recordings tell it."""
+        return float(np.sqrt(max(self.spread[0] - self.tau[0] ** 2, 0.0)))
+
 
 @dataclass(frozen=True)
 class Solution:
