@@ -9,6 +9,7 @@ import numpy as np
 
 from imulab.estimation.least_squares import coverage_factor
 from imulab.gravity import Gravity, gravity_findings
+from imulab.procedures.thermal.agreement import disagreements
 from imulab.procedures.thermal.calibrations import Own, own_calibrations
 from imulab.procedures.thermal.degrees import Found, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
@@ -24,8 +25,6 @@ from imulab.verdict import Note
 _STANDS_OUT = 5.0
 _MOST_NAMED = 6
 _WORSE = 3.0
-_MOVES = (0.01, 0.005)
-"""What biases (g) and scale factors hardly move by from one power cycle to the next."""
 _SAME = 1e-9
 """Of two values of gravity that are one."""
 _GAUGE = "x input axis along body x, y input axis in the body xy plane, at every temperature"
@@ -78,7 +77,7 @@ def make_record(
         | _alone(own_calibrations(problem, solution), holds, np.append(np.full(3, g), scale / g)),
         sensor=sensor,
         sources=sources,
-        warnings=tuple(_findings(holds, found, drift, gravity, options, name)),
+        warnings=tuple(_findings(holds, problem, found, drift, gravity, options, name)),
     )
 
 
@@ -182,23 +181,6 @@ def _factors(laws: Laws, gravity: float, scale: Array) -> tuple[Array, Array]:
     return np.repeat(each, counts), np.repeat(np.repeat([1.0, -1.0, 0.0], 3), counts)
 
 
-def _unlike(solution: Solution, name: str) -> list[str]:
-    """Return what says that recordings are hardly of one unit, mounted alike: a scatter that no power cycle makes."""
-    bias, scale = solution.scatter.tau.tolist()
-    found = [
-        text
-        for size, text in (
-            (bias / _MOVES[0], f"biases by {1e3 * bias:.3g} mg"),
-            (scale / _MOVES[1], f"scale factors by {100 * scale:.2g} %"),
-        )
-        if size > 1
-    ]
-    return [
-        f"{name}: from one recording to the next {' and '.join(found)} differ, which no power cycle does: are all of "
-        "one unit, its axes named alike, its temperatures by one thermometer?"
-    ] * bool(found)
-
-
 def of_record(record: Calibration, gravity: float, uncertainty: float) -> tuple[Laws, Array, Array, Array, float]:
     """Return the laws of a record with coefficients and covariance in units of g, the outputs' scale, per g.
 
@@ -243,7 +225,7 @@ def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[s
 
 
 def _findings(
-    holds: Holds, fitted: Found, drift: Drift, gravity: Gravity, options: Mapping[str, Any], name: str
+    holds: Holds, problem: Problem, fitted: Found, drift: Drift, gravity: Gravity, options: Mapping[str, Any], name: str
 ) -> list[str]:
     solution = fitted.solution
     found = [*(note for r in holds.recordings for note in r.notes), *holds.notes]
@@ -261,7 +243,7 @@ def _findings(
                 "scatter between power cycles, an upper bound: come back to temperatures to learn more"
             )
         )
-    found += _unlike(solution, name)
+    found += disagreements(holds, problem, solution, name)
     if options["degrees"] == "auto" and not solution.laws.degrees[0] and solution.scatter.tau[0] > 0:
         found.append(
             f"{name}: the recordings' biases differ by {1e3 * solution.scatter.tau[0]:.2g} mg (standard deviation); so "
