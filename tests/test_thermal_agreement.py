@@ -87,3 +87,9 @@ def test_temperatures_above_what_sensors_bear_are_asked_about(tmp_path, capsys):
     assert main(["thermal", "fit", *files, "-o", str(tmp_path / "t.json")]) == 0
     said = capsys.readouterr().err
     assert "temperatures up to 140 degC, above what sensors are rated to: are these degrees Fahrenheit?" in said
+
+
+def test_a_simulation_without_a_recording_is_refused(tmp_path, capsys):
+    assert main(["thermal", "simulate", "--attitudes", "0", "-o", str(tmp_path / "none")]) == 2
+    assert "attitudes 0, ramps 0: make no recording" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()

@@ -109,6 +109,8 @@ def simulate_thermal(
             raise OptionError(f"{name} {value:g}: expected {low:g} to {high:g}")
     if not all(-100 <= t <= 150 for t in made.temperatures):
         raise OptionError(f"temperatures {made.temperatures}: expected -100 to 150 degC")
+    if not len(made):
+        raise OptionError("attitudes 0, ramps 0: make no recording; expected one attitude or one ramp at least")
     return made
 
 
