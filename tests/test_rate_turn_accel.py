@@ -8,6 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
+from imulab.procedures.rate.turnaxes import _scattered
 from reference import rate as reference
 from test_rate_accel import ARM, BIAS, SCALE, TURN, accel
 
@@ -105,3 +106,15 @@ def test_what_cannot_be_is_refused_in_a_line(name, accel):
     with pytest.raises(il.ImulabError, match=said) as refused:
         call(accel)
     assert "\n" not in str(refused.value)
+
+
+def test_turns_without_noise_state_what_is_left_and_divide_by_nothing():
+    count = np.array([3.0, -3.0, 5.0])
+    left = np.array([[0.0, 1e-6, 2e-16], [0.0, -2e-6, 0.0], [0.0, 1e-6, 0.0]])
+    with np.errstate(all="raise"):
+        found = _scattered(left, count, np.zeros((3, 3)))
+    assert (found > 0).all()
+    assert (found[[0, 2]] < 1e-11).all()
+    # no weights but the turns made, which the least uncertainty follows: chi-square of left / count
+    chi = np.sqrt(np.sum((left[:, 1] / count) ** 2) / 2)
+    assert found[1] == pytest.approx(chi * np.sqrt(np.sum(count**4)) / np.sum(count**2), rel=1e-9)

@@ -18,6 +18,7 @@ _BINS, _LEAST = 20, 10
 _BATCHES = 32
 _POWER, _SINE, _BESIDE = 0.999, 0.998, 3
 _PER_PERIOD = 16
+_BESIDE_NOISE = 8
 _SMOOTH = 0.02
 _LONGEST = 1 << 17
 _SHOWN = 3.0
@@ -122,7 +123,11 @@ def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> t
     along = felt - felt.mean()
     share = of_drift * float(trend @ along) / float(along @ along) / float(np.ptp(values) / np.ptp(felt))
     sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, share)))
-    return sweep, _by_rate(at, felt, kept, matrix, fits, step)
+    binned = _by_rate(at, felt, kept, matrix, fits, step)
+    if sweep.frequency is not None:
+        largest = float(np.abs(felt).max())
+        binned = replace(binned, variance=binned.variance * _colour(matrix, kept, fits, binned, largest))
+    return sweep, binned
 
 
 def _spectrum(rate: Array, step: float) -> tuple[float, float | None]:
@@ -236,6 +241,33 @@ def _covariance(matrix: Array, normal: Array, left: Array) -> Array:
     scores = np.add.reduceat(matrix * left[:, None], edges, axis=0)
     wide = _BATCHES / (_BATCHES - 1)  # the scores of all batches add up to zero
     return np.asarray(normal @ (scores.T @ scores * wide) @ normal)
+
+
+def _colour(matrix: Array, outputs: list[Array], fits: Array, binned: Binned, largest: float) -> Array:
+    """Return by what to multiply the variances of means by rate, as if independent, for noise that has a colour.
+
+    What enters the scale factor at one frequency is the noise near that frequency. With d the rate, over its largest,
+    freed of the columns of bias, drift and square, and D and R the spectra of d and of what the fit left, the variance
+    of the slope is ``mean(|D|^2 |R|^2) / (d d)^2``, |R|^2 averaged over the frequencies beside each. The fit took
+    from R about one frequency; without that correction the mean over 2 n + 1 of them would be low by 1 / (2 n + 1).
+    """
+    others = matrix[:, [0, 1, 3]]
+    along = matrix[:, 2] - others @ (np.linalg.pinv(others.T @ others) @ (others.T @ matrix[:, 2]))
+    size = len(along)
+    lines = np.abs(np.fft.rfft(along)) ** 2
+    lines /= lines.sum()
+    window = np.ones(2 * _BESIDE_NOISE + 1)
+    count = np.convolve(np.ones(len(lines) - 1), window, mode="same") - 1  # none at frequency 0
+    length = binned.duration
+    apart = binned.rate - length @ binned.rate / length.sum()
+    factors = []
+    for k, output in enumerate(outputs):
+        power = np.abs(np.fft.rfft(output - matrix @ fits[:, k]))[1:] ** 2
+        beside = np.convolve(power, window, mode="same") / count / size
+        variance = float(lines[1:] @ beside) / float(along @ along) / largest**2
+        each = float(np.mean(binned.variance[:, k] * length))  # pooled, for 1 s
+        factors.append(variance * float(length @ apart**2) / each if each > 0 else 1.0)
+    return np.array(factors)
 
 
 def _by_rate(time: Array, felt: Array, outputs: list[Array], matrix: Array, fits: Array, step: float) -> Binned:

@@ -30,6 +30,7 @@ _SMOOTH = 0.05  # s
 _BATCHES = 8
 _FACE = np.cos(np.radians(30))
 _CHANCE = 0.01
+_EXACT = 1e-12
 
 
 def check_accel(accel: Calibration, recording: Recording) -> None:
@@ -147,6 +148,7 @@ def _by_count(direction: Array, count: Array) -> Array:
 
 def _scattered(left: Array, count: Array, noise: Array) -> Array:
     """Return the uncertainty of slopes over turns made, of three gyroscopes; by the scatter where it exceeds noise."""
+    noise = np.maximum(noise, _EXACT * np.abs(count)[:, None])  # data without noise leave rounding
     variance = (count**2 @ noise**2) / (count @ count) ** 2
     freedom = len(count) - 1
     if not freedom:
