@@ -25,6 +25,7 @@ PARTS = {
     "peers": "The same tasks call by call with peers",
     "growth": "Growth",
     "recordings": "Recordings",
+    "thermal": "Thermal",
     "warmup": "Warm-up",
     "fleet": "Fleet",
     "accuracy": "Accuracy and real recordings",
