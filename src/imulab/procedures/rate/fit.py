@@ -19,7 +19,7 @@ from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
 from imulab.procedures.rate.orders import choose_orders
 from imulab.procedures.rate.parameters import g_sensitivity
-from imulab.procedures.rate.prior import with_prior
+from imulab.procedures.rate.prior import prior_at, with_prior
 from imulab.procedures.rate.record import make_record
 from imulab.procedures.rate.simulate import RateRecordings
 from imulab.procedures.rate.solve import Problem, Solution, solve, without_lean
@@ -91,7 +91,8 @@ def fit_rate(
         Record of `fit_tumble` of the same unit or its file, whose ``accel_*`` are in each recording: they tell the
         table axis in the body, and the result is a record of both triads.
     prior
-        Earlier record of the same gyroscopes, or its file: both are one fit, and the record says whether they agree.
+        Earlier record of the same gyroscopes, or its file: both are one fit, and the record says whether they agree. A
+        thermal record is one at the mean temperature of the recordings.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 
@@ -180,7 +181,7 @@ def fit_test(
         linearity[AXES[problem.gyros[i]]] = linearity_of(_upright(problem, solution), i, scale, orders[i])
     record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
     if prior is not None:
-        record = with_prior(record, prior, str(record.model["frame"]))
+        record = with_prior(record, prior_at(prior, recordings), str(record.model["frame"]))
     if accel is not None:
         record = with_accelerometers(accel, record)
     return RateFit(record, tuple(dwells), linearity)

@@ -7,7 +7,7 @@ clock is common to both, and no average makes it smaller.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,9 +16,10 @@ import numpy as np
 from imulab.errors import DataError, RecordError
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
 from imulab.procedures.rate.choices import AXES
-from imulab.recording import Array
+from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import compared
+from imulab.units import parse_unit
 from imulab.verdict import Note
 
 _KINDS = ("gyro_bias", "gyro_scale_factor", "gyro_misalignment", "gyro_g_sensitivity", "gyro_k")
@@ -81,6 +82,29 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
         warnings=(*record.warnings, _said(comparison.probability, comparison.changes)),
     )
     return with_accelerometers(prior, found) if frame is None and "bias_x" in prior.parameters else found
+
+
+def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration:
+    """Return a prior as it is at the mean temperature of the recordings, where it is a thermal record.
+
+    Raises
+    ------
+    RecordError
+        Their temperature is not known, or outside the record's range, or the record holds no scale factors.
+    """
+    if prior.procedure != "thermal":
+        return prior
+    from imulab.procedures.thermal.prior import gyros_at_temperature
+
+    known = [
+        float(np.nanmean(one.si("temperature")))
+        for one in recordings
+        if "temperature" in one
+        and parse_unit(one.units["temperature"]).quantity == "temperature"
+        and np.isfinite(one.si("temperature")).any()
+    ]
+    whole = float(np.mean(known)) if len(known) == len(recordings) else None
+    return gyros_at_temperature(prior, whole, recordings[0].name)
 
 
 def _order(parameters: Mapping[str, Parameter]) -> int:

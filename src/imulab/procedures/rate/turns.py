@@ -18,7 +18,7 @@ from imulab.estimation.least_squares import chi_square_probability
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
 from imulab.procedures.rate.choices import AXES, FENCE, gyros_of
-from imulab.procedures.rate.prior import with_prior
+from imulab.procedures.rate.prior import prior_at, with_prior
 from imulab.procedures.rate.turnaxes import check_accel, with_axes
 from imulab.procedures.rate.turnrecord import turns_record
 from imulab.procedures.rate.turnrests import Motions, carried, composed, find_motions
@@ -119,7 +119,8 @@ def fit_turns(
         ``accel_*`` tell the axes of the turns, and the result is a record of both triads, with misalignments.
     prior
         Earlier record of the same gyroscopes, of `fit_gyro` or of a rate test, or its file: both are one fit. The
-        record says whether they agree, and holds what turns do not show as the prior has it.
+        record says whether they agree, and holds what turns do not show as the prior has it. A thermal record is one at
+        the mean temperature of the recording.
     reading
         How data are to be understood: `rate` or `time`, `unit`; `layout`, `topic`, `instance`, `window`, `element`.
 
@@ -175,7 +176,7 @@ def fit_turns(
         record = with_axes(record, recording, motions, found, held)
     if prior is not None:
         frame = None if held is None else BY_ACCELEROMETERS
-        record = with_prior(record, as_record(prior, "fit_turns: prior"), frame)
+        record = with_prior(record, prior_at(as_record(prior, "fit_turns: prior"), [recording]), frame)
     if held is not None:
         record = with_accelerometers(held, record)
     return TurnsFit(record, found)
