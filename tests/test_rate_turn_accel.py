@@ -118,3 +118,24 @@ def test_turns_without_noise_state_what_is_left_and_divide_by_nothing():
     # no weights but the turns made, which the least uncertainty follows: chi-square of left / count
     chi = np.sqrt(np.sum((left[:, 1] / count) ** 2) / 2)
     assert found[1] == pytest.approx(chi * np.sqrt(np.sum(count**4)) / np.sum(count**2), rel=1e-9)
+
+
+def test_an_earlier_record_of_both_triads_is_joined_to_turns_with_accelerometers(accel):
+    """Two alike tests as one have the mean of their scale factors, 1 / sqrt(2) as sure."""
+    how = {"counts": (1, -1, 1, -1), "noise": 1e-3, "force_noise": 0.01, "stops": 0.35}
+    first, second = (hand(**how, seed=seed) for seed in (11, 12))
+    prior, alone = (il.fit_turns(one, accel=accel).calibration for one in (first, second))
+    both = il.fit_turns(second, accel=accel, prior=prior).calibration
+    assert "bias_x" in both.parameters
+    assert any("the prior agrees" in warning for warning in both.warnings)
+    for i, a in enumerate("xyz"):
+        name = f"gyro_scale_factor_{a}"
+        weight = np.array([one.parameters[name].standard_uncertainty ** -2.0 for one in (prior, alone)])
+        mean = float(weight @ [prior.value(name), alone.value(name)] / weight.sum())
+        found = both.parameters[name]
+        assert found.value == pytest.approx(mean, abs=0.2 * found.standard_uncertainty)
+        assert found.standard_uncertainty == pytest.approx(weight.sum() ** -0.5, rel=0.1)
+        for k, b in enumerate("xyz"):
+            if i != k:
+                p = both.parameters[f"gyro_misalignment_{a}{b}"]
+                assert abs(p.value - TURN[i, k]) < 4 * p.standard_uncertainty
