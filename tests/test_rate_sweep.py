@@ -219,3 +219,40 @@ def test_sines_of_few_periods_state_the_error_of_their_scale_factor(frequency, p
         scores.append((scale.value * DEGREE - SCALE) / (scale.standard_uncertainty * DEGREE))
     # the root of a mean of 60 squares scatters by 0.09 about 1, and by 0.06 more as the noise is found from the run
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.33
+
+
+def test_a_simulated_sweep_gives_its_truth_back(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = il.simulate_rate("0,100", sweep="60 s", lag="6 ms", noise="0", rate="200 Hz", latitude="0 deg", seed=4)
+    fit = il.fit_rate(made, order=1).calibration
+    for name, value in made.truth.items():
+        if name.startswith(("gyro_scale_factor", "gyro_misalignment", "gyro_delay")):
+            size = 57.3 if "scale" in name else 1.0
+            assert fit.value(name) == pytest.approx(value, abs=1e-5 * size), name
+    for axis in "xyz":
+        assert fit.value(f"gyro_bandwidth_{axis}") == pytest.approx(1 / (2 * np.pi * 6e-3), rel=0.01)
+    words = [
+        "rate",
+        "simulate",
+        "-o",
+        "sweeps",
+        "--sweep",
+        "30s",
+        "--lag",
+        "5ms",
+        "--rate",
+        "200 Hz",
+        "--rates",
+        "0,80",
+    ]
+    assert main(words, project=False) == 0
+    assert "sweep = true" in (tmp_path / "sweeps" / "test.toml").read_text()
+    assert main(["rate", "fit", "sweeps/test.toml", "-o", "s.json"], project=False) == 0
+    record = json.loads((tmp_path / "s.json").read_text())["parameters"]
+    delay = record["gyro_delay_z"]
+    assert abs(delay["value"] - 5e-3) < 4 * delay["standard_uncertainty"]
+    capsys.readouterr()
+    for wrong, said in (("--sweep=5s", "sweep, rate: expected 20 s"), ("--lag=2s", "lag 2s: expected a time constant")):
+        assert main(["rate", "simulate", "-o", "no", "--sweep", "30s", wrong], project=False) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()

@@ -109,6 +109,8 @@ def simulate(
     loop: Annotated[str, typer.Option(help="Rising less falling at rate 0, a fraction of the largest rate.")] = "0",
     latitude: Annotated[str, typer.Option(help="Of the place, deg.")] = "48 deg",
     table: Annotated[str, typer.Option(help="Standard deviation of what all rates are off by, a fraction.")] = "0",
+    sweep: Annotated[str | None, typer.Option(help="A sine of 0.05 to 2 Hz in place of steps, so long, s.")] = None,
+    lag: Annotated[str, typer.Option(help="Time constant of the gyroscopes, s.")] = "0 s",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
     """Simulate a unit on a rate table, a file for each face and cycle, with their manifest test.toml, into a folder."""
@@ -116,7 +118,7 @@ def simulate(
 
     made = call(
         simulate_rate, rates=rates, faces=faces, cycles=cycles, hold=hold, noise=noise, rate=rate, bend=bend, loop=loop,
-        latitude=latitude, table=table, seed=seed,
+        latitude=latitude, table=table, sweep=sweep, lag=lag, seed=seed,
     )  # fmt: skip
     made.save(output)
     print(f"{output}: test.toml and {len(made.recordings)} recordings")

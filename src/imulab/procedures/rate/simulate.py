@@ -21,6 +21,8 @@ from imulab.units import from_si
 from imulab.writers import write_csv
 
 _ACCELERATION = np.radians(200.0)  # rad/s^2, of the table
+_LOWEST, _HIGHEST, _SHORTEST = 0.05, 2.0, 20.0  # Hz and s, of a sweep
+_FINER = 8
 _SCALE, _TILT, _ZERO = 5e-3, 3e-3, np.radians(0.3)
 
 
@@ -72,11 +74,13 @@ def simulate_rate(
     loop: float | str = "0",
     latitude: float | str = "48 deg",
     table: float | str = "0",
+    sweep: float | str | None = None,
+    lag: float | str = "0 s",
     seed: int | str = 1,
 ) -> RateRecordings:
     """Simulate a unit on a rate table: up through the rates, down, and the same the other way round, for each face.
 
-    ``M = S (s + k3 s^3 + loop) + S b``, ``s = T w``, with the Earth's rate in w.
+    ``M = S (s + k3 s^3 + loop) + S b``, ``s = T w``, with the Earth's rate in w; or a sweep in place of the steps.
 
     Parameters
     ----------
@@ -100,6 +104,10 @@ def simulate_rate(
         rad.
     table
         Standard deviation of what all rates of the table are off by, a fraction.
+    sweep
+        So long, s, a sine of the largest rate from 0.05 to 2 Hz in place of steps, with the table's rate recorded.
+    lag
+        Time constant of the gyroscopes, a first-order lag, s.
     seed
         Of the random numbers.
 
@@ -123,6 +131,11 @@ def simulate_rate(
     common, bent, split = fraction(table, "table"), fraction(bend, "bend"), fraction(loop, "loop")
     if sizes.size < 2 or not duration >= 1 or not 0 < period <= 0.1:
         raise OptionError("rates, hold, rate: expected two rates or more, a hold of 1 s or more, and 10 Hz or more")
+    swept, constant = None if sweep is None else in_si(sweep, "sweep", "time", "s"), in_si(lag, "lag", "time", "s")
+    if swept is not None and not (swept >= _SHORTEST and period <= 0.1 / _HIGHEST):
+        raise OptionError(f"sweep, rate: expected {_SHORTEST:g} s or longer, and {_HIGHEST / 0.1:g} Hz or more")
+    if not 0 <= constant <= 1:
+        raise OptionError(f"lag {lag}: expected a time constant of 0 to 1 s")
     rng = np.random.default_rng(whole(seed, "seed"))
     scale, zero = 1 + _SCALE * rng.standard_normal(3), _ZERO * rng.standard_normal(3)
     turn = np.eye(3) + _TILT * rng.standard_normal((3, 3)) * (1 - np.eye(3))
@@ -134,7 +147,9 @@ def simulate_rate(
     for word in words:
         for cycle in range(1, whole(cycles, "cycles") + 1):
             axis, sign = AXES.index(word[1]), 1.0 if word[0] == "+" else -1.0
-            time, table_rate, rising = _profile(way, duration, period)
+            time, table_rate, rising = (
+                _profile(way, duration, period) if swept is None else _sweep(float(sizes[-1]), swept, period)
+            )
             body = np.zeros((len(time), 3))
             body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(place))
             angle = np.cumsum(table_rate) * period
@@ -143,11 +158,12 @@ def simulate_rate(
             along = body @ turn.T
             along = along + k3 * along**3
             along[:, axis] += sign * split * sizes[-1] / 2 * rising * (1 - (table_rate / sizes[-1]) ** 2)
-            output = scale * (along + zero) + spread * rng.standard_normal(along.shape)
-            recordings.append(_recording(time, output, f"{'np'[sign > 0]}{word[1]}_{cycle}.csv"))
-            runs.append(Run(recordings[-1].name, word, tuple(way.tolist())))
+            output = scale * (_lagging(along, constant, period) + zero) + spread * rng.standard_normal(along.shape)
+            name = f"{'np'[sign > 0]}{word[1]}_{cycle}.csv"
+            recordings.append(_recording(time, output, name, None if swept is None else table_rate))
+            runs.append(Run(name, word, tuple(way.tolist()) if swept is None else None, sweep=swept is not None))
     test = RateTest(tuple(runs), common, 0.0, 0.0, place, name="test.toml")
-    return RateRecordings(test, tuple(recordings), _truth(scale, zero, turn, k3))
+    return RateRecordings(test, tuple(recordings), _truth(scale, zero, turn, k3, None if swept is None else constant))
 
 
 def _profile(way: Array, hold: float, period: float) -> tuple[Array, Array, Array]:
@@ -165,15 +181,40 @@ def _profile(way: Array, hold: float, period: float) -> tuple[Array, Array, Arra
     return time, np.asarray(table), np.asarray(step[np.minimum(part, len(step) - 1)])
 
 
-def _recording(time: Array, output: Array, name: str) -> Recording:
+def _sweep(largest: float, duration: float, period: float) -> tuple[Array, Array, Array]:
+    """Return time, the rate of a swept sine, whose frequency rises evenly, and whether it rises (1) or falls (-1)."""
+    time = np.asarray(np.arange(int(duration / period)) * period, dtype=np.float64)
+    phase = 2 * np.pi * (_LOWEST * time + (_HIGHEST - _LOWEST) * time**2 / (2 * duration))
+    return time, np.asarray(largest * np.sin(phase)), np.sign(np.cos(phase))
+
+
+def _lagging(rate: Array, constant: float, period: float) -> Array:
+    """Return what a first-order lag makes of smooth rates (n, 3), by straight lines between finer samples of them."""
+    if not constant:
+        return rate
+    from scipy.interpolate import CubicSpline
+    from scipy.signal import lfilter
+
+    step, count = period / _FINER, len(rate)
+    fine = CubicSpline(np.arange(count), rate)(np.arange(_FINER * (count - 1) + 1) / _FINER)
+    kept, mean = np.exp(-step / constant), -np.expm1(-step / constant) * constant / step
+    # The state before is that of a unit that has long turned at the first rate.
+    lagging, _ = lfilter([1 - mean, mean - kept], [1.0, -kept], fine, axis=0, zi=mean * fine[:1])
+    return np.asarray(lagging[::_FINER])
+
+
+def _recording(time: Array, output: Array, name: str, table: Array | None) -> Recording:
     columns = {"time": time, **{f"gyro_{a}": from_si(output[:, k], "deg/s") for k, a in enumerate(AXES)}}
+    if table is not None:
+        columns["table_rate"] = from_si(table, "deg/s")
     return Recording(columns, {key: "s" if key == "time" else "deg/s" for key in columns}, {"serial": "SIM"}, name=name)
 
 
-def _truth(scale: Array, zero: Array, turn: Array, k3: float) -> dict[str, float]:
+def _truth(scale: Array, zero: Array, turn: Array, k3: float, delay: float | None) -> dict[str, float]:
     found = {f"gyro_bias_{a}": float(zero[i]) for i, a in enumerate(AXES)}
     found |= {f"gyro_scale_factor_{a}": float(from_si(scale[i], "deg/s")) for i, a in enumerate(AXES)}
     found |= {
         f"gyro_misalignment_{a}{b}": float(turn[i, j]) for i, a in enumerate(AXES) for j, b in enumerate(AXES) if i != j
     }
+    found |= {} if delay is None else {f"gyro_delay_{a}": delay for a in AXES}
     return found | {f"gyro_k3_{a}": float(k3) for a in AXES}
