@@ -37,10 +37,10 @@ def accel():
     return dataclasses.replace(found, parameters=parameters)
 
 
-def whole(faces, lean=0.0, tilt=0.0, arm=ARM, noise=0.0, seed=1, accelerometers=True, leans=None):
+def whole(faces, lean=0.0, tilt=0.0, arm=ARM, noise=0.0, seed=1, accelerometers=True, leans=None, table=None):
     """A test of several runs, whose table axis leans by `lean` rad from each face."""
     rng, made, runs = np.random.default_rng(seed), [], []
-    table = reference.steps(WAY, 8.0, FREQUENCY)
+    table = reference.steps(WAY, 8.0, FREQUENCY) if table is None else table
     for number, face in enumerate(faces):
         axis = lean * rng.standard_normal(3) if leans is None else leans[number].copy()
         axis["xyz".index(face[1])] = 1 if face[0] == "+" else -1
@@ -73,6 +73,36 @@ def test_the_table_axis_is_that_of_the_accelerometers(accel):
     exact = il.fit_rate(level, accel=accel, order=1).calibration
     for name, true in TRUTH.items():
         assert exact.value(name) == pytest.approx(true, abs=1e-9), name
+
+
+def swept(largest=200.0, low=0.05, duration=90.0):
+    """The rate of a table, rad/s, whose frequency rises to 1 Hz."""
+    t = np.arange(int(duration * FREQUENCY)) / FREQUENCY
+    return largest * DEGREE * np.sin(2 * np.pi * (low * t + (1 - low) * t**2 / (2 * duration)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_the_table_axis_is_found_from_a_sweep_too(accel, noise):
+    """Leans of 1 deg, a table 2 mrad off level, an arm of 6 cm, whose tangential acceleration the sweep has, too."""
+    made = whole(SIX[::2], lean=np.radians(1), tilt=2e-3, noise=noise, table=swept())
+    found = il.fit_rate(made, accel=accel, order=1).calibration
+    reach = 1.0 if noise else 0.0
+    for i in "xyz":
+        own = found.parameters[f"gyro_scale_factor_{i}"]
+        # what the arm's centripetal force does to G is found from six faces only: 0.1 deg/s/g of 6 cm
+        assert abs(own.value / TRUTH[f"gyro_scale_factor_{i}"] - 1) < 2e-5 + 4 * reach * own.standard_uncertainty
+        for k in "xyz".replace(i, ""):
+            across = found.parameters[f"gyro_misalignment_{i}{k}"]
+            off = abs(across.value - TRUTH[f"gyro_misalignment_{i}{k}"])
+            assert off < 2e-5 + 4 * reach * across.standard_uncertainty
+    blind = il.fit_rate(made, order=1).calibration
+    assert max(abs(blind.value(n) - v) for n, v in TRUTH.items() if "misalignment" in n) > 5e-3
+
+
+def test_a_sweep_that_hardly_turns_the_table_tells_no_axis(accel):
+    made = whole(SIX[::2], table=swept(20.0, 0.2))
+    with pytest.raises(il.ImulabError, match=r"0.csv .*the table axis .* by a whole turn or more, found \d+ deg"):
+        il.fit_rate(made, accel=accel, order=1)
 
 
 def test_an_axis_off_by_a_degree_takes_its_cosine_from_the_scale_factor(accel):

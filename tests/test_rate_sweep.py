@@ -166,16 +166,6 @@ def test_what_is_no_sweep_is_refused_in_a_line(made, said):
     assert "\n" not in str(refused.value)
 
 
-def test_accelerometers_find_no_table_axis_in_a_sweep():
-    made = il.simulate_tumble(attitudes=24, order=1, hold="2 s", unit="m/s^2", gravity=9.81)
-    record = il.fit_tumble(made, order=1, gravity=9.81).calibration
-    turned = swept(duration=10.0)
-    force = {f"accel_{a}": np.full(len(turned), 9.81 * (a == "z")) for a in "xyz"}
-    both = il.Recording({**turned.columns, **force}, {**turned.units, **dict.fromkeys(force, "m/s^2")}, name="z.csv")
-    with pytest.raises(il.ImulabError, match="needs steps of rate, held for whole turns; found a sweep"):
-        il.fit_rate(both, accel=record)
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 @pytest.mark.parametrize(
     ("parts", "single"),

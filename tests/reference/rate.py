@@ -41,7 +41,7 @@ def outputs(table, frequency, axis, sign, scale, turn, bias, powers=(), latitude
 def mounted(table, frequency, axis, arm, tilt=0.0):
     """Body rate and specific force of a unit on a table about `axis` (3,), which is off level by `tilt` rad, at `arm`.
 
-    ``f = g u + w x (w x r)``: the upward direction u goes round the table axis as the table turns under it.
+    ``f = g u + w x (w x r) + w' x r``: the upward direction u goes round the table axis as the table turns under it.
     """
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     one = np.cross(axis, [0.3, 0.5, 0.8])
@@ -51,7 +51,7 @@ def mounted(table, frequency, axis, arm, tilt=0.0):
     up = axis + tilt * (np.cos(angle)[:, None] * one - np.sin(angle)[:, None] * two)
     rate = np.asarray(table)[:, None] * axis
     force = 9.80665 * up / np.linalg.norm(up, axis=1)[:, None] + np.cross(rate, np.cross(rate, arm))
-    return rate, force
+    return rate, force + np.cross(np.gradient(rate, axis=0) * frequency, arm)
 
 
 def hand_turns(axes, counts, frequency, arm, tilt=0.0, speed=120.0, stops=None):

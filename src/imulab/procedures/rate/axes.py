@@ -1,7 +1,9 @@
 """What accelerometers say of the table axis: its direction in the body, free of the table's level and the lever arm.
 
 Over whole turns a table that is off level reads ``f = g a - w^2 r``, a the table axis and r the lever arm across it, so
-that the intercept of the mean of f over w^2 is along a. Source: rotation about a fixed axis; least squares.
+that the intercept of the mean of f over w^2 is along a. Where the rate changes all the time, what w' adds, and what a
+table off level adds with cosine and sine of its angle, are found beside it. Source: rotation about a fixed axis; least
+squares.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import numpy as np
 
 from imulab.errors import DataError, RecordError
 from imulab.procedures.rate.choices import AXES
-from imulab.procedures.rate.dwells import Dwells
+from imulab.procedures.rate.dwells import Dwells, recorded_rate
 from imulab.procedures.rate.manifest import RateTest
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance
@@ -23,6 +25,7 @@ from imulab.verdict import UNJUDGED, Note
 BY_ACCELEROMETERS = "that of the accelerometers"
 """The frame of a record's misalignments."""
 _FACE = np.cos(np.radians(30))
+_PIECE = 0.02  # s
 _TRIAD = tuple(f"accel_{axis}" for axis in AXES)
 
 
@@ -69,14 +72,14 @@ def find_axes(
     if "bias_x" not in accel.parameters:
         raise RecordError(f"accel: a {accel.procedure} record without accelerometers; expected one of tumble fit")
     pairs = zip(recordings, dwells, strict=True)
-    means = [_means(recording, found, test.place(k)) for k, (recording, found) in enumerate(pairs)]
+    seen = [_seen(recording, found, test.place(k)) for k, (recording, found) in enumerate(pairs)]
     unit = recordings[0].triad_unit("accel")
-    outputs = np.vstack(means)
-    runs = np.repeat(np.arange(len(dwells)), [len(found.rate) for found in dwells])
+    outputs = np.vstack([each[0] for each in seen])
+    runs = np.repeat(np.arange(len(seen)), [len(each[0]) for each in seen])
 
     def axes_by(record: Calibration) -> list[tuple[Array, Array, float]]:
         force = corrected_means(record, outputs, unit)
-        return [_intercept(force[runs == k], found, test.place(k)) for k, found in enumerate(dwells)]
+        return [_intercept(force[runs == k], each[1]) for k, each in enumerate(seen)]
 
     found = axes_by(accel)
     force = np.array([each[0] for each in found])
@@ -126,24 +129,31 @@ def moved_by_parameters(accel: Calibration, directions: Callable[[Calibration], 
     return np.array(changes).reshape(len(names), len(at), 3), matrix / np.outer(known, known)
 
 
-def _means(recording: Recording, found: Dwells, place: str) -> Array:
-    """Return the mean outputs of the accelerometers over each dwell, shape (n, 3)."""
+def _outputs(recording: Recording, place: str) -> tuple[Array, Array]:
+    """Return time, s, and the outputs of the accelerometers, shapes (n,) and (n, 3)."""
     missing = [name for name in _TRIAD if name not in recording]
     if missing:
         raise DataError(f"{place}: no column {missing[0]}; the table axis by accelerometers needs all three")
     time, outputs = recording.si("time"), recording.triad("accel")
     if not np.isfinite(outputs).all():
         raise DataError(f"{place}: accel_*: expected numbers, found none at some times")
+    return time, outputs
+
+
+def _means(recording: Recording, found: Dwells, place: str) -> Array:
+    """Return the mean outputs of the accelerometers over each dwell, shape (n, 3)."""
+    time, outputs = _outputs(recording, place)
     first, last = np.searchsorted(time, found.start), np.searchsorted(time, found.stop, side="right")
     return np.array([outputs[a:b].mean(axis=0) for a, b in zip(first, last, strict=True)])
 
 
-def _intercept(force: Array, found: Dwells, place: str) -> tuple[Array, Array, float]:
-    """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it."""
+def _seen(recording: Recording, found: Dwells, place: str) -> tuple[Array, Array]:
+    """Return mean outputs of the accelerometers, shape (n, 3), and the columns that they are made of, (n, c).
+
+    The columns are 1, w^2, and what else adds to them, all times the root of their weight.
+    """
     if found.sweep is not None:
-        raise DataError(
-            f"{place}: the table axis by accelerometers needs steps of rate, held for whole turns; found a sweep"
-        )
+        return _seen_in_a_sweep(recording, place)
     turns = np.abs(found.rate) * (found.stop - found.start) / (2 * np.pi)
     which = turns >= 1
     squares = found.rate[which] ** 2
@@ -153,12 +163,36 @@ def _intercept(force: Array, found: Dwells, place: str) -> tuple[Array, Array, f
             f"expected longer dwells, found {int(which.sum())}"
         )
     root = np.sqrt(turns[which])[:, None]  # what is left of a tilt falls with the turns
-    columns = np.column_stack([np.ones(len(squares)), squares / squares.max()]) * root
-    coefficients, *_ = np.linalg.lstsq(columns, force[which] * root, rcond=None)
-    left = force[which] * root - columns @ coefficients
-    variance = float(np.mean(np.sum(left**2, axis=0))) / max(len(squares) - 2, 1)
-    u = float(np.sqrt(variance * np.linalg.inv(columns.T @ columns)[0, 0]))
-    return coefficients[0], coefficients[1] / squares.max(), u
+    return _means(recording, found, place)[which], np.column_stack([np.ones(len(squares)), squares]) * root
+
+
+def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
+    """Return the same over pieces of 0.02 s of a run whose rate changes all the time."""
+    time, outputs = _outputs(recording, place)
+    rate = recorded_rate(recording, time)
+    assert rate is not None
+    angle = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(time))])
+    if np.ptp(angle) < 2 * np.pi:
+        raise DataError(
+            f"{place}: the table axis by accelerometers needs a sweep that turns the table by a whole turn or more, "
+            f"found {from_si(float(np.ptp(angle)), 'deg'):.0f} deg: sweep more slowly, or faster"
+        )
+    size = max(1, round(_PIECE / float(np.median(np.diff(time)))))
+    count = len(time) // size
+    columns = [np.ones(len(time)), rate**2, np.gradient(rate, time), np.cos(angle), np.sin(angle)]
+    pieces = np.column_stack([*columns, outputs])[: count * size].reshape(count, size, -1).mean(axis=1)
+    return pieces[:, len(columns) :], pieces[:, : len(columns)]
+
+
+def _intercept(force: Array, columns: Array) -> tuple[Array, Array, float]:
+    """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it."""
+    root, largest = columns[:, :1], np.abs(columns).max(axis=0)
+    scaled = columns / largest
+    coefficients, *_ = np.linalg.lstsq(scaled, force * root, rcond=None)
+    left = force * root - scaled @ coefficients
+    variance = float(np.mean(np.sum(left**2, axis=0))) / max(len(force) - columns.shape[1], 1)
+    u = float(np.sqrt(variance * np.linalg.inv(scaled.T @ scaled)[0, 0])) / largest[0]
+    return coefficients[0] / largest[0], coefficients[1] / largest[1], u
 
 
 def _up(direction: Array) -> str:

@@ -81,7 +81,7 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
     time = check_time(recording)
     outputs = [recording.column(name) for name in names]
     own = outputs[names.index(main)] if run.sign > 0 else -outputs[names.index(main)]
-    column = _recorded(recording, time)
+    column = recorded_rate(recording, time)
     if column is None and run.rates is None:
         raise SegmentError(
             f"{place}: no column table_rate or table_angle; expected the table's rates (rates = [0, 10, -10] in the "
@@ -161,7 +161,7 @@ def _swept(
     )
 
 
-def _recorded(recording: Recording, time: Array) -> Array | None:
+def recorded_rate(recording: Recording, time: Array) -> Array | None:
     """Return the rate of the table that a recording holds, rad/s, shape (n,)."""
     for name, quantity in (("table_rate", "rate"), ("table_angle", "angle")):
         if name not in recording:
