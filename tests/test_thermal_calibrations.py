@@ -4,6 +4,7 @@ import numpy as np
 
 import imulab as il
 from imulab.procedures.thermal.gyrorecord import gyro_scale_predicted
+from imulab.procedures.thermal.record import deviation_of_force
 from reference import thermal as reference
 
 G = reference.G
@@ -80,3 +81,35 @@ def test_scale_factors_of_gyroscopes_are_drawn_over_temperature(tmp_path):
         expected = np.sqrt(np.einsum("ni,ij,nj->n", powers, record.cov(*names), powers))
         np.testing.assert_allclose(u[k], expected, rtol=1e-6)
     assert "Scale factor of the gyroscopes over temperature" in report_of(record, tmp_path)
+
+
+def test_the_deviation_of_the_corrected_force_is_that_of_drawn_laws(tmp_path):
+    """Laws drawn from the record's covariance correct the outputs of an ideal unit in all directions."""
+    _, given = soaks(24, offset=3e-4)
+    record = il.fit_thermal(given, degrees="3,2,1", gravity=f"{G}+-0").calibration
+    rng, at = np.random.default_rng(7), np.array([-20.0, 13.0, 60.0])
+    names, t = list(record.covariance.names), at - record.model["reference_temperature"]["value"]
+    mean = np.array([record.value(name) for name in names])
+    drawn = rng.multivariate_normal(mean, record.cov(*names), size=20_000)
+
+    def law(values, label):
+        own = [k for k, name in enumerate(names) if name == label or name.startswith(f"{label}_t")]
+        return sum(values[:, k, None] * t**power for power, k in enumerate(own))
+
+    up = rng.standard_normal((len(drawn), 3))
+    f = G * up / np.linalg.norm(up, axis=1)[:, None]
+    errors = np.zeros((len(drawn), 3, 3))
+    for k in range(3):
+        now, true = ({name: law(each, name)[:, k] for name in NAMES} for each in (drawn, mean[None]))
+        sensed = np.stack([
+            f[:, 0],
+            true["misalignment_yx"] * f[:, 0] + f[:, 1],
+            true["misalignment_zx"] * f[:, 0] + true["misalignment_zy"] * f[:, 1] + f[:, 2],
+        ])  # fmt: skip
+        read = [true[f"scale_factor_{a}"] * (sensed[i] + true[f"bias_{a}"]) for i, a in enumerate("xyz")]
+        x, y, z = (read[i] / now[f"scale_factor_{a}"] - now[f"bias_{a}"] for i, a in enumerate("xyz"))
+        y = y - now["misalignment_yx"] * x
+        z = z - now["misalignment_zx"] * x - now["misalignment_zy"] * y
+        errors[:, k] = np.stack([x, y, z], axis=1) - f
+    np.testing.assert_allclose(deviation_of_force(record, at), np.sqrt(np.mean(errors**2, axis=(0, 2))), rtol=0.03)
+    assert "Standard deviation of the corrected force over temperature" in report_of(record, tmp_path)

@@ -10,7 +10,7 @@ from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.engineering import rows as engineering_rows
 from imulab.procedures.thermal.gyrofigures import COLOURS, gyro_exhibits, own_points
 from imulab.procedures.thermal.model import AXES, GROUPS
-from imulab.procedures.thermal.record import predicted
+from imulab.procedures.thermal.record import deviation_of_force, predicted
 from imulab.procedures.thermal.sections import Own, Thermal, thermal_of
 from imulab.records.calibration import Calibration
 from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
@@ -58,6 +58,7 @@ def exhibits(record: Calibration) -> Exhibits:
     items: list[Figure | ReportTable] = [
         _coefficients(record),
         *(_over_temperature(k, temperature, values, spread, found.data.calibrations) for k in range(3)),
+        _of_force(record, found, temperature),
         _residuals(found),
     ]
     if found.model.gyro is not None:
@@ -139,6 +140,36 @@ def _over_temperature(group: int, temperature: Any, values: Any, spread: Any, al
         layout={
             "xaxis": axis("temperature, degC"),
             "yaxis": axis(f"{name}, {unit}", exponentformat="none"),
+            "legend": LEGEND,
+        },
+    )
+
+
+def _of_force(record: Calibration, found: Thermal, temperature: Any) -> Figure:
+    laws, between = deviation_of_force(record, temperature), found.fit.between_recordings
+    cycle = np.hypot(between.bias.value, found.model.gravity.value * between.scale_factor.value / np.sqrt(3))
+    known = between.from_ != "unknown"
+    traces = [
+        scatter(
+            rounded(temperature), rounded(each * _MICRO_G, 4), "lines", name=name, line={"color": colour, "dash": dash}
+        )
+        for name, each, colour, dash in (
+            ("by the laws", laws, GOOD, "solid"),
+            *([("and the power cycle's own offset", np.hypot(laws, cycle), INK, "dash")] if known else []),
+        )
+    ]
+    return Figure(
+        title="Standard deviation of the corrected force over temperature",
+        caption="Of one component, its root mean square over all directions, without noise"
+        + (
+            "; dashed with what biases and scale factors differ by from one power cycle to the next."
+            if known
+            else "; what power cycles add is not known."
+        ),
+        traces=traces,
+        layout={
+            "xaxis": axis("temperature, degC"),
+            "yaxis": axis("standard deviation, µg", rangemode="tozero"),
             "legend": LEGEND,
         },
     )

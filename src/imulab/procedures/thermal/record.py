@@ -287,3 +287,17 @@ def predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
         for axis in axes
     ]
     return np.array([values for values, _ in found]), np.array([spread for _, spread in found])
+
+
+def deviation_of_force(record: Calibration, temperature: Array) -> Array:
+    """Return the standard deviation of a component of the corrected force by the laws, m/s^2, shape (n,).
+
+    Root of the mean over all directions of f, of magnitude g: the variance of the bias, and a third of those of scale
+    factor and misalignment, whose covariances with it have no mean.
+    """
+    values, spread = predicted(record, temperature)
+    g = thermal_of(record).model.gravity.value
+    relative = np.concatenate([spread[:3] / g, spread[3:6] / np.abs(values[3:6]), spread[6:]])
+    weights = np.repeat([1.0, 1 / 3, 1 / 3], len(AXES)) / len(AXES)
+    found: Array = g * np.sqrt(weights @ relative**2)
+    return found
