@@ -113,3 +113,14 @@ def test_the_deviation_of_the_corrected_force_is_that_of_drawn_laws(tmp_path):
         errors[:, k] = np.stack([x, y, z], axis=1) - f
     np.testing.assert_allclose(deviation_of_force(record, at), np.sqrt(np.mean(errors**2, axis=(0, 2))), rtol=0.03)
     assert "Standard deviation of the corrected force over temperature" in report_of(record, tmp_path)
+
+
+def test_a_misalignment_that_attitudes_at_one_temperature_do_not_show_is_named():
+    made = {ramps: il.simulate_thermal(ramps=ramps, turn_on="0", seed=2) for ramps in (3, 4)}
+    given = {ramps: [each for each in m if "ramp" in each.name or "25" in each.name] for ramps, m in made.items()}
+    few, more = (il.fit_thermal(given[ramps], turn_on_scatter="0.1 mg").calibration for ramps in (3, 4))
+    said = "attitudes at one temperature alone do not tell whether misalignment follows it"
+    assert few.model["degrees"]["misalignment"] == 0
+    assert any(said in warning for warning in few.warnings)
+    assert more.model["degrees"]["misalignment"] == 1
+    assert not any(said in warning for warning in more.warnings)

@@ -250,6 +250,13 @@ def _findings(
             "few recordings do not tell whether by their temperature or from power cycle to power cycle: record five "
             "temperatures or more, or state --degrees"
         )
+    moved = holds.group < 0
+    if not solution.laws.degrees[2] and not clusters_of(holds.temperature[moved]).any():
+        found.append(
+            f"{name}: attitudes at one temperature alone do not tell whether misalignment follows it, which is taken "
+            "as constant: one that moves by 10 urad/K, as is usual, errs biases by about 0.1 mg, which no uncertainty "
+            "holds: one more ramp, -x up, or attitudes at another temperature would tell"
+        )
     if options["degrees"] == "auto":
         found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > _WORSE**2]
