@@ -31,16 +31,26 @@ M4F = ["-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"]
 FLAGS = [*M4F, "-std=gnu99", "-DIMULAB_REAL=float", "-DIL_ARRAY_ELEMENTS=6", "-ffp-contract=off"]
 LINK = ["-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "--specs=rdimon.specs", "-nostartfiles"]
 QEMU = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting-config", "enable=on,target=native"]
+HELD = "the temperature as before"
 TITLES = ["one sample of", "flash, bytes", "state, bytes", "stack, bytes", "instructions, -Os", "instructions, -O2"]
 
 
 def cases() -> Iterator[tuple[str, list[Calibration], Fusion | None]]:
-    """Yield titles, records and how an array fuses."""
+    """Yield titles, records and how an array fuses; a title that ends in HELD is of samples at one temperature."""
     for order in (1, 2, 3):
         yield f"accelerometers, order {order}", [madeup.tumble(order)], None
     yield "accelerometers and gyroscopes, order 1", [madeup.tumble(1, gyro=True)], None
     yield "the same with g-sensitivity", [madeup.tumble(1, gyro=True, sensitive=True)], None
+    yield "the same with powers of the rate to 3", [madeup.tumble(1, gyro=True, sensitive=True, powers=3)], None
     yield "nine axes, order 1", [_nine()], None
+    soaks = il.simulate_thermal("-20,-5,10,25,40,60", gyro=True)
+    cubic, spline = (il.fit_thermal(soaks, degrees=f"{bias},2,1").calibration for bias in ("3", "spline"))
+    yield "accelerometers over temperature, degrees 3 2 1", [cubic], None
+    yield f"the same, {HELD}", [cubic], None
+    yield "accelerometers over temperature, a spline with 6 knots", [spline], None
+    six = il.fit_thermal(soaks, degrees="3,2,1", with_="gyro").calibration
+    yield "accelerometers and gyroscopes over temperature", [six], None
+    yield f"accelerometers and gyroscopes, {HELD}", [six], None
     yield "drift of a flexible gyroscope, two axes", [madeup.centrifuge()], None
     for model in ("knot-cubic", "knot-log-cubic", "exponential"):
         yield f"warm-up of two axes, `{model}`", [madeup.warmup(model)], None
@@ -56,14 +66,14 @@ def _nine() -> Calibration:
     return il.fit_mag(recording, accel=six, gravity=9.80665, field="48 uT").calibration
 
 
-def measured(records: Sequence[Calibration], fusion: Fusion | None = None) -> dict[str, float]:
-    """Return flash, state and stack, bytes, and instructions a sample by each optimisation."""
+def measured(records: Sequence[Calibration], fusion: Fusion | None = None, *defined: str) -> dict[str, float]:
+    """Return flash, state and stack, bytes, and instructions a sample by each optimisation; `defined` as compiled."""
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         export("c", list(records), folder, ExportOptions(fusion=fusion))
         for level in ("-Os", "-O2"):
-            image = _built(folder, level, "count")
+            image = _built(folder, level, "count", *defined)
             done = subprocess.run(
                 [*QEMU, "-icount", "shift=0", "-kernel", str(image)], capture_output=True, text=True, timeout=300
             )
@@ -77,11 +87,11 @@ def measured(records: Sequence[Calibration], fusion: Fusion | None = None) -> di
     return found
 
 
-def _built(folder: Path, level: str, what: str) -> Path:
+def _built(folder: Path, level: str, what: str, *defined: str) -> Path:
     """Return an image of the unit that counts, or that only has or lacks its calls."""
     image = folder / f"{what}{level}.elf"
     sources = [TARGET / "sample.c", *([TARGET / "start.c"] if what == "count" else [])]
-    define = [] if what == "count" else [f"-D{what}"]
+    define = [f"-D{name}" for name in (*defined, *([] if what == "count" else [what]))]
     command = ["arm-none-eabi-gcc", *FLAGS, level, *define, *LINK, f"-I{folder}", "-T", TARGET / "mps2.ld"]
     command += [*sources, folder / "imulab.c", folder / "unit.c", "-o", image, "-lm"]
     subprocess.run(list(map(str, command)), check=True)
@@ -98,7 +108,7 @@ def table() -> str:
     """Return the table in Markdown."""
     lines = [f"| {' | '.join(TITLES)} |", f"|{'---|' * len(TITLES)}"]
     for title, records, fusion in cases():
-        found = measured(records, fusion)
+        found = measured(records, fusion, *(["HELD"] if title.endswith(HELD) else []))
         names = ("flash", "state", "stack", "instructions -Os", "instructions -O2")
         lines.append(f"| {title} | {' | '.join(f'{found[name]:.0f}' for name in names)} |")
         print(lines[-1], flush=True)

@@ -1,4 +1,5 @@
-/* One sample of everything that an exported unit corrects, on a Cortex-M4F.
+/* One sample of everything that an exported unit corrects, on a Cortex-M4F; each at a temperature of its own, or with
+ * HELD all at one.
  *
  * With EMPTY or CALLS only what is linked matters: the difference of the two images is what the unit costs in flash.
  * Otherwise the emulator counts: with `qemu -icount shift=0` each instruction takes 1 ns of the clock that SysTick counts,
@@ -13,8 +14,14 @@ static il_real warming[UNIT_WARMUP_AXES];
 static il_array_state array;
 static il_real reading[UNIT_ARRAY_AXES * UNIT_ARRAY_ELEMENTS], rates[UNIT_ARRAY_AXES];
 #endif
+#if UNIT_HAS_THERMAL
+static il_thermal_state warmth;
+#endif
+#if UNIT_HAS_THERMAL_GYRO
+static il_thermal_gyro_state gyro_warmth;
+#endif
 static uint32_t tick;
-static il_real accel[3], gyro[3], mag[3], level[2], drifting[2];
+static il_real temperature, accel[3], gyro[3], mag[3], level[2], drifting[2];
 volatile il_real seen; /* what a result is kept in, so that none is left out */
 
 __attribute__((noinline)) static void sample(void) {
@@ -24,6 +31,12 @@ __attribute__((noinline)) static void sample(void) {
 #endif
 #if UNIT_HAS_GYRO
     (void)il_gyro_apply(&unit_gyro, gyro, accel, gyro);
+#endif
+#if UNIT_HAS_THERMAL
+    (void)il_thermal_apply(&unit_thermal, &warmth, temperature, accel, accel);
+#endif
+#if UNIT_HAS_THERMAL_GYRO
+    (void)il_thermal_gyro_apply(&unit_thermal_gyro, &gyro_warmth, temperature, gyro, accel, gyro);
 #endif
 #if UNIT_HAS_MAG
     (void)il_mag_apply(&unit_mag, mag, mag);
@@ -46,6 +59,12 @@ __attribute__((noinline)) static void sample(void) {
 static int start(void) {
     tick = 0;
 #ifndef EMPTY
+#if UNIT_HAS_THERMAL
+    il_thermal_start(&warmth);
+#endif
+#if UNIT_HAS_THERMAL_GYRO
+    il_thermal_gyro_start(&gyro_warmth);
+#endif
 #if UNIT_HAS_WARMUP
     if (il_warmup_start(&unit_warmup, &warm, (il_real)21.5, (il_real)0.005) != IL_OK) return 0;
 #endif
@@ -62,7 +81,7 @@ void reset(void);
 
 void reset(void) {
     for (;;) {
-        accel[0] = gyro[0] = mag[0] = level[0] = drifting[0] = seen;
+        temperature = accel[0] = gyro[0] = mag[0] = level[0] = drifting[0] = seen;
         if (start()) sample();
         seen = accel[0] + gyro[0] + mag[0] + level[0] + drifting[0];
     }
@@ -92,6 +111,22 @@ static void load(void) {
 #endif
 #if UNIT_HAS_GYRO
     ONCE(i) gyro[i] = ((il_real)3 * gyro[i] + unit_gyro.bias[i]) / unit_gyro.gain[i];
+#endif
+#if UNIT_HAS_THERMAL
+    const il_real low = unit_thermal.knot[0], high = unit_thermal.knot[unit_thermal.pieces];
+    il_tumble triad;
+#ifdef HELD
+    temperature = low + (il_real)0.6 * (high - low);
+#else
+    temperature = low + (il_real)0.5 * (high - low) * ((il_real)1 + uniform());
+#endif
+    (void)il_thermal_at(&unit_thermal, temperature, &triad);
+    ONCE(i) accel[i] = ((il_real)14.7 * accel[i] + triad.bias[i]) / triad.gain[i];
+#endif
+#if UNIT_HAS_THERMAL_GYRO
+    il_gyro turned;
+    (void)il_thermal_gyro_at(&unit_thermal_gyro, temperature, &turned);
+    ONCE(i) gyro[i] = ((il_real)3 * gyro[i] + turned.bias[i]) / turned.gain[i];
 #endif
 #if UNIT_HAS_MAG
     ONCE(i) mag[i] = (mag[i] + unit_mag.bias[i]) / unit_mag.gain[i];
@@ -167,6 +202,12 @@ int main(void) {
         if (used > stack) stack = used;
     }
     unsigned ram = 0;
+#if UNIT_HAS_THERMAL
+    ram += (unsigned)sizeof warmth;
+#endif
+#if UNIT_HAS_THERMAL_GYRO
+    ram += (unsigned)sizeof gyro_warmth;
+#endif
 #if UNIT_HAS_WARMUP
     ram += (unsigned)sizeof warm;
 #endif
