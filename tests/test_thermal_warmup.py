@@ -4,6 +4,7 @@ The unit of the figures is made here by hand: a rate that follows the temperatur
 8 K, and is put out with white noise.
 """
 
+import hashlib
 import subprocess
 from dataclasses import replace
 
@@ -147,3 +148,69 @@ def test_a_bundle_of_both_corrects_as_the_records_do(unit, tmp_path, monkeypatch
     assert capsys.readouterr().err.count("\n") == 1
     assert main(["apply", "thermal.json", "after.json", "cycle.csv", "-o", "out.csv"], project=False) == 0
     assert il.read("out.csv").triad("accel") == pytest.approx(expected.triad("accel"), abs=1e-8)
+
+
+OPTIONS = {"temperatures": "-10,10,30", "settling_time": "300 s", "model": "knot-cubic"}
+
+
+@pytest.fixture(scope="module")
+def by_blob(unit, tmp_path_factory):
+    """A warm-up record of cycles that a blob of the thermal record corrected; blobs of it alone, and of both."""
+    _, thermal, cycles, _, _ = unit
+    (alone,) = il.export("blob", thermal, tmp_path_factory.mktemp("alone"))
+    after = il.fit_warmup([il.apply(alone, each) for each in cycles], **OPTIONS).calibration
+    (both,) = il.export("blob", [thermal, after], tmp_path_factory.mktemp("both"))
+    return alone, after, both
+
+
+def test_cycles_corrected_by_a_blob_name_the_thermal_record_in_it(unit, by_blob):
+    """So the right chain is the right one, whichever of it comes from a blob and which from a record."""
+    _, thermal, cycles, _, _ = unit
+    alone, after, both = by_blob
+    assert after.model["after"] == thermal.sealed()[0]
+    expected = il.apply(after, il.apply(thermal, cycles[0])).triad("accel")
+    for chain in ([alone, after], [both]):
+        result = cycles[0]
+        for each in chain:
+            result = il.apply(each, result)
+        assert result.triad("accel") == pytest.approx(expected, abs=4e-6 * G)
+
+
+def test_wrong_chains_with_a_blob_are_refused_by_name(unit, by_blob):
+    _, thermal, cycles, raw, _ = unit
+    alone, after, both = by_blob
+    for chain, said in (
+        ([alone, raw], "whose cycles no thermal record had corrected"),
+        ([after], "with none before it"),
+        ([alone, thermal], r"already corrected by thermal"),
+        ([thermal, alone], r"already corrected by unit\.blob"),
+        ([both, after], "already corrected by warmup"),
+        ([thermal, both], r"already corrected by unit\.blob"),
+    ):
+        result = cycles[0]
+        for each in chain[:-1]:
+            result = il.apply(each, result)
+        with pytest.raises(il.ImulabError, match=said):
+            il.apply(chain[-1], result)
+
+
+def test_the_head_names_blob_and_records_in_files_too(unit, by_blob, tmp_path, monkeypatch, capsys):
+    _, thermal, cycles, _, _ = unit
+    alone, after, both = by_blob
+    monkeypatch.chdir(tmp_path)
+    il.write(cycles[0], "cycle.csv")
+    assert main(["apply", str(both), "cycle.csv", "-o", "out.csv"], project=False) == 0
+    own = hashlib.sha256(both.read_bytes()).hexdigest()
+    assert il.read("out.csv").corrected_by == (
+        f"unit.blob sha256:{own}",
+        f"unit.blob (thermal: accel) sha256:{thermal.sealed()[0]}",
+        f"unit.blob sha256:{after.sealed()[0]}",
+    )
+    thermal.save("thermal.json")
+    after.save("after.json")
+    for wrong in (["after.json"], ["thermal.json"], [str(alone)]):
+        capsys.readouterr()
+        assert main(["apply", *wrong, "out.csv", "-o", "twice.csv"], project=False) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        assert "already corrected by" in error

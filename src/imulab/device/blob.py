@@ -22,6 +22,8 @@ _HEAD = 16
 
 class _Kind(Part):
     kind: str
+    record: str | None = None
+    """SHA-256 of the record that it is from; blobs of version 0.1 do not say."""
 
 
 class _Text(Part):

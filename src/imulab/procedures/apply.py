@@ -138,8 +138,8 @@ def apply(
 ) -> Recording:
     """Return data corrected by a record; columns that it does not touch pass unchanged.
 
-    The result names the record and its SHA-256 in `corrected_by`, which its file will hold. A recording that the same
-    record corrected before is refused, unless `again`.
+    The result names the record and its SHA-256 in `corrected_by`, which its file will hold; of a blob these are its own
+    and those of the records in it. A recording that the same record corrected before is refused, unless `again`.
 
     Parameters
     ----------
@@ -214,8 +214,14 @@ def apply(
         corrected = ready.further(corrected)
     if corrected is recording:
         return recording
-    by = entry(ready.name, ready.holds[0], (part.kind for part, _ in ready.sections))
-    return replace(corrected, corrected_by=(*recording.corrected_by, by))
+    return replace(corrected, corrected_by=(*recording.corrected_by, *_entries(ready)))
+
+
+def _entries(ready: Loaded) -> Iterator[str]:
+    """What a corrected recording says: a line per record; for a blob one for itself, then one per record in it."""
+    made = [(columns.get("record", ready.holds[0]), part.kind) for part, columns in ready.sections]
+    for digest in dict.fromkeys((ready.holds[0], *(digest for digest, _ in made))):
+        yield entry(ready.name, digest, [kind for of, kind in made if of == digest])
 
 
 def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterable[Recording]) -> Iterator[Recording]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from imulab.device.array_settings import Fusion
 from imulab.device.tables import DeviceTable
@@ -29,6 +30,8 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Device
 def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[DeviceTable]:
     """Return the tables of several records of one unit, in their order; an array fuses by `fusion` where it is given.
 
+    The columns of each name its record by its SHA-256, so that what a blob corrected is known by the records in it.
+
     Raises
     ------
     RecordError
@@ -37,12 +40,15 @@ def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) 
     serials = {serial: None for record in records if (serial := record.sensor.get("serial"))}
     if len(serials) > 1:
         raise RecordError(f"records of different units: {' '.join(serials)}; expected those of one")
-    made = [(tables_of(record, fusion), record) for record in records]
-    tables = [table for own, _ in made for table in own]
+    tables = [
+        replace(table, columns={**table.columns, "record": record.sealed()[0]})
+        for record in records
+        for table in tables_of(record, fusion)
+    ]
     kinds = [table.kind for table in tables]
     twice = sorted({kind for kind in kinds if kinds.count(kind) > 1})
     if twice:
         raise RecordError(f"two records give a {twice[0]} table; a unit has one")
     check_order(kinds)
-    check_after((table.kind, table.columns, (record.sealed()[0],)) for own, record in made for table in own)
+    check_after((table.kind, table.columns, (table.columns["record"],)) for table in tables)
     return tables
