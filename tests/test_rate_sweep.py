@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -246,3 +247,37 @@ def test_a_simulated_sweep_gives_its_truth_back(tmp_path, monkeypatch, capsys):
         assert main(["rate", "simulate", "-o", "no", "--sweep", "30s", wrong], project=False) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+def _chirps(count, seed=0):
+    """Chirps of 60 s at 1 kHz of a gyroscope without delay, with noise, deg/s."""
+    time = np.arange(count) / 1000
+    within = time % 60
+    table = 100 * np.sin(2 * np.pi * (0.05 * within + 1.95 * within**2 / 120))
+    noise = 0.05 * np.random.default_rng(seed).standard_normal((3, count))
+    gyros = {f"gyro_{a}": gain * table + own for a, gain, own in zip("xyz", (2e-3, -3e-3, SCALE), noise, strict=True)}
+    columns = {"time": time, **gyros, "table_rate": table}
+    return il.Recording(columns, {n: "s" if n == "time" else "deg/s" for n in columns}, name="z.csv")
+
+
+def test_a_long_sweep_takes_a_few_columns_of_memory():
+    """Twelve columns of all samples beside the recording; thirty before it went block by block."""
+    made = _chirps(600_000)
+    il.fit_rate(_chirps(60_000))  # what is imported once is not counted
+    tracemalloc.start()
+    found = il.fit_rate(made).calibration.parameters["gyro_scale_factor_z"]
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 12 * 8 * len(made)
+    assert abs(found.value * DEGREE - SCALE) < 4 * found.standard_uncertainty * DEGREE
+
+
+def test_gaps_in_a_sweep_leave_out_what_is_beside_them():
+    made = swept()
+    keep = np.ones(len(made), dtype=bool)
+    for first, last in ((700, 760), (2000, 2001), (4100, 4500)):
+        keep[first:last] = False
+    cut = dataclasses.replace(made, columns={n: v[keep] for n, v in made.columns.items()})
+    found = il.fit_rate(cut).calibration.parameters
+    assert found["gyro_scale_factor_z"].value * DEGREE == pytest.approx(SCALE, rel=1e-5)
+    assert found["gyro_delay_z"].value == pytest.approx(TRUE_DELAY, abs=3e-5)

@@ -179,9 +179,13 @@ def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
         )
     size = max(1, round(_PIECE / float(np.median(np.diff(time)))))
     count = len(time) // size
-    columns = [np.ones(len(time)), rate**2, np.gradient(rate, time), np.cos(angle), np.sin(angle)]
-    pieces = np.column_stack([*columns, outputs])[: count * size].reshape(count, size, -1).mean(axis=1)
-    return pieces[:, len(columns) :], pieces[:, : len(columns)]
+
+    def pieces(values: Array) -> Array:
+        return np.asarray(values[: count * size].reshape(count, size).mean(axis=1))
+
+    columns = (pieces(np.square(rate)), pieces(np.gradient(rate, time)), pieces(np.cos(angle)), pieces(np.sin(angle)))
+    force = np.column_stack([pieces(output) for output in outputs.T])
+    return force, np.column_stack([np.ones(count), *columns])
 
 
 def _intercept(force: Array, columns: Array) -> tuple[Array, Array, float]:
