@@ -60,6 +60,15 @@ def plan(
             metavar="sphere|FILE",
         ),
     ] = "sphere",
+    with_: Annotated[
+        str | None, one_of(("gyro",), "Say what the same soaks give of the gyroscopes, too.", "--with")
+    ] = None,
+    gyro_noise: Annotated[
+        str, typer.Option(metavar="N", help="Angle random walk of the gyroscopes, deg/sqrt(h).")
+    ] = "0.3 deg/sqrt(h)",
+    gyro_turn_on_scatter: Annotated[
+        str, typer.Option(help="What their biases move by from one power cycle to the next, deg/s.")
+    ] = "0.01 deg/s",
     output: Annotated[str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Plan to write.")] = None,
     report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
     json: AsJson = False,
@@ -72,7 +81,8 @@ def plan(
     check_plan_outputs(output, report, [name for name in (noise, source) if Path(name).is_file()])
     made = call(
         plan_thermal, temperatures=temperatures, time=time, soak=soak, attitude=attitude, noise=noise,
-        turn_on_scatter=turn_on_scatter, degrees=degrees, from_=source,
+        turn_on_scatter=turn_on_scatter, degrees=degrees, from_=source, with_=with_ or (), gyro_noise=gyro_noise,
+        gyro_turn_on_scatter=gyro_turn_on_scatter,
     )  # fmt: skip
     write_plan(made, output, report)
     if json:
@@ -93,6 +103,16 @@ def _plan_json(made: ThermalPlan) -> str:
     def force(value: float) -> dict[str, Any]:
         return {"value": value, "unit": "m/s^2"}
 
+    gyro = {}
+    if made.gyro is not None:
+        gyro["gyro"] = {
+            "noise": {"value": made.gyro.noise, "unit": "rad/sqrt(s)"},
+            "turn_on_scatter": {"value": made.gyro.turn_on_scatter, "unit": "rad/s"},
+            "mean": {"value": made.gyro.mean, "unit": "rad/s"},
+            "predicted": {"standard_uncertainty": made.gyro.deviation.tolist(), "unit": "rad/s"},
+            "turns": made.gyro.turns,
+            "turned_at": made.gyro.turned_at,
+        }
     return json_text(
         {
             "degrees": list(made.degrees),
@@ -119,6 +139,7 @@ def _plan_json(made: ThermalPlan) -> str:
                 {"soaks": each.soaks, "attitudes": each.attitudes, "mean": each.mean, "worst": each.worst}
                 for each in made.tried
             ],
+            **gyro,
         }
     )
 

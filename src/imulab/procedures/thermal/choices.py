@@ -17,6 +17,8 @@ LEAST_SPAN = 10.0
 LEAST_KNOTS = 5
 """Temperatures from which a spline of the bias is tried."""
 SETTLE = 300.0
+TURNED, FOLLOWED = 9, 3
+"""Attitudes of a recording whose turns tell scale factors of gyroscopes; temperatures at which these follow it."""
 
 
 def further_of(given: str | Sequence[str], option: str) -> tuple[str, ...]:

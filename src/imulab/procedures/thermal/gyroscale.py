@@ -17,6 +17,7 @@ from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, SegmentError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import leave_out
+from imulab.procedures.thermal.choices import FOLLOWED, TURNED
 from imulab.procedures.thermal.degrees import clusters_of
 from imulab.procedures.thermal.device import tables_of
 from imulab.procedures.thermal.gyro import Gyroscopes
@@ -36,9 +37,6 @@ from imulab.verdict import Bad, Note
 
 CRYSTAL = 50e-6
 """Standard uncertainty of the rate of the clock that all recordings are timed by."""
-_FEWEST = 9
-_LAW_AT = 3
-"""Temperatures with turns at which the scale factor follows them."""
 _SIGNIFICANT = 0.01
 _WORST = 0.1
 _LARGE_MISS, _ASKEW = 2.0, 0.2  # deg, rad
@@ -117,14 +115,14 @@ def nominal_output(holds: Holds, record: Calibration, unit: str) -> Array:
     if not found:
         raise DataError(
             f"{holds.recordings[0].name}: columns gyro_x gyro_y gyro_z are in {unit}, of which turns between attitudes "
-            f"tell the scale; expected a tumble of {_FEWEST} attitudes or more: {why}"
+            f"tell the scale; expected a tumble of {TURNED} attitudes or more: {why}"
         )
     return np.asarray(np.mean(found, axis=0), dtype=np.float64)
 
 
 def _turns(attitudes: Attitudes) -> bool:
     """Whether a recording has attitudes enough for turns to tell anything; one that rests while it drifts has one."""
-    return attitudes.pieces is not None and len(np.unique(attitudes.pieces[:, 2])) >= _FEWEST
+    return attitudes.pieces is not None and len(np.unique(attitudes.pieces[:, 2])) >= TURNED
 
 
 def scale_from_turns(
@@ -210,7 +208,7 @@ def _by_sensitivity(solved: Solved) -> Array:
 def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> ScaleLaws:
     """Return the polynomials through what each recording says; `known` is the covariance of what all share."""
     temperature = np.array([each.temperature for each in found])
-    degree = 1 if clusters_of(temperature).max() + 1 >= _LAW_AT else 0
+    degree = 1 if clusters_of(temperature).max() + 1 >= FOLLOWED else 0
     laws = Laws(over.low, over.high, (0, degree, 0))
     functions = np.polynomial.chebyshev.chebvander(laws.place(temperature), degree)
     size, n = 3 * (degree + 1), len(found)

@@ -10,8 +10,9 @@ import numpy as np
 
 from imulab.errors import ObservabilityError, OptionError
 from imulab.procedures.inputs import Data
-from imulab.procedures.thermal.choices import APART, DEGREES, LEAST_SPAN, degrees_of
+from imulab.procedures.thermal.choices import APART, DEGREES, LEAST_SPAN, degrees_of, further_of
 from imulab.procedures.thermal.design import Design, exchange, nodes, way
+from imulab.procedures.thermal.gyroplan import noise_and_scatter, plan_gyroscopes
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.planned import PlannedSoak, ThermalPlan, Tried
 from imulab.procedures.tumble.plan import shortest_path, sphere_candidates
@@ -38,6 +39,9 @@ def plan_thermal(
     turn_on_scatter: float | str = "0.1 mg",
     degrees: str | tuple[int, int, int] = DEGREES,
     from_: Data = "sphere",
+    with_: str | Sequence[str] = (),
+    gyro_noise: float | str = "0.3 deg/sqrt(h)",
+    gyro_turn_on_scatter: float | str = "0.01 deg/s",
 ) -> ThermalPlan:
     """Choose soaks and attitudes for a calibration over temperature, and predict the corrected force over the range.
 
@@ -62,6 +66,12 @@ def plan_thermal(
         Of the laws of bias, scale factor and misalignment that the plan is for.
     from_
         Where attitudes may lie, as for `plan_tumble`.
+    with_
+        ``"gyro"``: predict what the same soaks give of the gyroscopes, too.
+    gyro_noise
+        Angle random walk of the gyroscopes, rad/sqrt(s), over all of an attitude's time.
+    gyro_turn_on_scatter
+        Standard deviation of each of their biases from one power cycle to the next, rad/s.
 
     Raises
     ------
@@ -88,6 +98,7 @@ def plan_thermal(
     tau = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "mg") / STANDARD_GRAVITY
     if not 0 <= tau < 1:
         raise OptionError(f"turn_on_scatter {turn_on_scatter!r}: expected 0 or more, less than 1 g")
+    further = noise_and_scatter(gyro_noise, gyro_turn_on_scatter) if further_of(with_, "with_") else None
     given = candidates_of(from_)
     points = sphere_candidates() if given is None else given
     options = _allowed(count, **sizes)
@@ -104,8 +115,13 @@ def plan_thermal(
     covariance, sets = _best(design, points, _counts(design, **sizes))
     deviation = sigma * STANDARD_GRAVITY * design.deviations(covariance)
     unit = sigma * STANDARD_GRAVITY
+    soaks_of = tuple(_scheduled(design, sets, sizes["soak"], sizes["attitude"]))
+    gyro = None
+    if further is not None:
+        placed = [(each.temperature, each.directions) for each in soaks_of]
+        gyro = plan_gyroscopes(laws, design.places, placed, (sizes["soak"], sizes["attitude"]), *further)
     return ThermalPlan(
-        soaks=tuple(_scheduled(design, sets, sizes["soak"], sizes["attitude"])),
+        soaks=soaks_of,
         degrees=laws.degrees,
         temperature=design.places,
         deviation=deviation,
@@ -117,6 +133,7 @@ def plan_thermal(
         tried=tuple(
             Tried(k, n, unit * float(np.sqrt(cost)), unit * worst) for (k, n), (cost, worst) in found if cost < np.inf
         ),
+        gyro=gyro,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from imulab.atomic_write import write_page
 from imulab.procedures.thermal.degrees import spoken_degrees
+from imulab.procedures.thermal.gyroplan import GyroPlan, hourly
 from imulab.procedures.tumble.plan import roll_pitch
 from imulab.procedures.tumble.sheet import attitude_picture
 from imulab.recording import Array, Recording
@@ -22,6 +23,7 @@ from imulab.units import from_si
 from imulab.writers import write_csv
 
 _ROWS = 9
+_RATE = "#7a4f9a"
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ class ThermalPlan(Shown):
         That was available, s.
     tried
         The numbers of soaks that were compared.
+    gyro
+        What is predicted of the gyroscopes, None unless it was asked for.
     """
 
     soaks: tuple[PlannedSoak, ...]
@@ -94,6 +98,7 @@ class ThermalPlan(Shown):
     turn_on_scatter: float
     time: float
     tried: tuple[Tried, ...]
+    gyro: GyroPlan | None = None
 
     @property
     def duration(self) -> float:
@@ -120,13 +125,19 @@ class ThermalPlan(Shown):
             f"mean over {low:g} to {high:g} degC), {_ug(self.deviation[worst])} ug where they are worst, at "
             f"{self.temperature[worst]:.0f} degC; the turn-on offset of each later power cycle comes on top. "
             f"{free} independent offsets will tell the turn-on scatter."
+            + ("" if self.gyro is None else f" {self.gyro.said(self.temperature)}")
         )
 
     @property
     def predicted(self) -> list[tuple[str, str, str]]:
-        """Standard deviation of the corrected force at temperatures over the range: name, text and unit."""
+        """Standard deviation of the corrected force, and rate, at temperatures over the range: name, text and unit."""
         places = np.linspace(0, len(self.temperature) - 1, _ROWS).round().astype(int).tolist()
-        return [(f"corrected force at {self.temperature[k]:.0f} degC", _ug(self.deviation[k]), "ug") for k in places]
+        at = [f"at {self.temperature[k]:.0f} degC" for k in places]
+        found = [(f"corrected force {one}", _ug(self.deviation[k]), "ug") for one, k in zip(at, places, strict=True)]
+        if self.gyro is not None:
+            rates = self.gyro.deviation[places].tolist()
+            found += [(f"corrected rate {one}", hourly(u), "deg/h") for one, u in zip(at, rates, strict=True)]
+        return found
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return the plan in a few sentences, and the schedule."""
@@ -199,7 +210,7 @@ class ThermalPlan(Shown):
         write_page(path, self.sheet())
 
     def plot(self) -> Plot:
-        """Return the standard deviation of the corrected force over temperature, and where the soaks are."""
+        """Return the standard deviation of the corrected force, and rate, over temperature, and where soaks are."""
         at = np.array([soak.temperature for soak in self.soaks])
         traces: list[dict[str, Any]] = [
             {"type": "scatter", "mode": "lines", "name": "predicted", "x": np.round(self.temperature, 3).tolist(),
@@ -213,6 +224,13 @@ class ThermalPlan(Shown):
             "yaxis": axis("sd of the corrected force, ug", rangemode="tozero"),
             "legend": LEGEND,
         }
+        if self.gyro is not None:
+            traces[0]["name"] = "force"
+            own = [float(hourly(value)) for value in self.gyro.deviation]
+            line = {"color": _RATE, "width": 2, "dash": "dash"}
+            traces.insert(1, {**traces[0], "name": "rate at rest", "y": own, "yaxis": "y2", "line": line})
+            right = axis("sd of the rate at rest, deg/h", rangemode="tozero", overlaying="y", side="right")
+            layout |= {"yaxis2": {**right, "showgrid": False}, "margin": {"r": 75}}
         caption = "Of a component, root mean square over directions, without the turn-on offset of the day."
         return Plot(Figure("What the laws will give", caption, traces, layout, message=self.lead), "Thermal plan")
 

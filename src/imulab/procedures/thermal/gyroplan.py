@@ -1,0 +1,138 @@
+"""What a schedule over temperature gives of the gyroscopes: rates at rest, and the turns that scale factors take.
+
+Each axis by itself, as `imulab.procedures.thermal.gyro` fits it: the law of its bias, its g-sensitivity and an offset
+of each power cycle, from means at rest whose noise is that of the angle random walk and of the Earth's rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imulab.errors import OptionError
+from imulab.procedures.thermal.choices import FOLLOWED, TURNED
+from imulab.procedures.thermal.gyro import EARTH
+from imulab.procedures.thermal.model import Laws
+from imulab.quantities import RANDOM_WALK, in_si, of_units
+from imulab.recording import Array
+from imulab.units import from_si
+
+
+@dataclass(frozen=True)
+class GyroPlan:
+    """What a plan over temperature will give of the gyroscopes.
+
+    Attributes
+    ----------
+    deviation
+        Standard deviation of a component of the corrected rate at rest at the plan's temperatures, root mean square
+        over attitudes, rad/s, shape (m,).
+    noise
+        Angle random walk, rad/sqrt(s).
+    turn_on_scatter
+        Of the biases from one power cycle to the next, rad/s.
+    turns, turned_at
+        Turns between attitudes that tell scale factors, and at how many temperatures: of soaks of nine attitudes or
+        more.
+    needed
+        Time in which each soak has nine attitudes, s.
+    """
+
+    deviation: Array
+    noise: float
+    turn_on_scatter: float
+    turns: int
+    turned_at: int
+    needed: float
+
+    @property
+    def mean(self) -> float:
+        """Root of the mean square of `deviation`, rad/s."""
+        return float(np.sqrt(np.mean(self.deviation**2)))
+
+    def said(self, temperature: Array) -> str:
+        """Return what the plan predicts in sentences; `temperature` as of the plan, degC."""
+        worst = int(np.argmax(self.deviation))
+        known = f"{hourly(self.mean)} deg/h, {hourly(self.deviation[worst])} deg/h where they are worst"
+        walk = f"{self.noise / RANDOM_WALK['deg/sqrt(h)']:.3g} deg/sqrt(h)"
+        return (
+            f"The gyroscopes' laws will give a component of the rate at rest to {known}, at "
+            f"{temperature[worst]:.0f} degC, by an angle random walk of {walk}, {hourly(self.turn_on_scatter)} deg/h "
+            f"of turn-on scatter and the Earth's rate from unknown directions. {self._turned()}"
+        )
+
+    def _turned(self) -> str:
+        if not self.turns:
+            return (
+                f"No soak has the {TURNED} attitudes whose turns tell scale factors: these soaks with as many take "
+                f"{self.needed / 3600:.3g} h."
+            )
+        follow = "and how they follow it" if self.turned_at >= FOLLOWED else "taken as constant"
+        at = "temperature" if self.turned_at == 1 else "temperatures"
+        return f"{self.turns} turns at {self.turned_at} {at} will tell scale factors, {follow}."
+
+
+def hourly(rate: float) -> str:
+    """Return a rate in deg/h, as text."""
+    return f"{from_si(float(rate), 'deg/h'):.3g}"
+
+
+def noise_and_scatter(noise: float | str, turn_on_scatter: float | str) -> tuple[float, float]:
+    """Return the angle random walk, rad/sqrt(s), and the scatter of biases between power cycles, rad/s.
+
+    Raises
+    ------
+    OptionError
+        One is out of range.
+    """
+    walk = of_units(noise, "gyro_noise", RANDOM_WALK)
+    tau = in_si(turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
+    if not 0 < walk < 1:
+        raise OptionError(f"gyro_noise {noise!r}: expected more than 0, less than 1 rad/sqrt(s)")
+    if not 0 <= tau < 1:
+        raise OptionError(f"gyro_turn_on_scatter {turn_on_scatter!r}: expected 0 or more, less than 1 rad/s")
+    return walk, tau
+
+
+def plan_gyroscopes(
+    laws: Laws, places: Array, soaks: Sequence[tuple[float, Array]], times: tuple[float, float], walk: float, tau: float
+) -> GyroPlan:
+    """Predict what soaks give of gyroscopes.
+
+    Parameters
+    ----------
+    laws
+        Of the accelerometers, whose degree of the bias the gyroscopes' have too.
+    places
+        Temperatures at which to predict, degC, shape (m,).
+    soaks
+        Temperature, degC, and upward directions, (n, 3), of each.
+    times
+        Of a soak, and of an attitude, all of which counts as rest, s.
+    walk, tau
+        As of `noise_and_scatter`.
+    """
+    size = laws.degrees[0] + 1
+    variance = walk**2 / times[1] + EARTH**2 / 3
+    information = np.zeros((size + 3, size + 3))
+    for temperature, up in soaks:
+        law = np.tile(laws.design(np.array([temperature]))[0, 0, :size], (len(up), 1))
+        rows = np.hstack([law, up])
+        common = rows.sum(axis=0)
+        share = tau**2 / (variance + len(up) * tau**2)
+        information += (rows.T @ rows - share * np.outer(common, common)) / variance
+    covariance = np.linalg.inv(information)
+    functions = laws.design(places)[:, 0, :size]
+    at_rest = np.einsum("ma,ab,mb->m", functions, covariance[:size, :size], functions)
+    counts = [len(up) for _, up in soaks]
+    enough = [(temperature, count) for (temperature, _), count in zip(soaks, counts, strict=True) if count >= TURNED]
+    return GyroPlan(
+        deviation=np.sqrt(at_rest + np.trace(covariance[size:, size:]) / 3),
+        noise=walk,
+        turn_on_scatter=tau,
+        turns=sum(count - 1 for _, count in enough),
+        turned_at=len({temperature for temperature, _ in enough}),
+        needed=len(soaks) * (times[0] + TURNED * times[1]),
+    )
