@@ -7,6 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
+from reference import rate as reference
 
 FREQUENCY = 100.0
 BIAS = np.array([0.3, -0.2, 0.5])
@@ -179,6 +180,22 @@ def test_a_first_motion_is_whole_within_a_fifth_of_a_turn():
     assert il.fit_turns(turned([1, 3, -3, -1], 1.08)).turns["z"].count.tolist() == [1, 3, -3, -1]
 
 
+def test_turns_that_wobble_in_a_cone_are_composed_where_the_integral_about_one_axis_errs():
+    """An axis that cones at 1 deg, five times a turn: ``d^2 (m - 1) / 2`` is -914 ppm at full d."""
+    counts, frequency = [1] * 5 + [-1] * 5, 40.0
+    rates = reference.wobbling_turns(counts, frequency, wobble=1.0, rounds=-5, stops=np.zeros(11), speed=180, rest=1)
+    found = il.fit_turns({"gyro": np.degrees(1.02 * rates)}, rate=frequency, unit="deg/s").turns["z"]
+    assert found.scale / 1.02 - 1 == pytest.approx(0, abs=10e-6)
+    moving = np.abs(rates).max(axis=1) > 0
+    edges = np.flatnonzero(np.diff(moving.astype(int))).reshape(-1, 2) + 1
+    angles = [rates[a:b, 2].sum() / frequency for a, b in edges.tolist()]
+    one_axis = np.dot(counts, angles) / 10 / (2 * np.pi) - 1
+    u = (np.arange(1000) + 0.5) / 1000
+    size = np.radians(1.0) ** 2 * np.mean((1 - np.cos(np.pi * u) ** 8) ** 2 * (1 - np.cos(2 * np.pi * u)))
+    assert one_axis == pytest.approx(size * (-5 - 1) / 2, rel=0.03)
+    assert abs(one_axis) > 4 * 185e-6
+
+
 @pytest.mark.parametrize("size", [4, 10])
 def test_stamps_in_bursts_are_evened_and_said(size):
     """Samples taken evenly, stamped as blocks of them arrive: 0.2 ms apart, then a pause."""
@@ -189,6 +206,28 @@ def test_stamps_in_bursts_are_evened_and_said(size):
     assert found.turns["z"].scale == pytest.approx(1.02, abs=100e-6)
     assert any("time stamps come in bursts" in w and "taken as even" in w for w in found.calibration.warnings)
     assert not any("bursts" in w for w in il.fit_turns(made).calibration.warnings)
+
+
+def test_stamps_in_late_bursts_err_by_a_percent_if_they_are_believed():
+    """Blocks of 0.2 s that come up to 50 ms late, turns of a second: slope of the angle at stops over turns."""
+    counts, size, speed, believed, evened = [1, -1, 3, -3], 20, 360, [], []
+    made = turned(counts, 1.02, noise=1e-3, speed=speed)
+    lengths = [round(360 * abs(count) / speed * FREQUENCY) + 300 for count in counts]
+    stops = 150 + np.concatenate([[0], np.cumsum(lengths)])
+    count = np.arange(len(made))
+    for seed in range(12):
+        late = np.random.default_rng(seed).uniform(0, 0.05, len(made) // size + 1)[count // size]
+        stamps = count // size * size / FREQUENCY + count % size * 2e-4 + late
+        z = made.column("gyro_z") - BIAS[2]
+        angle = np.concatenate([[0], np.cumsum((z[1:] + z[:-1]) / 2 * np.diff(stamps))])[stops]
+        believed.append(np.polyfit(360 * np.cumsum([0, *counts]), angle, 1)[0] / 1.02 - 1)
+        found = il.fit_turns(_with(made, time=stamps))
+        evened.append(found.turns["z"].scale / 1.02 - 1)
+        assert any("time stamps come in bursts" in w for w in found.calibration.warnings)
+    assert np.abs(believed).max() > 1e-2
+    assert np.sqrt(np.mean(np.square(believed))) > 5e-3
+    assert np.abs(evened).max() < 1e-3
+    assert np.sqrt(np.mean(np.square(evened))) < 3e-4
 
 
 def test_stamps_that_jitter_as_the_samples_do_are_kept():

@@ -83,3 +83,28 @@ def hand_turns(axes, counts, frequency, arm, tilt=0.0, speed=120.0, stops=None):
             between = (1 - share) * np.asarray(axes[face]) + share * np.asarray(axes[face + 1])
             forces.append(9.80665 * between / np.linalg.norm(between, axis=1)[:, None])
     return np.vstack(rates), np.vstack(forces)
+
+
+def wobbling_turns(counts, frequency, wobble, rounds, stops, speed=180.0, rest=1.5):
+    """Body rate of a unit that is turned by hand, rests between, while its axis cones at `wobble` deg.
+
+    The attitude is ``Rz(psi) Rx(alpha) Ry(beta)``, ``alpha = d sin(m psi)``, ``beta = d cos(m psi)``, m rounds a turn;
+    d, which is 0 at the rests, is `wobble` in between. Stops are off by `stops`, deg.
+    """
+    still = np.zeros((round(rest * frequency), 3))
+    parts = [still]
+    for k, count in enumerate(counts):
+        whole = (360.0 * count + stops[k + 1] - stops[k]) * DEGREE
+        duration = round(2 * abs(whole) / (speed * DEGREE) * frequency) / frequency
+        u = np.arange(1, round(duration * frequency)) / frequency / duration
+        psi, turn = whole * (u - np.sin(2 * np.pi * u) / (2 * np.pi)), whole / duration * (1 - np.cos(2 * np.pi * u))
+        d = wobble * DEGREE * (1 - np.cos(np.pi * u) ** 8)
+        grows = wobble * DEGREE * 8 * np.pi / duration * np.cos(np.pi * u) ** 7 * np.sin(np.pi * u)
+        sine, cosine = np.sin(rounds * psi), np.cos(rounds * psi)
+        a, b = d * sine, d * cosine
+        of_a, of_b = grows * sine + d * rounds * turn * cosine, grows * cosine - d * rounds * turn * sine
+        x = of_a * np.cos(b) - turn * np.cos(a) * np.sin(b)
+        y = of_b + turn * np.sin(a)
+        z = of_a * np.sin(b) + turn * np.cos(a) * np.cos(b)
+        parts += [np.column_stack([x, y, z]), still]
+    return np.vstack(parts)

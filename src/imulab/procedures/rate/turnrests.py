@@ -140,7 +140,11 @@ def _of_mean(rate: Array) -> Array:
 
 
 def composed(steps: Array) -> Array:
-    """Return the quaternion of small turns one after the other, rad, shape (n, 3), by halving their number."""
+    """Return the quaternion of small turns one after the other, rad, shape (n, 3), by halving their number.
+
+    Each is taken from its integrated rates by the turn before (Bortz, IEEE Trans. AES-7 (1971) 61): ``a x b / 12``.
+    """
+    steps = steps + np.vstack([np.zeros(3), np.cross(steps[:-1], steps[1:]) / 12])
     size = np.linalg.norm(steps, axis=1, keepdims=True)
     found = np.hstack([np.cos(size / 2), steps * np.sinc(size / 2 / np.pi) / 2])
     while len(found) > 1:
