@@ -1,6 +1,7 @@
 """What each recording gives alone, beside the laws: held against a tumble calibration of that recording."""
 
 import numpy as np
+import pytest
 
 import imulab as il
 from imulab.procedures.thermal.gyrorecord import gyro_scale_predicted
@@ -27,7 +28,7 @@ def soaks(attitudes, offset=0.0):
         columns = {f"accel_{a}": outputs[:, k] for k, a in enumerate("xyz")}
         columns |= {f"std_accel_{a}": np.full(attitudes, NOISE * G) for a in "xyz"}
         units = dict.fromkeys(columns, "m/s^2") | {"temperature": "degC"}
-        columns["temperature"] = np.full(attitudes, float(at))
+        columns["temperature"] = at + 1e-3 * (-1.0) ** np.arange(attitudes)  # a thermometer of fine steps
         made.append(il.Recording(columns, units, {"gravity": f"{G} m/s^2"}, f"soak_{number}"))
     return triad, made
 
@@ -42,7 +43,7 @@ def test_each_equals_the_tumble_calibration_of_its_recording():
     record = il.fit_thermal(given, degrees="3,2,1", gravity=f"{G}+-0").calibration
     alone = record.data["calibrations"]
     assert alone["recording"] == [each.name for each in given]
-    assert alone["temperature"] == [-20, 0, 20, 40, 60]
+    assert alone["temperature"] == pytest.approx([-20, 0, 20, 40, 60], abs=1e-9)
     for row, u, recording in zip(alone["values"], alone["standard_uncertainty"], given, strict=True):
         tumble = il.fit_tumble(recording, order=1, gravity=f"{G}+-0").calibration
         expected = np.array([tumble.value(name) for name in NAMES])
@@ -119,8 +120,28 @@ def test_a_misalignment_that_attitudes_at_one_temperature_do_not_show_is_named()
     made = {ramps: il.simulate_thermal(ramps=ramps, turn_on="0", seed=2) for ramps in (3, 4)}
     given = {ramps: [each for each in m if "ramp" in each.name or "25" in each.name] for ramps, m in made.items()}
     few, more = (il.fit_thermal(given[ramps], turn_on_scatter="0.1 mg").calibration for ramps in (3, 4))
-    said = "attitudes at one temperature alone do not tell whether misalignment follows it"
+    said = "the holds do not tell whether misalignment follows the temperature"
     assert few.model["degrees"]["misalignment"] == 0
     assert any(said in warning for warning in few.warnings)
     assert more.model["degrees"]["misalignment"] == 1
     assert not any(said in warning for warning in more.warnings)
+
+
+def test_a_thermometer_in_whole_kelvins_widens_what_each_recording_gives_alone():
+    """Points are drawn where the thermometer reads, half a kelvin off at most: 0.3 mg/K of bias moves them so far."""
+    standard = []
+    for seed in range(6):
+        rng = np.random.default_rng([43, seed])
+        triad, made = reference.Triad(rng), []
+        for at in np.array([-20.0, 0.0, 20.0, 40.0, 60.0]) + rng.uniform(-0.5, 0.5, 5):
+            outputs = np.array([triad.output(G * u, at) for u in reference.directions(rng, 24)])
+            outputs += NOISE * G * rng.standard_normal(outputs.shape)
+            columns = {f"accel_{a}": outputs[:, k] for k, a in enumerate("xyz")}
+            columns |= {f"std_{name}": np.full(24, NOISE * G) for name in columns}
+            units = dict.fromkeys(columns, "m/s^2") | {"temperature": "degC"}
+            columns["temperature"] = np.full(24, round(at))
+            made.append(il.Recording(columns, units, {"gravity": f"{G} m/s^2"}, f"soak_{round(at)}"))
+        alone = il.fit_thermal(made, degrees="3,2,1").calibration.data["calibrations"]
+        for reading, row, u in zip(alone["temperature"], alone["values"], alone["standard_uncertainty"], strict=True):
+            standard += [(row[k] - triad.at(reading)[0][k]) / u[k] for k in range(3)]
+    assert 0.7 < np.sqrt(np.mean(np.square(standard))) < 1.3

@@ -34,9 +34,10 @@ def own_calibrations(problem: Problem, solution: Solution) -> list[Own]:
     """Return the calibration that each recording gives alone, where it can, and a prior's.
 
     The laws at the temperature of each hold, and nine constants added to them, fitted to ``|f| = g`` of the
-    recording's holds: one Gauss-Newton step, because the laws are already near.
+    recording's holds: one Gauss-Newton step, because the laws are already near. The uncertainty holds that of the
+    temperature, which moves the point along the laws.
     """
-    parameters, _, _, _ = parameters_of(problem, solution.laws, solution.coefficients)
+    parameters, _, _, slope = parameters_of(problem, solution.laws, solution.coefficients)
     force, change = forces(parameters, problem.reading)
     length = np.linalg.norm(force, axis=1)
     columns = np.einsum("ni,nij->nj", force / length[:, None], change)
@@ -56,7 +57,8 @@ def own_calibrations(problem: Problem, solution: Solution) -> list[Own]:
             continue
         inverse = np.linalg.pinv(matrix)
         values = parameters[own].mean(axis=0) - inverse @ (weight[own] * residual[own])
-        u = np.sqrt((inverse**2).sum(axis=1))
+        by_heat = (slope[own] * problem.step[own, None]).mean(axis=0)
+        u = np.sqrt((inverse**2).sum(axis=1) + by_heat**2)
         found.append(Own(number, float(problem.temperature[own].mean()), values, u))
     if problem.known is not None:
         temperature, values, covariance = problem.known

@@ -57,12 +57,17 @@ class Step:
 
 @dataclass(frozen=True)
 class Found:
-    """Laws that were fitted: the solution, what was compared on the way, temperatures left out, what the rows tell."""
+    """Laws that were fitted: the solution, what was compared on the way, temperatures left out, what the rows tell.
+
+    `missed`: higher degrees that the holds need, and how probable what these add would be by chance, where the degrees
+    were stated.
+    """
 
     solution: Solution
     steps: list[Step]
     left_out: list[LeftOut]
     view: Observability
+    missed: tuple[Degrees, float] | None = None
 
 
 def clusters_of(temperature: Array) -> NDArray[np.int64]:
@@ -178,6 +183,8 @@ def choose(
     """
     cluster = clusters_of(problem.temperature)
     knots = _knots(problem.temperature, cluster, laws)
+    limit = max(len(knots) - 2, 0)
+    highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
     if wanted != "auto":
         own = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots if spline else ())
         if max(own.degrees) >= len(knots) or (spline and len(knots) < LEAST_KNOTS):
@@ -189,9 +196,8 @@ def choose(
         solution, view = _observable(problem, own, tau, name)
         solution = _bounded(problem, solution, tau)
         held = left_out(splits(solution, cluster), np.ones(own.size, dtype=np.bool_))
-        return Found(solution, [], _at(held, problem, cluster), view)
-    limit = max(len(knots) - 2, 0)
-    highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
+        missed = _missed(problem, solution, highest, tau, name)
+        return Found(solution, [], _at(held, problem, cluster), view, missed)
     found = _descended(problem, highest, cluster, tau, name)
     steps = found.steps
     if len(knots) >= LEAST_KNOTS:
@@ -211,6 +217,28 @@ def choose(
         for step in steps
     }
     return replace(found, steps=list(unique.values()), left_out=_at(found.left_out, problem, cluster))
+
+
+def _missed(
+    problem: Problem, solution: Solution, highest: Laws, tau: float | None, name: str
+) -> tuple[Degrees, float] | None:
+    """Return the degrees that ``auto`` starts from, as far as the holds tell them, if stated ones are too low (1 %)."""
+    own = solution.laws
+    bias, scale, misalignment = (max(pair) for pair in zip(own.degrees, highest.degrees, strict=True))
+    larger = replace(own, degrees=(bias, scale, misalignment))
+    try:
+        higher, _ = _highest(problem, larger, tau, name)
+    except ObservabilityError:
+        return None
+    added = [
+        place
+        for part, before in zip(higher.laws.parts, own.parts, strict=True)
+        for place in range(part.start + before.stop - before.start, part.stop)
+    ]
+    if not added:
+        return None
+    probability = _wald(higher, np.eye(higher.laws.size)[added])
+    return (higher.laws.degrees, probability) if probability < _INSIGNIFICANT else None
 
 
 def _bounded(problem: Problem, solution: Solution, tau: float | None) -> Solution:

@@ -18,6 +18,7 @@ from imulab.procedures.thermal.model import AXES, GROUPS, Laws
 from imulab.procedures.thermal.rows import Problem, together
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Solution
+from imulab.procedures.thermal.untold import untold
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.verdict import Note
@@ -243,20 +244,22 @@ def _findings(
                 "scatter between power cycles, an upper bound: come back to temperatures to learn more"
             )
         )
-    found += disagreements(holds, problem, solution, name)
+    if fitted.missed:
+        higher, probability = fitted.missed
+        found.append(
+            f"{name}: degrees {solution.laws.spelled} are too low: what {','.join(map(str, higher))} add has a "
+            f"probability of {probability:.1g} by chance, and no uncertainty holds what is missing: state higher "
+            "ones, or leave --degrees out"
+        )
+    else:
+        found += disagreements(holds, problem, solution, name)
     if options["degrees"] == "auto" and not solution.laws.degrees[0] and solution.scatter.tau[0] > 0:
         found.append(
             f"{name}: the recordings' biases differ by {1e3 * solution.scatter.tau[0]:.2g} mg (standard deviation); so "
             "few recordings do not tell whether by their temperature or from power cycle to power cycle: record five "
             "temperatures or more, or state --degrees"
         )
-    moved = holds.group < 0
-    if not solution.laws.degrees[2] and not clusters_of(holds.temperature[moved]).any():
-        found.append(
-            f"{name}: attitudes at one temperature alone do not tell whether misalignment follows it, which is taken "
-            "as constant: one that moves by 10 urad/K, as is usual, errs biases by about 0.1 mg, which no uncertainty "
-            "holds: one more ramp, -x up, or attitudes at another temperature would tell"
-        )
+    found += untold(problem, solution, name)
     if options["degrees"] == "auto":
         found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > _WORSE**2]
