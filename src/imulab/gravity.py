@@ -124,26 +124,38 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
     return [gravity.note] if gravity.note else []
 
 
-def gravity_option(gravity: str | None, latitude: str | None, height: str | None, label: str) -> Gravity | None:
+def gravity_option(
+    gravity: str | None, latitude: str | None, height: str | None, label: str, *, beside: bool = False
+) -> Gravity | None:
     """Return the gravity that options state, or None; `label` is how messages call an option (``"--{}"``).
+
+    `beside` as for `at_place`.
 
     Raises
     ------
     OptionError
         An option is no quantity of its kind, is out of range, or does not go with another.
     """
-    found = at_place(gravity, latitude, height, label)
+    found = at_place(gravity, latitude, height, label, beside=beside)
     return stated_gravity(found, label.format("gravity")) if isinstance(found, str) else found
 
 
 def at_place(
-    gravity: Given, latitude: float | str | None, height: float | str | None, label: str = "{}"
+    gravity: Given,
+    latitude: float | str | None,
+    height: float | str | None,
+    label: str = "{}",
+    *,
+    beside: bool = False,
 ) -> Given | Gravity:
     """Return normal gravity at a place where one is given, else `gravity`; errors as for `gravity_option`.
 
-    Latitude in rad and height in m, or texts; the last digit of a text counts as rounded.
+    Latitude in rad and height in m, or texts; the last digit of a text counts as rounded. `beside` says that the
+    latitude tells the Earth's rate too, and so may stand beside a gravity, which then counts.
     """
     names = {name: label.format(name) for name in ("gravity", "latitude", "height")}
+    if beside and gravity is not None and height is None:
+        return gravity
     if gravity is not None and (latitude is not None or height is not None):
         raise OptionError(
             f"{names['gravity']} together with {names['latitude']} or {names['height']}: expected one or the other"
@@ -242,6 +254,17 @@ def _of_head(recording: Recording) -> Gravity | None:
     return Gravity(found.value, f"head of {recording.name}", found.standard_uncertainty, Note(said))
 
 
+def checked_latitude(latitude: float, name: str = "latitude") -> float:
+    """Return a latitude, rad; refuse what is none in the words of `normal_gravity`, under this name."""
+    if not isinstance(latitude, numbers.Real):
+        raise OptionError(f"{name} {quoted(latitude)}: expected a number, in rad and m")
+    if not abs(latitude) <= math.pi / 2 * (1 + 1e-12):
+        degrees = 2 * math.pi < abs(latitude) <= 90.0
+        hint = f'; numbers are rad, degrees are written "{latitude:g} deg"' if degrees else ""
+        raise OptionError(f"{name} {math.degrees(latitude):g} deg: expected -90 to 90 deg{hint}")
+    return latitude
+
+
 def normal_gravity(latitude: float | str, height: float | str = 0.0) -> float:
     """Return the magnitude of normal gravity.
 
@@ -278,17 +301,11 @@ def normal_gravity(latitude: float | str, height: float | str = 0.0) -> float:
     >>> round(il.normal_gravity("48.1 deg", "520 m"), 5)
     9.80739
     """
-    if isinstance(latitude, str):
-        latitude = in_si(latitude, "latitude", "angle", "deg")
+    latitude = checked_latitude(in_si(latitude, "latitude", "angle", "deg") if isinstance(latitude, str) else latitude)
     if isinstance(height, str):
         height = in_si(height, "height", "length", "m")
-    for called, value in (("latitude", latitude), ("height", height)):
-        if not isinstance(value, numbers.Real):
-            raise OptionError(f"{called} {quoted(value)}: expected a number, in rad and m")
-    if not abs(latitude) <= math.pi / 2 * (1 + 1e-12):
-        degrees = 2 * math.pi < abs(latitude) <= 90.0
-        hint = f'; numbers are rad, degrees are written "{latitude:g} deg"' if degrees else ""
-        raise OptionError(f"latitude {math.degrees(latitude):g} deg: expected -90 to 90 deg{hint}")
+    if not isinstance(height, numbers.Real):
+        raise OptionError(f"height {quoted(height)}: expected a number, in rad and m")
     if not -500.0 <= height <= 10000.0:
         raise OptionError(f"height {height:g} m: expected -500 to 10000 m")
     sine_squared = math.sin(latitude) ** 2

@@ -41,21 +41,33 @@ class Gyros:
 
 
 def turned(up, axis, angle):
-    """Directions `up` (3,) turned about a unit vector by angles (n,): Rodrigues' formula."""
+    """Directions `up`, (3,) or (n, 3), turned about a unit vector by angles (n,): Rodrigues' formula."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    return up * c + np.cross(axis, up) * s + axis * (axis @ up) * (1 - c)
+    return up * c + np.cross(axis, up) * s + axis * np.reshape(up @ axis, (-1, 1)) * (1 - c)
 
 
-def motion(rng, count, hold=6.0, turn=2.0, rate=50.0, earth=0.0):
-    """Time, upward direction (n, 3) and rate of the body (n, 3), rad/s: attitudes with a smooth turn between two."""
+EARTH = 7.292115e-5
+
+
+def motion(rng, count, hold=6.0, turn=2.0, rate=50.0, earth=0.0, latitude=None):
+    """Time, upward direction (n, 3) and rate of the body (n, 3), rad/s: attitudes with a smooth turn between two.
+
+    In holds a rate of size `earth` in any direction; or, at a `latitude`, the Earth's rate all the time, in headings
+    that the unit takes at random by a twist about up in each turn.
+    """
     points = directions(rng, count)
     points = points[rng.permutation(count)]
-    up, rates = [], []
+    up, rates, norths = [], [], []
+    if latitude is not None:
+        level = np.cross(points[0], rng.standard_normal(3))
+        north = level / np.linalg.norm(level)
     resting, moving = round(hold * rate), round(turn * rate)
     for k in range(count):
         about = earth * rng.standard_normal(3) / np.sqrt(3)
         up.append(np.tile(points[k], (resting, 1)))
         rates.append(np.tile(about, (resting, 1)))
+        if latitude is not None:
+            norths.append(np.tile(north, (resting, 1)))
         if k + 1 < count:
             axis = np.cross(points[k], points[k + 1])
             angle = np.arctan2(np.linalg.norm(axis), points[k] @ points[k + 1])
@@ -65,7 +77,16 @@ def motion(rng, count, hold=6.0, turn=2.0, rate=50.0, earth=0.0):
             speed = angle / turn * (1 - np.cos(2 * np.pi * share))
             up.append(turned(points[k], axis, angles))
             rates.append(-speed[:, None] * axis)
+            if latitude is not None:
+                twist = rng.uniform(-np.pi, np.pi)
+                rates[-1] = rates[-1] + twist / angle * speed[:, None] * up[-1]
+                whole = np.append(angles, angle)
+                carried = turned(turned(north, points[k], -twist / angle * whole), axis, whole)
+                norths.append(carried[:-1])
+                north = carried[-1]
     up, rates = np.vstack(up), np.vstack(rates)
+    if latitude is not None:
+        rates = rates + EARTH * (np.sin(latitude) * up + np.cos(latitude) * np.vstack(norths))
     return np.arange(len(up)) / rate, up, rates
 
 

@@ -179,6 +179,9 @@ def gyro(
     noise: Annotated[
         str | None, typer.Option(metavar="RECORD", help="Noise record of the same gyroscopes, for u of their biases.")
     ] = None,
+    latitude: Annotated[
+        str | None, typer.Option(metavar="DEG", help="Latitude, deg, for the vertical part of the Earth's rate.")
+    ] = None,
     output: OutputFile = None,
     report: ReportFile = None,
     json: AsJson = False,
@@ -197,7 +200,7 @@ def gyro(
         own = read_recording(accel_file, layout=accel_layout or how["layout"], element=how["element"])
     both = call(
         fit_gyro, record, recording, accel_data=own, fit_bias=fit_bias, g_sensitivity=g_sensitivity, clock=clock,
-        clock_of=clock_of, noise=noise,
+        clock_of=clock_of, noise=noise, latitude=latitude,
     )  # fmt: skip
     finish(
         both.calibration,

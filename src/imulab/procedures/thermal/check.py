@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Unpack
 import numpy as np
 
 from imulab.columns import triad
+from imulab.earth import at_latitude
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.gravity import Gravity, at_place, local_gravity
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
@@ -178,7 +179,8 @@ def check_thermal(
         None if settle is None else in_si(settle, "settle", "time", "s"),
         span=0.0,
     )
-    local = _gravity(held, at_place(gravity, latitude, height), given[0])
+    earth = at_latitude(latitude) if thermal_of(held).model.gyro is not None else None
+    local = _gravity(held, at_place(gravity, latitude, height, beside=earth is not None), given[0])
     holds, notes = _inside(held, find_holds(given))
     unit = thermal_of(held).model.output_unit
     check_holds(holds, local.value, conversion_factor(unit, "m/s^2") if unit in ("m/s^2", "g", "mg") else None)
@@ -190,7 +192,7 @@ def check_thermal(
             "the record does not say how far biases move from one power cycle to the next, so an offset that a whole "
             "recording has in common is not tested: state --turn-on-scatter"
         )
-    gyro, said = check_gyros(held, holds, force, gyro_turn_on_scatter)
+    gyro, said = check_gyros(held, holds, force, gyro_turn_on_scatter, earth)
     notes += said
     notes += [*([local.note] if local.note else []), *_known(held, given)]
     return ThermalCheck(holds, *tested, local, largest, tuple(notes), gyro)

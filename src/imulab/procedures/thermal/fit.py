@@ -9,6 +9,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from imulab.earth import EarthRate, at_latitude
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import Gravity, at_place, local_gravity
@@ -134,7 +135,8 @@ def fit_thermal(
     recordings = prepared([as_recording(one, reading, fit_thermal) for one in given], temperature_column, settling)
     if further:
         check_gyroscopes(recordings)
-    local = local_gravity(at_place(gravity, latitude, height), recordings[0])
+    earth = at_latitude(latitude) if further else None
+    local = local_gravity(at_place(gravity, latitude, height, beside=earth is not None), recordings[0])
     holds = find_holds(recordings)
     nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
     check_holds(holds, local.value, nominal)
@@ -158,6 +160,7 @@ def fit_thermal(
         "gravity": local.value,
         "tilt": leaning,
         "with": list(further) or None,
+        "latitude": None if earth is None else earth.latitude,
         "turn_on_scatter": None if scatter is None else scatter * local.value,
         "gyro_turn_on_scatter": rates,
         "temperature_column": temperature_column,
@@ -166,7 +169,7 @@ def fit_thermal(
     options = {key: value for key, value in options.items() if value is not None}
     record = make_record(holds, problem, found, drift, local, scale, options, name)
     if further:
-        record = _with_gyroscopes(record, holds, problem, found.solution, scale, wanted, rates, name)
+        record = _with_gyroscopes(record, holds, problem, found.solution, scale, wanted, rates, name, earth)
     return ThermalFit(record, found.view, tuple(found.steps), tuple(found.left_out))
 
 
@@ -188,12 +191,14 @@ def _with_gyroscopes(
     wanted: str | Degrees,
     tau: float | None,
     name: str,
+    earth: EarthRate | None,
 ) -> Calibration:
     """Return the record of the accelerometers with the gyroscopes: biases at rest, then scale factors from turns."""
     laws = solution.laws
     force, _ = forces(laws.design(problem.temperature) @ solution.coefficients[: laws.size], problem.reading)
     nominal = nominal_output(holds, record, holds.recordings[0].triad_unit("gyro"))
-    gyros = fit_gyroscopes(rates_at_rest(holds, force, nominal), laws.low, laws.high, wanted, tau, name)
+    rest = replace(rates_at_rest(holds, force, nominal), earth=earth)
+    gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, tau, name)
     turned = scale_from_turns(holds, problem, solution, record, gyros, scale)
     return with_gyroscopes(record, holds, gyros, turned, name)
 

@@ -3,9 +3,10 @@
     M / S = b(T) + G f + W + offset of the power cycle,   b(T) as in `imulab.procedures.thermal.model`
 
 W is the Earth's rate, of which only the size is known: in each attitude it is taken as random, its three parts as
-independent. Errors of the temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise
-are those of `imulab.procedures.thermal.solve`. The g-sensitivity G, the same at all temperatures, is fitted where it is
-significant at 1 % (F).
+independent. Where the latitude is known, so is its vertical part, and the level part alone is random. Errors of the
+temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise are those of
+`imulab.procedures.thermal.solve`. The g-sensitivity G, the same at all temperatures, is fitted where it is significant
+at 1 % (F).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.earth import EARTH
 from imulab.errors import ObservabilityError
 from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.procedures.thermal.choices import DEGREES
@@ -26,8 +28,6 @@ from imulab.procedures.thermal.rows import Rows, whitener
 from imulab.procedures.thermal.solve import Scatter, Solution, between, concluded, excess_of
 from imulab.recording import Array
 
-EARTH = 7.292115e-5
-"""rad/s."""
 _PASSES = 4
 _SIGNIFICANT = 0.01
 _NO_WORSE = 1.0
@@ -36,6 +36,8 @@ _FAR = 8.0
 _TELL = 4
 """Holds of a recording that tell which of them differs."""
 _RANK = 1e-7
+_ASKEW = 0.03
+"""Part of the Earth's rate that is sensed across itself: gyroscopes are askew, or their scale factors off, by that."""
 
 
 @dataclass(frozen=True)
@@ -228,9 +230,9 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
     noise[range(n), :, range(n), :] = held.covariance
     number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
     heat = _spread(number) * (slope * held.step[:, None]).ravel()[:, None]
-    earth = EARTH / np.sqrt(3) * _by_axis(held.attitude)
+    known, earth = _earth(held)
     return Rows(
-        residual=jacobian @ coefficients - held.mean.ravel(),
+        residual=jacobian @ coefficients + known - held.mean.ravel(),
         jacobian=jacobian,
         noise=noise.reshape(3 * n, 3 * n),
         offsets=(_by_axis(held.recording), np.zeros((3 * n, 3))),
@@ -239,6 +241,17 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
         owner=np.repeat(np.arange(n), 3),
         magnitude=np.ones(3 * n, dtype=np.bool_),
     )
+
+
+def _earth(held: RatesAtRest) -> tuple[Array, Array]:
+    """Return what is known of the Earth's rate, (3 n,), and columns of unit variance for what is not, (3 n, 3 k)."""
+    if held.earth is None:
+        return np.zeros(3 * len(held)), EARTH / np.sqrt(3) * _by_axis(held.attitude)
+    up = held.force / np.linalg.norm(held.force, axis=1, keepdims=True)
+    along = up[:, :, None] * up[:, None, :]
+    unknown = held.earth.level / np.sqrt(2) * (np.eye(3) - along) + _ASKEW * EARTH * along
+    columns = np.einsum("nk,nij->nikj", _one_hot(held.attitude), unknown)
+    return (held.earth.vertical * up).ravel(), columns.reshape(3 * len(held), -1)
 
 
 def _one_hot(number: NDArray[np.int64]) -> Array:

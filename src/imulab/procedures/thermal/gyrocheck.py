@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
+from imulab.earth import EarthRate
 from imulab.errors import OptionError, UnitError
 from imulab.procedures.thermal.gyro import rows_of
 from imulab.procedures.thermal.gyroholds import RatesAtRest, rates_at_rest
@@ -56,7 +57,11 @@ class GyroCheck:
 
 
 def check_gyros(
-    record: Calibration, holds: Holds, force: Array, turn_on_scatter: float | str | None
+    record: Calibration,
+    holds: Holds,
+    force: Array,
+    turn_on_scatter: float | str | None,
+    earth: EarthRate | None = None,
 ) -> tuple[GyroCheck | None, list[str]]:
     """Test the outputs at rest under specific forces in g, shape (n, 3); return what is found, and what is to be said.
 
@@ -79,7 +84,11 @@ def check_gyros(
             Note(f"{which}: no columns gyro_x gyro_y gyro_z over time, so the record's gyroscopes are not tested")
         ]
     tau, rank = _scatter(record, turn_on_scatter)
-    held = _rates(record, holds, force)
+    fit = thermal_of(record).fit.gyro
+    assert fit is not None
+    # In a record without a latitude the vertical part is in the g-sensitivities: taken off, it would count twice.
+    known = earth if fit.latitude is not None or not model.gyro.g_sensitivity else None
+    held = replace(_rates(record, holds, force), earth=known)
     degree, laws = model.gyro.degrees.bias, model.gyro_laws
     names, _ = names_and_units(degree, sensitivity=model.gyro.g_sensitivity)
     size = 3 * (degree + 1)
@@ -89,8 +98,6 @@ def check_gyros(
     coefficients = inverse @ np.array([record.value(name) for name in names])
     covariance = inverse @ record.cov(*names) @ inverse.T
     rows = rows_of(held, laws, coefficients, ())
-    fit = thermal_of(record).fit.gyro
-    assert fit is not None
     excess = fit.excess.value**2
     noise = together(rows, excess, np.zeros(2))
     whole = together(rows, excess, np.array([tau or 0.0, 0.0])) + rows.jacobian @ covariance @ rows.jacobian.T

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
+from imulab.earth import EarthRate
 from imulab.errors import DataError, UnitError
 from imulab.estimation.ranked import MAD_TO_SIGMA
 from imulab.estimation.rows import leave_out
@@ -50,6 +51,8 @@ class RatesAtRest:
         Nominal output per rad/s that the means are in units of, shape (3,): 1 where the unit is one of rate.
     notes
         What a user should know of how they were found.
+    earth
+        The Earth's rate, where the latitude is known.
     """
 
     mean: Array
@@ -65,6 +68,7 @@ class RatesAtRest:
     unit: str
     size: Array
     notes: tuple[str, ...]
+    earth: EarthRate | None = None
 
     def __len__(self) -> int:
         return len(self.mean)
@@ -74,7 +78,7 @@ class RatesAtRest:
         return RatesAtRest(
             self.mean[kept], self.covariance[kept], self.force[kept], self.temperature[kept], self.rate[kept],
             self.step[kept], self.shared[kept], self.recording[kept], self.attitude[kept], self.index[kept],
-            self.unit, self.size, self.notes,
+            self.unit, self.size, self.notes, self.earth,
         )  # fmt: skip
 
 

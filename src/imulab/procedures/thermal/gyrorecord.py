@@ -124,6 +124,7 @@ def _fit(gyros: Gyroscopes, *, known: bool) -> dict[str, Any]:
             "from": "argument" if known else "recordings" if solution.scatter.rank else "unknown",
         },
         "g_sensitivity_probability": gyros.probability,
+        "latitude": None if gyros.held.earth is None else gyros.held.earth.latitude,
         **entries(gyros.drift, 1.0, "rad/s"),
         "left_out_temperature": [
             {"temperature": e.temperature, "holds": e.holds, "rms": e.rms, "chi_square": e.chi_square}
@@ -143,7 +144,7 @@ def _data(holds: Holds, gyros: Gyroscopes) -> dict[str, Any]:
 
 
 def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, turned: ScaleLaws | None, name: str) -> list[str]:
-    found = list(gyros.held.notes)
+    found = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
     found += [
         f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
         for index in gyros.aside.tolist()

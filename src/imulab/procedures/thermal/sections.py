@@ -146,6 +146,7 @@ class GyroFit(Part):
     between_recordings: GyroTurnOn
     left_out_temperature: list[LeftOut]
     g_sensitivity_probability: float | None = None
+    latitude: float | None = None
     turns: GyroTurns | None = None
     lag: Tested | None = None
     loop_x: Tested | None = None

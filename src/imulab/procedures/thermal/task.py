@@ -34,7 +34,7 @@ def _fit(
 
 GRAVITY = (
     text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
-    text_option("latitude", "Latitude, deg, for normal gravity.", shows="DEG"),
+    text_option("latitude", "Latitude, deg, for normal gravity; with gyro for the Earth's rate.", shows="DEG"),
     text_option("height", "Height above the ellipsoid, m.", shows="M"),
 )
 OPTIONS = (
@@ -66,13 +66,16 @@ _OF_THE_FIT = ("degrees", "tilt", "turn_on_scatter", "gyro_turn_on_scatter", "se
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.earth import at_latitude
     from imulab.gravity import gravity_option
 
     values = read_options(OPTIONS, texts, label)
     values["with"] = values["with"] or ()
-    gravity = gravity_option(values["gravity"], values["latitude"], values["height"], label)
+    earth = at_latitude(values["latitude"], label.format("latitude")) if values["with"] else None
+    gravity = gravity_option(values["gravity"], values["latitude"], values["height"], label, beside=earth is not None)
     fit = {name: values[name] for name in _OF_THE_FIT}
-    return {**values, "fit": {**fit, "gravity": gravity, "with_": values["with"]}, "part": part_of(values)}
+    fit |= {"gravity": gravity, "with_": values["with"], "latitude": None if earth is None else earth.latitude}
+    return {**values, "fit": fit, "part": part_of(values)}
 
 
 TASK = Task(

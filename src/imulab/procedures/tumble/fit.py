@@ -8,6 +8,7 @@ from typing import Unpack
 
 from numpy.typing import ArrayLike
 
+from imulab.earth import at_latitude
 from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import Gravity, at_place, local_gravity
@@ -108,7 +109,8 @@ def fit_tumble(
         scale factors. Without it that of the recording's head is used, or standard gravity, with a warning.
     latitude, height
         Instead of gravity: where that is normal gravity, as texts (``"47.4 deg"``, ``"400 m"``) or in rad and m; what a
-        place differs by is part of the uncertainty.
+        place differs by is part of the uncertainty. With ``"gyro"`` the latitude is that of `fit_gyro` too, and may
+        stand beside gravity.
     method
         ``"norm"`` or ``"linearised"``.
     loss
@@ -194,7 +196,7 @@ def fit_tumble(
     )  # fmt: skip
     place = stated_place(hemisphere, latitude, dip)
     attitudes = as_attitudes(data, reading, fit_tumble, covariance)
-    local = local_gravity(at_place(gravity, latitude, height), attitudes.recording)
+    local = local_gravity(at_place(gravity, latitude, height, beside="gyro" in further), attitudes.recording)
     check_attitudes(attitudes, local.value)
     scaling = nominal_scaling(attitudes, local.value)
     known = None if prior is None else prior_record(as_record(prior, "fit_tumble: prior"), attitudes)
@@ -212,7 +214,7 @@ def fit_tumble(
     record = make_record(estimate, local, scaling, {k: v for k, v in options.items() if v is not None}, trials)
     record = with_assumed_alignment(record) if estimate.problem.order == 0 else record
     return TumbleFit(
-        calibration=_with_further(record, further, attitudes, local, loss, magnitude, place),
+        calibration=_with_further(record, further, attitudes, local, loss, magnitude, place, latitude),
         observability=estimate.observability,
         orders=estimate.orders,
         residuals=local.value * estimate.found.solution.deviations[0],
@@ -228,6 +230,7 @@ def _with_further(
     loss: str,
     field: float | None,
     place: Place,
+    latitude: float | str | None,
 ) -> Calibration:
     """Return the record with further triads, each fitted on the record of those before it."""
     if "mag" in further:
@@ -241,7 +244,8 @@ def _with_further(
         from imulab.procedures.tumble.gyrorecord import with_gyro
 
         recording = attitudes.recording
-        record = with_gyro(record, fit_gyro(record, attitudes, recording), recording, recording)
+        found = fit_gyro(record, attitudes, recording, earth=at_latitude(latitude))
+        record = with_gyro(record, found, recording, recording)
     return record
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
+from imulab.earth import EarthRate
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.least_squares import Observability, observability
 from imulab.estimation.rows import LeftOut, leave_out
@@ -80,6 +81,8 @@ class GyroFit:
         Start, stop, s, and miss, rad, of turns that stand out and were set aside, shape (k, 3).
     notes
         What a user should know, a sentence each.
+    earth
+        The Earth's rate whose vertical part was taken off; None where the latitude is not known.
     """
 
     scale_factor: Array
@@ -98,6 +101,7 @@ class GyroFit:
     nonlinearity: Nonlinearity | None
     aside: Array
     notes: tuple[str, ...] = ()
+    earth: EarthRate | None = None
 
     @property
     def cost(self) -> float:
@@ -115,6 +119,7 @@ def fit_gyro(
     clock: float = CRYSTAL,
     clock_of: str = "gyro",
     noise: Calibration | None = None,
+    earth: EarthRate | None = None,
 ) -> GyroFit:
     """Calibrate a gyroscope triad from the turns between static attitudes.
 
@@ -133,7 +138,7 @@ def fit_gyro(
     own_force = specific_force(record, moving.triad("accel") * factor)
     force, knocked = specific_force(record, means), aside_of(record, attitudes)
     case = Case(recording.name, attitudes, force, own, own_force, output, unit, fit_bias, knocked)
-    found = solve_turns(case, time, sensitivity)
+    case, found = _begun(case, time, sensitivity, earth)
     time, found, said = _with_even_stamps(case, time, sensitivity, found)
     apart = attitudes.recording is not recording
     comparison = compare_clocks(own, own_force, time, found.rate(output), found.segments, search=apart)
@@ -168,7 +173,17 @@ def fit_gyro(
     linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
     if linearity is not None:
         notes += linearity.notes()
-    return _result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes))
+    return replace(_result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes)), earth=earth)
+
+
+def _begun(case: Case, time: Array, sensitivity: str, earth: EarthRate | None) -> tuple[Case, Solved]:
+    """Return the case, with what is known of the Earth's rate, as output, and the solution."""
+    found = solve_turns(case, time, sensitivity)
+    if earth is None:
+        return case, found
+    up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
+    case = replace(case, earth=found.output_of(earth.vertical * up))
+    return case, solve_turns(case, time, sensitivity)
 
 
 def _check_request(record: Calibration, attitudes: Attitudes, sensitivity: str, clock: float, clock_of: str) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from os import PathLike
 from typing import Any, Unpack
 
+from imulab.earth import at_latitude
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.tumble import gyro
@@ -34,6 +35,7 @@ def fit_gyro(
     clock: float | str = "50 ppm",
     clock_of: str = "gyro",
     noise: Record | None = None,
+    latitude: float | str | None = None,
     **reading: Unpack[Reading],
 ) -> BothTriads:
     """Calibrate a gyroscope triad from the turns between static attitudes.
@@ -60,6 +62,9 @@ def fit_gyro(
     noise
         Record of `fit_noise` of the same gyroscopes, or its file: the biases are no more certain than it says of a mean
         over the time at rest.
+    latitude
+        Of the place, rad or a text such as ``"48.1 deg"``: the vertical part of the Earth's rate is taken off the
+        outputs at rest. Without it that counts as g-sensitivity or scatter, as the level part always does.
     reading
         How arrays and files are to be understood: `rate` or `time`, `unit` or `units`; `layout`, `topic`, `instance`,
         `window`, `element`.
@@ -75,7 +80,7 @@ def fit_gyro(
     ObservabilityError
         The turns cannot separate the parameters.
     OptionError
-        `g_sensitivity`, `clock` or `clock_of` has a value that cannot be.
+        `g_sensitivity`, `clock`, `clock_of` or `latitude` has a value that cannot be.
 
     Examples
     --------
@@ -97,6 +102,6 @@ def fit_gyro(
     found = gyro.fit_gyro(
         known, find_attitudes(own), recording, fit_bias=fit_bias, sensitivity=g_sensitivity,
         clock=in_si(clock, "clock", "number", "ppm"), clock_of=clock_of,
-        noise=None if noise is None else as_record(noise, "fit_gyro: noise"),
+        noise=None if noise is None else as_record(noise, "fit_gyro: noise"), earth=at_latitude(latitude),
     )  # fmt: skip
     return BothTriads(with_gyro(known, found, recording, own), found)

@@ -63,6 +63,7 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
                 "condition_number": fit.observability.condition,
                 "bias": "fitted to the turns" if fit.fit_bias else "from the outputs at rest",
                 "g_sensitivity": "none" if fit.sensitivity is None else "from the outputs at rest",
+                "latitude": None if fit.earth is None else fit.earth.latitude,
                 "clock": _clock(fit.clock),
                 "nonlinearity": _nonlinearity(fit.nonlinearity),
                 "set_aside": [
@@ -200,7 +201,7 @@ def _off_nominal(fit: GyroFit) -> list[str]:
 
 
 def _warnings(fit: GyroFit) -> list[str]:
-    found = list(fit.notes)
+    found = [*fit.notes, *([] if fit.earth is None else [fit.earth.note()])]
     found += _off_nominal(fit)
     if fit.clock.counted and fit.clock.of == "gyro" and fit.clock.assumed == CRYSTAL:
         found.append(

@@ -125,17 +125,18 @@ def beyond_range(output: Array) -> NDArray[np.bool_]:
     return clipped
 
 
-def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str) -> Rest:
+def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str, earth: Array | float = 0.0) -> Rest:
     """Zero and g-sensitivity from the mean still outputs of each quiet hold, least squares over the holds.
 
-    Quiet is a hold that is still for three quarters of its samples; where fewer than half are, that half.
+    `earth` is what is known of the Earth's rate in each, as output, (n, 3), which is taken off. Quiet is a hold that
+    is still for three quarters of its samples; where fewer than half are, that half.
     """
     edges = np.column_stack([holds.start, holds.stop]).ravel()
     kept = np.where(holds.still[:, None], np.column_stack([output, np.ones(len(output))]), 0.0)
     sums = np.add.reduceat(np.vstack([kept, np.zeros((1, 4))]), edges, axis=0)[::2]
     fraction = sums[:, 3] / (holds.stop - holds.start)
     quiet = fraction >= min(_QUIET, float(np.median(fraction)))
-    mean, force = (sums[:, :3] / sums[:, 3:])[quiet], force[quiet]
+    mean, force = (sums[:, :3] / sums[:, 3:] - earth)[quiet], force[quiet]
     n = len(mean)
     middle = (holds.start + holds.stop)[quiet] / 2
     when = (middle - middle.mean()) / max(float(np.ptp(middle)), 1.0)

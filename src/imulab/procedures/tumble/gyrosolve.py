@@ -39,6 +39,8 @@ class Case:
     fit_bias: bool
     knocked: NDArray[np.bool_]
     """Attitudes that the accelerometers' record set aside, shape (n,)."""
+    earth: Array | float = 0.0
+    """Output by what is known of the Earth's rate in each attitude, shape (n, 3)."""
 
     def force_at(self, time: Array) -> Array:
         """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
@@ -69,6 +71,12 @@ class Solved:
         scaled = (output - self.rest.zero - moved) / (self.scale * (1 + self.theta[:3]))
         return np.asarray(np.linalg.solve(t, scaled.T).T, dtype=np.float64)
 
+    def output_of(self, rate: Array) -> Array:
+        """Output that body rates, rad/s, shape (n, 3), add."""
+        t = np.eye(3)
+        t[ROWS, COLUMNS] = self.theta[3:9]
+        return self.scale * (1 + self.theta[:3]) * (rate @ t.T)
+
     @property
     def typical_miss(self) -> float:
         """Median angle by which the turns miss, rad."""
@@ -85,7 +93,7 @@ def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
     holds = find_holds(case.attitudes, time, case.output, case.name)
 
     def solved(wanted: str) -> Solved:
-        rest = at_rest(holds, case.output, case.force, wanted)
+        rest = at_rest(holds, case.output, case.force, wanted, case.earth)
         moving = None if rest.slope is None else case.force_at(time)
         segments, notes = find_turns(holds, time, case.output, case.force, rest, moving, case.name)
         beside = case.knocked[segments.attitude] | case.knocked[segments.attitude + 1]

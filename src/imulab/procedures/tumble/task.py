@@ -60,6 +60,7 @@ def _fit(
         field=values["field"],
         hemisphere=values["hemisphere"],
         dip=values["dip"],
+        latitude=values["place"],
         progress=progress,
     ).calibration
 
@@ -100,7 +101,7 @@ ORDER = Option(
 )
 GRAVITY = (
     text_option("gravity", "Local gravity, m/s^2, as 9.81362 or 9.81362+-0.00002; else of the head.", shows="G"),
-    text_option("latitude", "Latitude, deg, for normal gravity.", shows="DEG"),
+    text_option("latitude", "Latitude, deg, for normal gravity; with gyro for the Earth's rate.", shows="DEG"),
     text_option("height", "Height above the ellipsoid, m.", shows="M"),
 )
 OPTIONS = (
@@ -148,6 +149,7 @@ OPTIONS = (
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
+    from imulab.earth import at_latitude
     from imulab.gravity import gravity_option
     from imulab.procedures.tumble.mag.stated import stated_place
     from imulab.procedures.tumble.options import check_options
@@ -165,7 +167,11 @@ def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
         if "mag" in values["with"]:
             place = stated_place(values["hemisphere"], values["latitude"], values["dip"])
             values["hemisphere"] = place.hemisphere
-    values["gravity"] = gravity_option(values["gravity"], values["latitude"], values["height"], label)
+    earth = at_latitude(values["latitude"], label.format("latitude")) if "gyro" in values["with"] else None
+    values["place"] = None if earth is None else earth.latitude
+    values["gravity"] = gravity_option(
+        values["gravity"], values["latitude"], values["height"], label, beside="gyro" in values["with"]
+    )
     return {**values, "part": part_of(values)}
 
 
