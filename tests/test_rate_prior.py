@@ -8,6 +8,7 @@ import pytest
 import imulab as il
 from imulab.cli import main
 from imulab.procedures.rate.simulate import RateRecordings
+from imulab.procedures.reports import exhibits_of
 
 HOW = {"noise": "0.02 deg/s", "rate": "50 Hz", "hold": "4 s", "rates": "0,50,100,200"}
 
@@ -135,3 +136,22 @@ def test_what_cannot_be_a_prior_is_refused_in_a_line(tmp_path):
     il.fit_turns(tmp_path / "t.csv").save(tmp_path / "t.json")
     with pytest.raises(il.ImulabError, match="the prior was made from this recording, which would count twice"):
         il.fit_turns(tmp_path / "t.csv", prior=tmp_path / "t.json")
+
+
+def test_the_report_shows_what_both_records_say_and_what_their_fit_makes_of_it(tmp_path):
+    """Values of the table to its two digits of the uncertainty."""
+    prior, alone = (il.fit_rate(simulated(seed), order=1).calibration for seed in (11, 12))
+    both = il.fit_rate(simulated(12), order=1, prior=prior).calibration
+    of = both.fit["prior"]["parameters"]["gyro_scale_factor_x"]
+    assert of["prior"]["value"] == prior.value("gyro_scale_factor_x")
+    assert of["test"]["value"] == alone.value("gyro_scale_factor_x")
+    (table,) = (item for item in exhibits_of(both).items if item.title == "The earlier record and this test")
+    (row,) = (row for row in table.rows if row[0] == "gyro_scale_factor_x")
+    for text, record in zip(row[1:4], (prior, alone, both), strict=True):
+        p = record.parameters["gyro_scale_factor_x"]
+        value, u = (float(part) for part in text.split(" ± "))
+        assert u == pytest.approx(1e6 * np.pi / 180 * p.standard_uncertainty, rel=0.06)
+        assert value == pytest.approx(1e6 * (p.value * np.pi / 180 - 1), abs=0.06 * u)
+    assert row[4] == "ppm off nominal"
+    both.save(tmp_path / "b.json")
+    assert il.load(tmp_path / "b.json").fit["prior"]["probability"] == both.fit["prior"]["probability"]

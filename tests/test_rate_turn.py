@@ -196,6 +196,17 @@ def test_turns_that_wobble_in_a_cone_are_composed_where_the_integral_about_one_a
     assert abs(one_axis) > 4 * 185e-6
 
 
+@pytest.mark.parametrize("noise", [1e-5, 3e-4, 2e-3, 5e-3])
+def test_turns_that_begin_slowly_are_not_taken_for_rest(noise):
+    """Three turns in 18 s: the first tenths of a second are below the noise of a sample, and were in the zero."""
+    rates, _ = reference.hand_turns(np.eye(3)[[2, 0, 1]], [1, -1, 3, -3], FREQUENCY, np.zeros(3), speed=60)
+    rates = rates + noise * np.random.default_rng(1).standard_normal(rates.shape)
+    found = il.fit_turns({"gyro": rates}, rate=FREQUENCY, unit="rad/s").turns
+    for axis in "xyz":
+        assert found[axis].scale == pytest.approx(1.0, abs=10e-6 + 0.06 * noise)
+        assert found[axis].scale_uncertainty < 450e-6
+
+
 @pytest.mark.parametrize("size", [4, 10])
 def test_stamps_in_bursts_are_evened_and_said(size):
     """Samples taken evenly, stamped as blocks of them arrive: 0.2 ms apart, then a pause."""

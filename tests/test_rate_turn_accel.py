@@ -68,6 +68,9 @@ def test_the_record_is_of_both_triads_and_corrects_both(accel, tmp_path, monkeyp
     said = capsys.readouterr().out
     assert "gyro_misalignment_xy" in said
     assert "bias_x" in said
+    assert "not stated" not in said
+    p = il.load("both.json").parameters["gyro_misalignment_xy"]
+    assert np.diff(p.interval_95)[0] == pytest.approx(2 * 1.959964 * p.standard_uncertainty, rel=1e-6)
     corrected = il.apply("both.json", "turns.csv")
     assert float(np.sum(corrected.si("gyro_z")[:700]) / FREQUENCY) == pytest.approx(2 * np.pi, abs=0.01)
 

@@ -37,7 +37,10 @@ def exhibits_of(record: Calibration) -> Exhibits:
         assert entry.joined is not None
         more = entry.joined(record)
         exhibits = replace(
-            exhibits, headline=f"{exhibits.headline} {more.headline}", items=[*exhibits.items, *more.items]
+            exhibits,
+            headline=f"{exhibits.headline} {more.headline}",
+            facts=[*exhibits.facts, *more.facts],
+            items=[*exhibits.items, *more.items],
         )
     return exhibits
 

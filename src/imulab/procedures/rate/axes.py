@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imulab.errors import DataError, RecordError
-from imulab.procedures.rate.choices import AXES
+from imulab.estimation.least_squares import coverage_factor
+from imulab.procedures.rate.choices import AXES, GAINS
 from imulab.procedures.rate.dwells import Dwells, recorded_rate
 from imulab.procedures.rate.manifest import RateTest
 from imulab.recording import Array, Recording
-from imulab.records.calibration import Calibration, Covariance
+from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si
 from imulab.verdict import UNJUDGED, Note
 
@@ -228,7 +229,7 @@ def with_accelerometers(accel: Calibration, record: Calibration) -> Calibration:
     kept = ("gyro_order", "gyro_output_unit", "largest_rate")
     return replace(
         accel,
-        parameters=own | dict(record.parameters),
+        parameters=own | {name: _with_interval(name, p) for name, p in record.parameters.items()},
         covariance=Covariance((*names, *record.covariance.names), tuple(map(tuple, joined.tolist()))),
         model={**accel.model, **{name: record.model[name] for name in kept if name in record.model}},
         fit={**{name: part for name, part in accel.fit.items() if name != "gyro"}, "rate": dict(record.fit)},
@@ -245,3 +246,11 @@ def lean_said(axes: TableAxes, test: RateTest) -> list[str]:
     most = float(np.arccos(np.clip(min(cosines), -1, 1)))
     degrees = from_si(most, "deg")
     return [Note(f"the table axis leaned from the faces by up to {degrees:.2g} deg, by the accelerometers")]
+
+
+def _with_interval(name: str, p: Parameter) -> Parameter:
+    """Return a parameter with the interval that its uncertainty gives, as the accelerometers' beside it have one."""
+    if p.interval_95 is not None or not p.standard_uncertainty or not name.startswith(GAINS):
+        return p
+    half = coverage_factor(None) * p.standard_uncertainty
+    return replace(p, interval_95=(p.value - half, p.value + half))

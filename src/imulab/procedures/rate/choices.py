@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 AXES = "xyz"
 MOUNTINGS = tuple(sign + axis for axis in AXES for sign in "+-")
+GAINS = ("gyro_bias", "gyro_scale_factor", "gyro_misalignment", "gyro_g_sensitivity", "gyro_k")
+"""How the parameters begin that a unit computes with; others are figures of the test."""
 ORDERS = ("auto", "1", "2", "3", "4", "5")
 RATES = "0,10,50,100,200,300"
 FENCE = "0.5 deg"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from imulab.procedures.procedure import Row
+from imulab.procedures.rate.sections import Prior
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
+from imulab.report.elements import ReportTable, format_uncertain
 from imulab.units import STANDARD_GRAVITY, from_si, parse_unit
 
 _FIGURES = ("gyro_nonlinearity", "gyro_asymmetry", "gyro_hysteresis")
@@ -47,3 +49,23 @@ def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     """Return the factor from SI and the unit in which the change of a parameter is read."""
     factor, offset, unit = shown(change.name, change.unit)
     return factor, "ppm" if offset else unit
+
+
+def prior_table(prior: Prior, record: Calibration) -> ReportTable:
+    """Return what the prior, the test without it, and both as one fit say of each parameter."""
+    found = []
+    for name, of in prior.parameters.items():
+        factor, offset, unit = shown(name, of.test.unit)
+        texts: list[str] = []
+        for one in (of.prior, of.test, record.parameter(name)):
+            u = one.standard_uncertainty
+            texts.append(" ± ".join(format_uncertain(one.value * factor + offset, None if u is None else u * factor)))
+        found.append([name, *texts, unit])
+    chance = "" if prior.probability is None else f" Probability of such differences: {prior.probability:.2g}."
+    return ReportTable(
+        "The earlier record and this test",
+        "Each alone, and both as one fit, the result, ± standard uncertainties. What all rates of one table, or "
+        f"one clock, have in common does not fall with a second test.{chance}",
+        ["parameter", "earlier", "this test", "both", "unit"],
+        found,
+    )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from imulab.procedures.rate.engineering import prior_table
 from imulab.procedures.rate.engineering import rows as engineering_rows
 from imulab.procedures.rate.sections import OfAxis, Rate, Seen, rate_of
 from imulab.procedures.rate.sweeprecord import sweep_table
@@ -41,6 +42,7 @@ def exhibits(record: Calibration) -> Exhibits:
     ]
     items: list[Figure | ReportTable] = [
         _parameters(record),
+        *([prior_table(found.fit.prior, record)] if "prior" in record.fit else []),
         *(_left(a, found.data.dwells) for a in axes),
         _of_line(record, found),
         *([sweep_table(found.fit.sweeps)] if "sweeps" in record.fit else []),
@@ -158,10 +160,11 @@ def _budget(record: Calibration, found: Rate) -> ReportTable:
         whole = (scale.standard_uncertainty or 0.0) / abs(scale.value) * _PPM
         rest = float(np.sqrt(max(whole**2 - common**2, 0.0)))
         rows.append([f"gyro_scale_factor_{name}", *(plain_number(value, 3) for value in (rest, common, whole))])
+    earlier = ", of the earlier record too" if "prior" in record.fit else ""
     return ReportTable(
         "What the uncertainty of a scale factor is made of, ppm",
-        "Dwells: noise, errors of single rates, and what scatters beyond them; more dwells make it smaller. Table: "
-        "what all rates have in common, which no number of dwells makes smaller.",
+        f"Dwells: noise, errors of single rates, and what scatters beyond them{earlier}; more dwells make it smaller. "
+        "Table: what all rates have in common, which no number of dwells makes smaller.",
         ["parameter", "dwells", "table", "all"],
         rows,
     )

@@ -15,14 +15,14 @@ import numpy as np
 
 from imulab.errors import DataError, RecordError
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
-from imulab.procedures.rate.choices import AXES
+from imulab.procedures.rate.choices import AXES, GAINS
+from imulab.procedures.rate.engineering import shown
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import compared
 from imulab.units import parse_unit
 from imulab.verdict import Note
 
-_KINDS = ("gyro_bias", "gyro_scale_factor", "gyro_misalignment", "gyro_g_sensitivity", "gyro_k")
 _TINY = 1e-12
 
 
@@ -52,7 +52,7 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
     known = [
         name
         for name in prior.covariance.names
-        if name.startswith(_KINDS)
+        if name.startswith(GAINS)
         and not name.startswith("gyro_scale_factor_slope")
         and (alike or not name.startswith("gyro_misalignment"))
     ]
@@ -78,6 +78,7 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
             "gyro_order": _order(parameters),
             "axes": axes,
         },
+        fit={**record.fit, "prior": _beside(prior, record, common, comparison.probability)},
         sources=tuple({source.file: source for source in (*prior.sources, *record.sources)}.values()),
         warnings=(*record.warnings, _said(comparison.probability, comparison.changes)),
     )
@@ -168,13 +169,31 @@ def _interval(source: Parameter, value: float, u: float) -> tuple[float, float] 
     return value - wide, value + wide
 
 
+def _beside(prior: Calibration, record: Calibration, names: list[str], probability: float | None) -> dict[str, Any]:
+    """Return ``fit.prior``: what each record says of the parameters of both, alone."""
+    pairs = {"prior": prior, "test": record}
+    return {
+        "probability": probability,
+        "parameters": {
+            name: {
+                key: {"value": (p := one.parameters[name]).value, "standard_uncertainty": p.standard_uncertainty,
+                      "unit": p.unit}
+                for key, one in pairs.items()
+            }
+            for name in names
+        },
+    }  # fmt: skip
+
+
 def _said(probability: float | None, changes: Any) -> str:
     chance = "" if probability is None else f" (probability {probability:.2g})"
     differing = [change for change in changes if change.significant]
     if not differing:
         return Note(f"the prior agrees{chance}; both are one fit, but for the biases, which are new")
     worst = max(differing, key=lambda change: abs(change.deviations or 0.0))
+    factor, offset, unit = shown(worst.name, worst.unit)
     return (
-        f"the prior does not agree{chance}: {worst.name} differs by {worst.difference:+.3g} {worst.unit}, "
-        f"{abs(worst.deviations or 0.0):.1f} times its uncertainty; both are one fit all the same (see show A B)"
+        f"the prior does not agree{chance}: {worst.name} differs by {factor * worst.difference:+.3g} "
+        f"{'ppm' if offset else unit}, {abs(worst.deviations or 0.0):.1f} times its uncertainty; both are one fit all "
+        "the same (see show A B)"
     )

@@ -56,6 +56,20 @@ class Swept(Part):
     bandwidth_beyond: Size | None
 
 
+class OfPrior(Part):
+    """One parameter of ``fit.prior``: what the prior says of it, and the test without that."""
+
+    prior: Quantity
+    test: Quantity
+
+
+class Prior(Part):
+    """``fit.prior``."""
+
+    probability: Size | None
+    parameters: dict[str, OfPrior]
+
+
 class Fit(Part):
     """``fit``."""
 
@@ -68,6 +82,7 @@ class Fit(Part):
     mounting_uncertainty: Size | None
     axes: dict[str, OfAxis]
     sweeps: list[Swept]
+    prior: Prior
 
 
 class Seen(Part):
@@ -92,6 +107,7 @@ class TurnsFit(Part):
     turns: int
     fence: Quantity
     clock: Size | None
+    prior: Prior
 
 
 class Turned(Part):

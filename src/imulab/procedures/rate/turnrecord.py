@@ -9,12 +9,13 @@ import numpy as np
 
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.rate.choices import AXES
+from imulab.procedures.rate.engineering import prior_table
 from imulab.procedures.rate.engineering import rows as engineering_rows
 from imulab.procedures.rate.sections import turns_of
 from imulab.procedures.rate.turnrests import Motions
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
-from imulab.report.elements import INK, Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
 from imulab.report.traces import axis, rounded, scatter
 from imulab.units import from_si
 from imulab.verdict import Bad, Note
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from imulab.procedures.rate.turns import AxisTurns
 
 _FAR = 0.1
+_LOOKS = {"x": ("circle", INK), "y": ("diamond", GOOD), "z": ("square", BAD)}
 
 
 def turns_record(
@@ -123,18 +125,24 @@ def turns_exhibits(record: Calibration) -> Exhibits:
         )
     ]
     number = list(range(1, len(table) + 1))
-    traces: list[dict[str, Any]] = [
-        scatter(
-            number, rounded(degrees[1]), "markers", name="left", marker={"color": INK, "size": 8}, text=seen.axis,
-            error_y={"type": "data", "array": rounded(degrees[2]), "thickness": 1, "width": 2},
-        )
-    ]  # fmt: skip
+    traces: list[dict[str, Any]] = []
+    for name, (symbol, colour) in _LOOKS.items():
+        which = [k for k, of in enumerate(seen.axis) if of == name]
+        if which:
+            rest, bars = (rounded([degrees[k][j] for j in which]) for k in (1, 2))
+            traces.append(
+                scatter(
+                    [number[j] for j in which], rest, "markers", name=f"gyro_{name}",
+                    marker={"color": colour, "symbol": symbol, "size": 8},
+                    error_y={"type": "data", "array": bars, "thickness": 1, "width": 2},
+                )
+            )  # fmt: skip
     several = len(table) > len(set(seen.axis))  # of one turn about each axis nothing is left
     figure = Figure(
         title="What is left of each turn",
-        caption="Bars: one standard uncertainty, of both stops and of the zero.",
+        caption="By the scale factor of these turns. Bars: one standard uncertainty, of both stops and of the zero.",
         traces=traces,
-        layout={"xaxis": axis("turn", dtick=1), "yaxis": axis("residual, deg")},
+        layout={"xaxis": axis("turn", dtick=1), "yaxis": axis("residual, deg"), "legend": LEGEND},
     )
     fence = float(np.degrees(found.fit.fence.value))
     return Exhibits(
@@ -144,9 +152,10 @@ def turns_exhibits(record: Calibration) -> Exhibits:
         [
             ReportTable("Parameters", "Per clock where no uncertainty of it was stated.",
                         ["parameter", "value", "u", "unit"], rows),
+            *([prior_table(found.fit.prior, record)] if "prior" in record.fit else []),
             ReportTable(
                 "Turns",
-                "Stated angle of each, and what is left of it by the scale factor found.",
+                "Stated angle of each, and what is left of it by the scale factor of these turns.",
                 ["gyro", "from, s", "to, s", "turns", "angle, deg", "residual, deg", "u, deg"],
                 table,
             ),

@@ -14,7 +14,7 @@ from imulab.units import parse_unit, to_si
 
 _BLOCK = 0.1  # s
 _LEAST, _TRIM = 6, 1
-_STILL, _OF_LARGEST = 5.0, 0.02
+_STILL, _OF_LARGEST, _OUT = 5.0, 0.02, 3.0
 _TURNED = np.radians(15)
 
 
@@ -129,7 +129,16 @@ def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
     off = np.linalg.norm(means - zero, axis=1)
     still = calm & (off < max(_OF_LARGEST * float(off.max()), 10 * np.sqrt(quiet / size)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
-    return [((a + _TRIM) * size, (b - _TRIM) * size) for a, b in edges.tolist() if b - a >= _LEAST]
+    steady = [_steady(means, a, b) for a, b in edges.tolist() if b - a >= _LEAST]
+    return [((a + _TRIM) * size, (b - _TRIM) * size) for a, b in steady if b - a >= _LEAST]
+
+
+def _steady(means: Array, first: int, last: int) -> tuple[int, int]:
+    """Return first block and end of a rest without what at its ends stands out of it, as a turn that begins slowly."""
+    part = means[first:last]
+    off = np.linalg.norm(part - np.median(part, axis=0), axis=1)
+    usual = np.flatnonzero(off <= _OUT * np.median(off))
+    return first + int(usual[0]), first + int(usual[-1]) + 1
 
 
 def _of_mean(rate: Array) -> Array:

@@ -254,14 +254,16 @@ def _correlation(record: Calibration) -> Figure:
     matrix = record.covariance.array()
     sigma = np.sqrt(np.diag(matrix))
     correlation = matrix / np.outer(sigma, sigma)
-    names = list(record.covariance.names)
+    together = np.abs(correlation - np.eye(len(sigma))).max(axis=0) > 1e-12
+    shown = together if together.any() else ~together  # those that go with no other would only take room
+    correlation = correlation[np.ix_(shown, shown)]
+    names = [name for name, one in zip(record.covariance.names, shown.tolist(), strict=True) if one]
     return Figure(
         title="Correlation of the parameters",
-        message=f"The pair that these attitudes tell apart least: {strongest_pair(correlation, names)}."
-        if len(names) > 1
-        else "",
-        caption="From −1 to +1, with numbers on hovering. Near 1 or −1 off the diagonal: two parameters that these "
-        "attitudes hardly tell apart, so that only their sum or difference is well known.",
+        message=f"The pair that is told apart least: {strongest_pair(correlation, names)}." if len(names) > 1 else "",
+        caption="From −1 to +1, with numbers on hovering. Near 1 or −1 off the diagonal: two parameters that the data "
+        "hardly tell apart, or whose uncertainty has a source in common (a table, a clock): their difference, or sum, "
+        "is known better than either.",
         traces=[correlation_map(correlation, names)],
         layout={
             "xaxis": {"tickangle": -45, "automargin": True},
