@@ -313,6 +313,8 @@ def _layout(layout: str | Path | Layout | None) -> Layout | None:
 
 def _open(file: str | Path, name: str) -> BinaryIO:
     if str(file) == "-":
+        if sys.stdin.buffer.closed:
+            raise ReadError(f"{name}: was read before; expected one file that is '-'")
         return sys.stdin.buffer
     try:
         return Path(file).open("rb")

@@ -33,6 +33,8 @@ _HOTTEST = 125.0
 def disagreements(holds: Holds, problem: Problem, solution: Solution, name: str) -> list[str]:
     """Return what says that recordings are hardly of one unit, mounted alike, at rest, by one thermometer."""
     bias, scale = solution.scatter.tau.tolist()
+    if not solution.scatter.rank:  # nobody measured it: it was stated
+        bias = 0.0
     many = int(clusters_of(problem.temperature).max(initial=0)) + 1 >= _ENOUGH
     differ = [
         text
@@ -46,7 +48,7 @@ def disagreements(holds: Holds, problem: Problem, solution: Solution, name: str)
     own = float(np.median(np.sqrt(np.diag(rows.noise)[rows.magnitude])))
     scattered = solution.excess > max(_SCATTERS, _NOISE * own)
     apart = _apart(holds, problem, solution.laws) if differ or scattered else ""
-    if differ:
+    if differ and (apart or not solution.scatter.bound):  # a bound holds bends of the law, too
         found.append(
             f"{name}: from one recording to the next {' and '.join(differ)} differ, which no power cycle does: are all "
             f"of one unit, its axes named alike, its temperatures by one thermometer?{apart}"
@@ -95,6 +97,7 @@ def _without(problem: Problem, gone: NDArray[np.bool_]) -> Problem:
         group=group,
         free=(),
         side=None if problem.side is None else problem.side[kept],
+        wander=None if problem.wander is None else problem.wander[np.ix_(kept, kept)],
     )
 
 

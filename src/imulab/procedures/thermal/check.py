@@ -276,6 +276,7 @@ def _inside(record: Calibration, holds: Holds) -> tuple[Holds, list[str]]:
         )
     }
     group = chosen["group"]
+    chosen["wander"] = holds.wander[np.ix_(kept, kept)]
     chosen["group"] = np.where(group >= 0, np.searchsorted(np.unique(group[group >= 0]), group), -1)
     note = (
         f"{(~kept).sum()} of {len(kept)} holds are at {where}, outside the {low:.1f} to {high:.1f} degC of the record, "
@@ -301,7 +302,7 @@ def _tested(
     laws, coefficients, covariance, scale, common = of_record(record, g, gravity.standard_uncertainty)
     problem = Problem(
         holds.mean / scale, holds.covariance / (scale[:, None] * scale), holds.temperature, np.zeros(len(holds)),
-        holds.step, holds.shared, holds.recording, holds.group, tilt, np.zeros(3),
+        holds.step, holds.shared, holds.recording, holds.group, tilt, np.zeros(3), wander=holds.wander,
     )  # fmt: skip
     rows = linearise(problem, laws, coefficients, _directions(problem, laws, coefficients))
     excess = (fit.excess.value / g) ** 2

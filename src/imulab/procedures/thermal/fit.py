@@ -236,6 +236,7 @@ def _problem(holds: Holds, scale: Array, zero: Array, tilt: float, known: tuple[
         zero,
         known,
         side=sides(holds),
+        wander=holds.wander,
     )
 
 

@@ -1,7 +1,8 @@
 """Recordings to holds: mean outputs at a known temperature, and which of them lie in one direction.
 
 A hold in which the temperature drifts is cut where it has moved by 1 K: the curvature within a cut then leaves less
-than 0.1 ug. The cuts of a hold are *unmoved*: nothing was turned between them. The scatter of a mean comes from batch
+than 0.1 ug. The cuts of a hold are *unmoved*: nothing was turned between them. What interrupts a hold, and rows that
+are no readings, are left out of its means. The scatter of a mean comes from batch
 means after their regression on the temperature, as in `imulab.procedures.tumble.held`.
 """
 
@@ -16,17 +17,18 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.errors import DataError
+from imulab.estimation.rows import leave_out
+from imulab.procedures.thermal.rest import stretches_at_rest, wandering
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes
 from imulab.procedures.tumble.segment import find_attitudes
 from imulab.recording import Array, Recording
+from imulab.verdict import Note
 
 _CUT = 1.0  # K
 _BATCHES = 10
 _FEWEST = 20
 """Samples of a cut: what is shorter joins the one before."""
 _SIDES = {"warming": 1.0, "cooling": -1.0}
-_FEW, _TURNED = 0.005, 0.1
-"""A recording whose outputs but for a few move by less than this share of g is one at rest."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Holds:
         As they were given, after the settling time.
     attitudes
         Those of each recording; one where it rests throughout.
+    wander
+        Covariance of their directions by what tips a unit that is not moved, rad^2, shape (n, n).
     notes
         What a user should know of how they were found.
     """
@@ -70,6 +74,7 @@ class Holds:
     unit: str
     recordings: tuple[Recording, ...]
     attitudes: tuple[Attitudes, ...]
+    wander: Array
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -109,9 +114,16 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
     attitudes: list[Attitudes] = []
     for number, given in enumerate(recordings):
         temperature = given.si("temperature")
-        found = _at_rest(find_attitudes(given))
+        found = find_attitudes(given)
+        if found.trace is None:
+            own = _of_rows(found, temperature)
+        else:
+            columns = triad("accel")
+            read = leave_out(given, columns).recording
+            outputs = np.column_stack([read.column(name) for name in columns])
+            found = _at_rest(found, outputs)
+            own = _of_time(found, outputs, temperature)
         attitudes.append(found)
-        own = _of_rows(found, temperature) if found.trace is None else _of_time(found, temperature)
         cuts += own
         owner += [number] * len(own)
         steps += [_step(temperature)] * len(own)
@@ -124,6 +136,7 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
             if len(members) > 1:
                 group[members] = group.max() + 1
                 shared[members] = False
+    wander, said = _wander(cuts, group, [recordings[number].name for number in owner])
     return Holds(
         mean=np.array([cut.mean for cut in cuts]),
         covariance=pooled(cuts),
@@ -138,18 +151,53 @@ def find_holds(recordings: Sequence[Recording]) -> Holds:
         unit=attitudes[0].unit,
         recordings=tuple(recordings),
         attitudes=tuple(attitudes),
-        notes=tuple(f"{found.recording.name}: {note}" for found in attitudes for note in found.notes),
+        wander=wander,
+        notes=(
+            *(
+                (Note if isinstance(note, Note) else str)(f"{found.recording.name}: {note}")
+                for found in attitudes
+                for note in found.notes
+            ),
+            *said,
+        ),
     )
 
 
-def _at_rest(found: Attitudes) -> Attitudes:
-    """Return one hold where the unit rests throughout: drift must not cut it, nor a knock, which is found later."""
-    if found.trace is None:
+def _wander(cuts: Sequence[Cut], group: NDArray[np.int64], names: Sequence[str]) -> tuple[Array, list[Note]]:
+    """Return the covariance of the holds' directions by the random walk of each unmoved group, and what is said."""
+    covariance, notes = np.zeros((len(cuts), len(cuts))), []
+    for number in range(int(group.max(initial=-1)) + 1):
+        members = np.flatnonzero(group == number)
+        own = [cuts[k] for k in members.tolist()]
+        mean, time = np.array([cut.mean for cut in own]), np.array([(cut.start + cut.stop) / 2 for cut in own])
+        direction = mean / np.linalg.norm(mean, axis=1).mean()
+        density = wandering(direction, np.array([cut.temperature for cut in own]), time)
+        if not density:
+            continue
+        begun = time - time[0]
+        covariance[np.ix_(members, members)] = density * np.minimum(begun[:, None], begun)
+        notes.append(
+            Note(
+                f"{names[members[0]]}: its direction wanders by {1e3 * np.sqrt(density * begun[-1]):.2g} mrad while it "
+                "rests (standard deviation), which the uncertainties hold: does its support tip, or is it knocked?"
+            )
+        )
+    return covariance, notes
+
+
+def _at_rest(found: Attitudes, outputs: Array) -> Attitudes:
+    """Return one hold where the unit rests throughout: drift must not cut it, nor do knocks, which are left out."""
+    time = found.recording.time
+    assert time is not None
+    edges = stretches_at_rest(outputs, time)
+    if edges is None:
         return found
-    ends = np.quantile(found.recording.triad("accel"), [_FEW, 1 - _FEW], axis=0)
-    if np.ptp(ends, axis=0).max() > _TURNED * np.linalg.norm(ends.mean(axis=0)):
-        return found
-    return replace(found, pieces=np.array([[0, len(found.recording), 0]]))
+    notes = found.notes
+    if len(edges) > 1:
+        first, lost = time[edges[0, 1]], 100 * (1 - np.diff(edges).sum() / len(time))
+        said = f"knocked while it rested, {len(edges) - 1} times, first at {first:.0f} s: {lost:.2g} % of its samples"
+        notes = (*notes, f"{said} left out")
+    return replace(found, pieces=np.column_stack([edges, np.zeros(len(edges), dtype=np.int64)]), notes=notes)
 
 
 def _of_rows(found: Attitudes, temperature: Array) -> list[Cut]:
@@ -165,17 +213,19 @@ def _of_rows(found: Attitudes, temperature: Array) -> list[Cut]:
     ]
 
 
-def _of_time(found: Attitudes, temperature: Array) -> list[Cut]:
-    recording, time = found.recording, found.recording.time
-    assert time is not None
+def _of_time(found: Attitudes, outputs: Array, temperature: Array) -> list[Cut]:
+    """Stretches of each attitude, what interrupted it left out, in which the temperature moves by 1 K at most."""
+    whole = found.recording.time
+    assert whole is not None
     assert found.pieces is not None
-    outputs = np.column_stack([recording.column(name) for name in triad("accel")])
     cuts = []
-    for first, last, attitude in found.pieces.tolist():
-        drift = abs(np.polyfit(time[first:last], temperature[first:last], 1)[0]) * (time[last - 1] - time[first])
-        count = int(max(1, min(np.ceil(drift / _CUT), (last - first) // _FEWEST)))
-        edges = np.linspace(first, last, count + 1).astype(np.int64)
-        cuts += [averaged(outputs, temperature, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
+    for attitude in np.unique(found.pieces[:, 2]).tolist():
+        own = np.concatenate([np.arange(a, b) for a, b, number in found.pieces.tolist() if number == attitude])
+        time, read, output = whole[own], temperature[own], outputs[own]
+        drift = abs(np.polyfit(time, read, 1)[0]) * (time[-1] - time[0])
+        count = int(max(1, min(np.ceil(drift / _CUT), len(own) // _FEWEST)))
+        edges = np.linspace(0, len(own), count + 1).astype(np.int64)
+        cuts += [averaged(output, read, time, a, b, attitude) for a, b in pairwise(edges.tolist())]
     return cuts
 
 

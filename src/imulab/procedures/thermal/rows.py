@@ -24,7 +24,7 @@ class Problem:
     an unmoved hold, rad; `zero`: biases to start from, shape (3,); `known`: a prior as rows of nine parameters,
     ``(temperature, values (9,), covariance (9, 9))``; `free`: what is fitted beside the laws, the lag (s) as 0, the
     loops of x, y and z (g) as 1 to 3; `side`: whether a soak was reached by warming (1) or
-    cooling (-1), 0 where nobody says.
+    cooling (-1), 0 where nobody says; `wander`: covariance of the holds' directions beside the tilt, rad^2, (n, n).
     """
 
     reading: Array
@@ -40,6 +40,7 @@ class Problem:
     known: tuple[float, Array, Array] | None = None
     free: tuple[int, ...] = ()
     side: Array | None = None
+    wander: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,9 @@ def linearise(problem: Problem, laws: Laws, coefficients: Array, directions: Arr
     full[:, 1, 1] += problem.tilt**2
     full[:, 2, 2] += problem.tilt**2
     own = np.where(owner[:, None] == owner, full[owner[:, None], kind[:, None], kind[None, :]], 0.0)
+    if problem.wander is not None and problem.wander.any():
+        tipped = np.where((kind[:, None] == kind) & (kind > 0), problem.wander[owner[:, None], owner], 0.0)
+        own = own + tipped
     jacobian = np.einsum("Ni,Nij,Njc->Nc", pick, change[owner], design[owner])
     turns = np.zeros((len(rows), 2 * len(directions)))
     side = kind > 0

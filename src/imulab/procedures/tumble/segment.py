@@ -34,6 +34,9 @@ _GAP_SECONDS, _GAP_STEPS = 0.25, 6.0
 _SLOW = 5.0
 _MUCH_LOST = 0.05
 _THRESHOLDS = np.geomspace(1.5, 400.0, 18)
+_DRIFT, _AS_GOOD = 1.0, 1.1
+"""K by which the temperature moves where the ellipsoid moves with it, and the share of the least error that then tells
+thresholds apart no more."""
 _SAME_ATTITUDE = 2e-3
 """Pieces of one hold whose means differ by less than this fraction of g (rad) are one attitude: averaging them
 shortens the vector by less than 0.5 ug."""
@@ -134,7 +137,9 @@ def find_attitudes(
     width = _window_width(blocks, recording, time, window)
     variance = _window_variance(blocks, width)
     quiet, resolution = _quietest(variance, recording, names)
-    pieces, threshold = _sweep(variance, quiet, blocks, width, settling, shortest)
+    candidates = _sweep(variance, quiet, blocks, width, settling, shortest)
+    best = _choose(candidates, drifting=_drifts(recording))
+    pieces, threshold = candidates[best], float(_THRESHOLDS[best] * quiet)
     trace = _trace(variance, time, blocks, width, threshold, quiet)
     if not pieces.start.size:
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
@@ -239,14 +244,12 @@ def _window_variance(blocks: _Blocks, width: int) -> Array:
 
 def _sweep(
     variance: Array, quiet: float, blocks: _Blocks, width: int, settling: float, shortest: float
-) -> tuple[_Pieces, float]:
-    """Return the attitudes that predict each other best, and the threshold of the variance that they lie below."""
+) -> list[_Pieces]:
+    """Return the attitudes under each threshold."""
     whole = len(blocks.mean) * blocks.duration
     trim = int(np.ceil(min(settling, whole) / blocks.duration))
     fewest = max(2, int(np.ceil(min(shortest, 2 * whole) / blocks.duration)))
-    candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
-    best = _choose(candidates)
-    return candidates[best], _THRESHOLDS[best] * quiet
+    return _candidates(variance, quiet, blocks, width, trim, fewest)
 
 
 def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
@@ -274,12 +277,22 @@ def _merge(start: NDArray[np.int64], stop: NDArray[np.int64], blocks: _Blocks) -
     return _Pieces(start, stop, attitude, mean[:count])
 
 
-def _choose(candidates: list[_Pieces]) -> int:
+def _drifts(recording: Recording) -> bool:
+    """Return whether the temperature moves so much that the outputs at rest lie on no one ellipsoid."""
+    if "temperature" not in recording:
+        return False
+    read = recording.column("temperature")
+    ends = np.quantile(read[np.isfinite(read)], [0.05, 0.95]) if np.isfinite(read).any() else np.zeros(2)
+    return bool(ends[1] - ends[0] > _DRIFT)
+
+
+def _choose(candidates: list[_Pieces], *, drifting: bool = False) -> int:
     """Index of the threshold whose attitudes predict each other best, among those that find enough.
 
     An ellipsoid ``x' Q x + 2 q' x = 1`` is linear in its nine coefficients, so that the error of each attitude
     predicted from all others follows from the hat matrix, ``r / (1 - h)``; half of it is the relative error of the
-    radius.
+    radius. Where the temperature drifts, so does the ellipsoid, which is most of every error: of the thresholds that
+    are as good, the one is taken whose neighbours change the time at rest least.
     """
     counts = np.array([len(pieces.mean) for pieces in candidates])
     enough = min(int(counts.max()), max(14, int(np.ceil(0.75 * median(counts[counts > 0])))) if counts.any() else 0)
@@ -290,6 +303,10 @@ def _choose(candidates: list[_Pieces]) -> int:
             usable = count >= max(enough, 1)
             known[id(pieces)] = _segment.ellipsoid_error(pieces.mean) if usable else np.inf
         errors.append(known[id(pieces)])
+    if np.isfinite(errors).any() and drifting:
+        rest = np.log([max(int((pieces.stop - pieces.start).sum()), 1) for pieces in candidates])
+        good = np.array(errors) <= _AS_GOOD * np.min(errors)
+        return int(np.argmin(np.where(good, np.abs(np.gradient(rest)), np.inf)))
     if np.isfinite(errors).any():
         return int(np.argmin(errors))
     return int(np.argmax(counts))
