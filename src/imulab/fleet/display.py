@@ -10,7 +10,11 @@ from imulab.errors import UnitError
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_unit
 
-_RATIO = re.compile(r"(.+)/\(\1\)")
+_PER_KELVIN = re.compile(r"(.+?)(/K(?:\^\d)?)")
+_SMALL = {"mg": ("µg", 1e3), "mrad": ("µrad", 1e3)}
+"""What changes by so little in a kelvin that a unit a thousand times smaller is read."""
+_NOMINAL = {"/(m/s^2)": "acceleration", "/(rad/s)": "rate", "/T": "magnetic field"}
+"""Scale factors whose nominal value is known: the quantity that is sensed over its SI unit."""
 _NONLINEARITY = re.compile(r"1/\(m/s\^2\)(?:\^(\d))?")
 
 
@@ -32,17 +36,25 @@ class Display:
 
 
 def display_of(unit: str) -> Display:
-    """Return how parameters of a unit are shown: m/s^2 in mg, rad in mrad, rad/s in deg/h, T in uT, ratios in ppm."""
+    """Return how parameters of a unit are shown.
+
+    m/s^2 in mg, rad in mrad, rad/s in deg/h, T in uT, scale factors off nominal in ppm; their changes in a kelvin in
+    µg/K, µrad/K, deg/h/K and ppm/K.
+    """
+    law = _PER_KELVIN.fullmatch(unit)
+    if law is not None:
+        shown = display_of(law[1])
+        name, more = _SMALL.get(shown.unit, (shown.unit, 1.0))
+        return Display(name + law[2], shown.factor * more)
     plain = {"m/s^2": "mg", "rad": "mrad", "rad/s": "deg/h", "T": "uT"}.get(unit)
     if plain is not None:
         return Display(plain, from_si(1.0, plain))
     if unit == "rad/s/(m/s^2)":
         return Display("deg/h/g", from_si(STANDARD_GRAVITY, "deg/h"))
-    if _RATIO.fullmatch(unit):
-        return Display("ppm", 1e6, -1e6)
-    sensed, slash, field = unit.rpartition("/")
-    if slash and field == "T" and parse_unit(sensed).quantity == "magnetic field":
-        return Display("ppm", 1e6 / from_si(1.0, sensed), -1e6)
+    for over, quantity in _NOMINAL.items():
+        sensed = unit.removesuffix(over)
+        if sensed != unit and parse_unit(sensed).quantity == quantity:
+            return Display("ppm", 1e6 / from_si(1.0, sensed), -1e6)
     match = _NONLINEARITY.fullmatch(unit)
     if match is not None:
         power = int(match[1] or 1)

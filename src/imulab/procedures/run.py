@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from imulab.errors import RecordError
 from imulab.procedures.options import FLAG
 from imulab.procedures.procedure import Files
 from imulab.procedures.registry import PROCEDURES
@@ -28,6 +29,8 @@ def run_task(
 ) -> Calibration:
     """Fit one unit; `options` are texts, None where not given.
 
+    What is wrong of a record that an option names, ``prior: ...``, is said with the name of its file.
+
     Raises
     ------
     ImulabError
@@ -35,4 +38,10 @@ def run_task(
     """
     task = PROCEDURES[name].task
     values = task.values({key: text for key, text in options.items() if text is not None}, label)
-    return task.fit(files, values, access, progress)
+    try:
+        return task.fit(files, values, access, progress)
+    except RecordError as error:
+        file = options.get(str(error).partition(":")[0])
+        if file is None:
+            raise
+        raise RecordError(f"{file}: {error}") from None
