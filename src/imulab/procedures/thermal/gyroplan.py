@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from imulab.earth import EARTH
 from imulab.errors import OptionError
 from imulab.procedures.thermal.choices import FOLLOWED, TURNED
-from imulab.procedures.thermal.gyro import EARTH
 from imulab.procedures.thermal.model import Laws
 from imulab.quantities import RANDOM_WALK, in_si, of_units
 from imulab.recording import Array
