@@ -211,6 +211,17 @@ def test_a_thermometer_that_stops_is_refused_and_one_that_never_goes_is_named(ma
     assert not any("in every row" in w for w in il.fit_thermal(constant).calibration.warnings)
 
 
+@pytest.mark.parametrize("settling", [2.0, 5.0, 10.0])
+def test_a_thermometer_that_settles_is_not_stuck(made, settling):
+    """Steps of 1/16 K without noise, 4 to 8 K off at first: each ends wherever its temperature lies between two steps."""
+    given, rng = [], np.random.default_rng(5)
+    for each in made:
+        approach = rng.uniform(4, 8) * np.exp(-each.time / settling)
+        reading = np.round(16 * (each.si("temperature").mean() + rng.uniform(-0.03, 0.03) - approach)) / 16
+        given.append(each.with_columns({"temperature": reading}, {}))
+    assert il.fit_thermal(given).calibration.fit["recordings"] == 5
+
+
 def test_a_reading_in_whole_kelvins_is_not_stuck(made):
     ramps = [r for r in il.simulate_thermal(ramps=3, turn_on=0.0) if r.name.startswith("ramp")]
     coarse = [r.with_columns({"temperature": np.round(r.column("temperature"))}, {}) for r in (*made, *ramps)]

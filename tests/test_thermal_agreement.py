@@ -93,3 +93,8 @@ def test_a_simulation_without_a_recording_is_refused(tmp_path, capsys):
     assert main(["thermal", "simulate", "--attitudes", "0", "-o", str(tmp_path / "none")]) == 2
     assert "attitudes 0, ramps 0: make no recording" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_a_simulated_unit_comes_back_to_temperatures_in_files_of_their_own(tmp_path):
+    assert main(["thermal", "simulate", "--temperatures=0,20,0", "--attitudes", "3", "-o", str(tmp_path)]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tumble_0.csv", "tumble_0_2.csv", "tumble_20.csv"]

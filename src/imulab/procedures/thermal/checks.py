@@ -19,6 +19,8 @@ _JUMP, _QUICK = 5.0, 2.0  # K; s
 _COLDEST = -120.0  # degC
 _STUCK, _SHORT, _READINGS = 200, 20.0, 20
 """A reading that stays for so many samples, so many times as long as nearly all others, of which there are so many."""
+_LATER = (1.5, 1.25)
+"""How many times as long as the one before the last step to a reading takes, and the one before it, if it settles."""
 
 
 def prepared(
@@ -141,11 +143,28 @@ def _check_stuck(recording: Recording, values: Array) -> None:
     if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * np.quantile(np.delete(runs, longest), 0.95)):
         return
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
+    if _settles(values[:first], values[first]):
+        return
     raise DataError(
         f"{recording.name}: {recording.place(first)} to {recording.place(last)}, column temperature: stuck at "
         f"{values[first]:.6g} degC over {runs[longest]} samples, where others change every few; expected a thermometer "
         "that goes on: choose the part before it (--window)"
     )
+
+
+def _settles(before: Array, value: float) -> bool:
+    """Return whether readings came to rest at a value step by step, each step later than the one before it.
+
+    An exponential approach takes at least 1.71 and 1.41 times as long for its last step and the one before as for that
+    before these; a thermometer that stops while it drifts took as long for each.
+    """
+    away = np.round(np.abs(before - value), 6)
+    levels = np.unique(away[away > 0])[: len(_LATER) + 2]
+    if len(levels) < len(_LATER) + 2:
+        return False
+    left = np.array([int(np.flatnonzero(away >= level)[-1]) for level in levels])
+    steps = -np.diff(left)
+    return bool(np.all(steps[:-1] > np.array(_LATER) * steps[1:]))
 
 
 def _with_constant_named(recordings: Sequence[Recording]) -> list[Recording]:

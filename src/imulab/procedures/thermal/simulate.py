@@ -196,7 +196,8 @@ def _recording(made: ThermalRecordings, index: int) -> Recording:
     if index < tumbles:
         time, force, turning = _tumble(made, rng)
         temperature = made.temperatures[index] + 0.3 * np.sin(time / 300.0 + rng.uniform(0, 6.28))
-        name = f"tumble_{made.temperatures[index]:g}.csv"
+        again = made.temperatures[: index + 1].count(made.temperatures[index])
+        name = f"tumble_{made.temperatures[index]:g}{f'_{again}' if again > 1 else ''}.csv"
     else:
         number = index - tumbles
         time = np.arange(int(made.duration * made.rate / 10)) * 10 / made.rate
