@@ -213,7 +213,7 @@ def test_a_thermometer_that_stops_is_refused_and_one_that_never_goes_is_named(ma
 
 @pytest.mark.parametrize("settling", [2.0, 5.0, 10.0])
 def test_a_thermometer_that_settles_is_not_stuck(made, settling):
-    """Steps of 1/16 K without noise, 4 to 8 K off at first: each ends wherever its temperature lies between two steps."""
+    """Steps of 1/16 K without noise, 4 to 8 K off at first: each ends anywhere between two steps."""
     given, rng = [], np.random.default_rng(5)
     for each in made:
         approach = rng.uniform(4, 8) * np.exp(-each.time / settling)
@@ -242,8 +242,9 @@ def test_recordings_that_no_power_cycle_parts_are_asked_about(made):
         (lambda r: [warmer(r[0], -300), *r[1:]], {}, "degC cannot be; expected -120 to 150 degC"),
         (lambda r: r, {"settle": "-5 s"}, "settle -5 s: expected 0 s or more"),
         (lambda r: r, {"degrees": "5,5,5"}, "expected a degree below their number"),
+        (lambda r: r, {"gyro_turn_on_scatter": "1 deg/h"}, "no gyroscopes are fitted; expected --with gyro"),
     ],
-    ids=["twice", "cold", "settle", "degrees"],
+    ids=["twice", "cold", "settle", "degrees", "no gyroscopes"],
 )
 def test_more_that_cannot_be_is_refused_in_one_line(made, change, options, said):
     with pytest.raises(il.ImulabError) as refused:

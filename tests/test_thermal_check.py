@@ -181,9 +181,10 @@ def test_a_check_goes_all_the_way(tmp_path, monkeypatch, capsys, unit):
         (lambda r: r, {"limit": "-1 mg"}, "expected more than 0"),
         (lambda r: r, {"tilt": "0"}, "expected a size above 0"),
         (lambda r: r, {"turn_on_scatter": "-1 mg"}, "expected 0 or more"),
+        (lambda r: r, {"gyro_turn_on_scatter": "1 deg/h"}, "the record holds no gyroscopes"),
         (lambda r: [], {}, "expected one recording or more"),
     ],
-    ids=["volts", "no temperature", "kelvins", "ten g", "limit", "tilt", "scatter", "none"],
+    ids=["volts", "no temperature", "kelvins", "ten g", "limit", "tilt", "scatter", "no gyroscopes", "none"],
 )  # fmt: skip
 def test_what_cannot_be_checked_is_refused_in_one_line(unit, change, options, said):
     triad, record = unit

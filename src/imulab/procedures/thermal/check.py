@@ -179,7 +179,10 @@ def check_thermal(
         None if settle is None else in_si(settle, "settle", "time", "s"),
         span=0.0,
     )
-    earth = at_latitude(latitude) if thermal_of(held).model.gyro is not None else None
+    has_gyroscopes = thermal_of(held).model.gyro is not None
+    if gyro_turn_on_scatter is not None and not has_gyroscopes:
+        raise OptionError("gyro_turn_on_scatter: the record holds no gyroscopes (thermal fit --with gyro)")
+    earth = at_latitude(latitude) if has_gyroscopes else None
     local = _gravity(held, at_place(gravity, latitude, height, beside=earth is not None), given[0])
     holds, notes = _inside(held, find_holds(given))
     unit = thermal_of(held).model.output_unit

@@ -145,6 +145,8 @@ def fit_thermal(
     if not 0 < leaning < np.inf:
         raise OptionError(f"tilt {leaning:g}: expected a size above 0")
     scatter = _scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
+    if gyro_turn_on_scatter is not None and not further:
+        raise OptionError("gyro_turn_on_scatter: no gyroscopes are fitted; expected --with gyro beside it")
     rates = _scatter(gyro_turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
     known = None if prior is None else _known(as_record(prior, "fit_thermal: prior"), holds, local.value, scale)
     problem = _problem(holds, scale, zero, leaning, known)
