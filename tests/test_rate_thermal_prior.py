@@ -7,7 +7,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.errors import RecordError
+from imulab.errors import DataError, RecordError
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +92,22 @@ def test_what_it_cannot_tell_is_refused_in_a_line(thermal, tmp_path, monkeypatch
     (line,) = [each for each in capsys.readouterr().err.splitlines() if "prior" in each]
     assert "a thermal record without scale factors of gyroscopes; expected one of thermal fit --with gyro" in line
     assert not (tmp_path / "both.json").exists()
+
+
+def test_runs_at_different_temperatures_have_no_one_prior(thermal):
+    """At their mean the law is off by what the temperatures make of it: 1,600 ppm stated as 16."""
+    test = il.simulate_rate("0,50,100", hold="3 s", rate="50 Hz", seed=5)
+
+    def at_temperatures(*temperatures):
+        made = tuple(
+            one.with_columns({"temperature": np.full(len(one), t)}, {"temperature": "degC"})
+            for one, t in zip(test.recordings, temperatures, strict=True)
+        )
+        return il.fit_rate(dataclasses.replace(test, recordings=made), order=1, prior=thermal)
+
+    said = "prior: py_1.csv was made at -15.0 degC, pz_1.csv at 55.0; .* recordings at one temperature, 5 K apart"
+    with pytest.raises(DataError, match=said) as refused:
+        at_temperatures(20.0, -15.0, 55.0)
+    assert "\n" not in str(refused.value)
+    warm = at_temperatures(22.6, 25.0, 27.4).calibration
+    assert warm.fit["prior"]["parameters"]

@@ -92,19 +92,28 @@ def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration
     ------
     RecordError
         Their temperature is not known, or outside the record's range, or the record holds no scale factors.
+    DataError
+        Their temperatures differ, so that no one scale factor is theirs.
     """
     if prior.procedure != "thermal":
         return prior
+    from imulab.procedures.thermal.choices import APART
     from imulab.procedures.thermal.prior import gyros_at_temperature
 
     known = [
-        float(np.nanmean(one.si("temperature")))
+        (float(np.nanmean(one.si("temperature"))), one.name)
         for one in recordings
         if "temperature" in one
         and parse_unit(one.units["temperature"]).quantity == "temperature"
         and np.isfinite(one.si("temperature")).any()
     ]
-    whole = float(np.mean(known)) if len(known) == len(recordings) else None
+    (coldest, cold), (hottest, hot) = min(known, default=(0.0, "")), max(known, default=(0.0, ""))
+    if hottest - coldest > APART:
+        raise DataError(
+            f"prior: {cold} was made at {coldest:.1f} degC, {hot} at {hottest:.1f}; a thermal record is a prior of "
+            f"recordings at one temperature, {APART:g} K apart at most: fit each temperature alone"
+        )
+    whole = float(np.mean([each for each, _ in known])) if len(known) == len(recordings) else None
     return gyros_at_temperature(prior, whole, recordings[0].name)
 
 
