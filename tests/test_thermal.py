@@ -228,6 +228,15 @@ def test_a_reading_in_whole_kelvins_is_not_stuck(made):
     assert il.fit_thermal(coarse).calibration.fit["recordings"] == 8
 
 
+def test_steps_larger_than_the_noise_are_not_stuck_once_the_reading_leaves_a_boundary(made):
+    rng, given = np.random.default_rng(6), []
+    for each in made:
+        middle = np.floor(each.si("temperature").mean()) + 0.25 + 0.3 * each.time / each.time[-1]
+        reading = np.round(2 * (middle + 0.03 * rng.standard_normal(len(each)))) / 2
+        given.append(each.with_columns({"temperature": reading}, {}))
+    assert il.fit_thermal(given).calibration.fit["recordings"] == 5
+
+
 def test_recordings_that_no_power_cycle_parts_are_asked_about(made):
     swapped = made[0].with_columns({"accel_x": made[0].column("accel_y"), "accel_y": made[0].column("accel_x")}, {})
     record = il.fit_thermal([swapped, *made[1:]]).calibration

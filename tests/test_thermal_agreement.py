@@ -23,12 +23,12 @@ def table(outputs, temperature, name):
     return Recording(columns=columns, units=units, name=name, metadata={"gravity": f"{G} m/s^2"})
 
 
-def soaks(seed, change=None, at=None):
-    """Five soaks of one unit with 0.1 mg of turn-on scatter; `change` alters outputs and reading of one, or all."""
+def soaks(seed, change=None, at=None, temperatures=SOAKS):
+    """Soaks of one unit with 0.1 mg of turn-on scatter; `change` alters outputs and reading of one, or all."""
     rng, triad = np.random.default_rng([seed, 8]), reference.Triad(np.random.default_rng([seed, 1]))
     other = reference.Triad(np.random.default_rng([seed, 2]))
     found = []
-    for number, temperature in enumerate(SOAKS):
+    for number, temperature in enumerate(temperatures):
         outputs, _ = reference.soak(triad, rng, temperature, 12, 60e-6 * G, 1e-4 * G)
         reading = temperature
         if change is not None and at in (number, None):
@@ -98,3 +98,30 @@ def test_a_simulation_without_a_recording_is_refused(tmp_path, capsys):
 def test_a_simulated_unit_comes_back_to_temperatures_in_files_of_their_own(tmp_path):
     assert main(["thermal", "simulate", "--temperatures=0,20,0", "--attitudes", "3", "-o", str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tumble_0.csv", "tumble_0_2.csv", "tumble_20.csv"]
+
+
+EIGHT = (-20.0, 0.0, 20.0, 40.0, 60.0, -20.3, 20.3, 60.3)
+
+
+def off(recordings):
+    record = il.fit_thermal(recordings).calibration
+    return [each for each in record.warnings if "lies off the other recordings by" in each], record.verdict.state
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_recording_that_lies_off_by_far_more_than_the_others_scatter_is_asked_about(seed):
+    """A twin of the unit whose biases differ by 3 mg, which passed as one unit as long as nobody left it out."""
+    twin = 3e-3 * G * np.array([1.0, -1.0, 0.6])
+    said, state = off(soaks(seed, lambda outputs, t, _: (outputs + twin, t), 5, EIGHT))
+    assert state == "look"
+    assert said[0].startswith("soak_5.csv: lies off the other recordings by")
+    assert not off(soaks(seed, temperatures=EIGHT))[0]
+
+
+def test_scale_factors_tell_a_twin_among_five_recordings():
+    stretched = np.array([1.002, 0.998, 1.0015])
+    said, state = off(soaks(3, lambda outputs, t, _: (outputs * stretched, t), 2))
+    assert state == "look"
+    assert "soak_2.csv: lies off the other recordings by" in said[0]
+    assert "ppm in scale factors" in said[0]
+    assert not off(soaks(3))[0]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.procedures.thermal.choices import DEGREES
-from imulab.procedures.thermal.degrees import clusters_of
+from imulab.procedures.thermal.degrees import _part, clusters_of, tail
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.rows import Problem
-from imulab.procedures.thermal.solve import Solution, between, solve
+from imulab.procedures.thermal.rows import Problem, whitener
+from imulab.procedures.thermal.solve import Solution, _modes, between, excess_of, solve
 
 _MOVES = 0.002
 """What biases hardly move by from one power cycle to the next, g."""
@@ -26,6 +26,14 @@ _ENOUGH = 5
 """Temperatures that show the bends of a law, and recordings of which one can be told to stand apart."""
 _APART = 0.4
 """Share of their disagreement that the others keep where one recording stands apart."""
+_ATTITUDES = 6
+"""Of a recording whose own scale factors can be told."""
+_CHANCE = 0.005
+"""How often chance lets a recording lie off the others so, in biases or in scale factors."""
+_OFF_BIAS, _OFF_SCALE = 0.5e-3, 3e-4
+"""Less than this is not asked about, in g and in 1."""
+_USUAL = 1e-4
+"""What scale factors may well move by from one power cycle to the next."""
 _HOTTEST = 125.0
 """degC; sensors are rated to it."""
 
@@ -59,6 +67,8 @@ def disagreements(holds: Holds, problem: Problem, solution: Solution, name: str)
             f"{1e6 * own:.0f} ug: is a recording of another unit, with axes swapped, or with a jump of its outputs?"
             f"{'' if differ else apart}"
         )
+    if not apart:
+        found += _off(holds, problem, solution)
     if solution.laws.high > _HOTTEST:
         found.append(
             f"{name}: temperatures up to {solution.laws.high:.0f} degC, above what sensors are rated to: are these "
@@ -78,6 +88,50 @@ def _apart(holds: Holds, problem: Problem, laws: Laws) -> str:
     if not best < _APART * second:
         return ""
     return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} ug"
+
+
+def _off(holds: Holds, problem: Problem, solution: Solution) -> list[str]:
+    """Return which recording lies far off the laws, by how the others, without it, scatter about theirs.
+
+    Its own offsets of bias, beside the laws, are compared with those of the others by F; of scale factors, which power
+    cycles hardly move, with what noise and the others' scatter allow. Of five recordings under a cubic the others do
+    not tell how far biases scatter: there the scale factors tell it alone.
+    """
+    rows = solution.rows
+    numbers, attitudes = np.unique(problem.recording, return_counts=True)
+    if len(numbers) < _ENOUGH:
+        return []
+    whose = np.where(rows.owner >= 0, problem.recording[rows.owner], -1)
+    asked = []
+    for number in numbers[attitudes >= _ATTITUDES].tolist():
+        if not problem.shared[problem.recording == number].all():
+            continue
+        others = _part(rows, whose != number)
+        excess, freedom = excess_of(others, solution.excess**2)
+        scatter, white = between(others, excess), whitener(others, excess, np.zeros(2))
+        own = np.s_[3 * number : 3 * number + 3]
+        stretch, told = max(float(scatter.tau[1]), _USUAL), freedom
+        if stretch > _USUAL:  # few recordings told it
+            bias, scale = (white(given) for given in others.offsets)
+            told = float(len(_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
+        tests = [(1, np.array([_BENDS, stretch]), told, _OFF_SCALE)]
+        if scatter.rank:
+            tests.append((0, scatter.tau, float(scatter.rank), _OFF_BIAS))
+        for kind, tau, told, least in tests:
+            white = whitener(rows, excess, tau)
+            s, force = _modes(white(rows.jacobian), white(rows.offsets[kind][:, own]), white(rows.residual))
+            if not len(s):
+                continue
+            size = float(np.sqrt(np.sum((force / s) ** 2) / 3))
+            chance = len(numbers) * tail(float(np.mean(force**2)), len(s), told)
+            if chance < _CHANCE and size > least:
+                by = f"{1e6 * size:.0f} ppm in scale factors" if kind else f"{1e3 * size:.2g} mg in biases"
+                asked.append((chance, f"{holds.recordings[number].name}: lies off the other recordings by {by}"))
+    return [
+        f"{said}, far more than they differ among themselves: is it of the same unit, at the temperature that it says, "
+        "or have the laws a bend there? come back to that temperature"
+        for _, said in sorted(asked)[:1]
+    ]
 
 
 def _without(problem: Problem, gone: NDArray[np.bool_]) -> Problem:

@@ -17,8 +17,9 @@ from imulab.units import parse_unit
 _KELVIN = 150.0  # degC; no unit is calibrated above it, and every kelvin above -120 degC is
 _JUMP, _QUICK = 5.0, 2.0  # K; s
 _COLDEST = -120.0  # degC
-_STUCK, _SHORT, _READINGS = 200, 20.0, 20
-"""A reading that stays for so many samples, so many times as long as nearly all others, of which there are so many."""
+_STUCK, _SHORT, _READINGS, _STEPS = 200, 20.0, 20, 1.5
+"""A reading that stays for so many samples, so many times as long as nearly all others, of which there are so many, and
+that changes by so many steps otherwise."""
 _LATER = (1.5, 1.25)
 """How many times as long as the one before the last step to a reading takes, and the one before it, if it settles."""
 
@@ -138,8 +139,11 @@ def _check_temperature(recording: Recording) -> None:
 def _check_stuck(recording: Recording, values: Array) -> None:
     """Refuse a thermometer that stops: one reading for long, where others change every few samples."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
-    runs = np.diff(edges)
+    runs, changes = np.diff(edges), np.abs(np.diff(values[edges[:-1]]))
     longest = int(np.argmax(runs))
+    # A reading whose steps are larger than its noise goes from one to the next, and rests at one where nothing warms.
+    if not changes.size or np.median(changes) < _STEPS * changes.min():
+        return
     if len(runs) < _READINGS or runs[longest] < max(_STUCK, _SHORT * np.quantile(np.delete(runs, longest), 0.95)):
         return
     first, last = int(edges[longest]), int(edges[longest + 1]) - 1
