@@ -99,6 +99,32 @@ def test_the_table_axis_is_found_from_a_sweep_too(accel, noise):
     assert max(abs(blind.value(n) - v) for n, v in TRUTH.items() if "misalignment" in n) > 5e-3
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.2])
+def test_a_sweep_states_the_error_of_its_axis_whatever_the_noise(accel, correlation):
+    """Noise of the accelerometers alone, white or correlated over 0.2 s, in which it erred by 4 times its statement."""
+    names = accel.covariance.names
+    zero = dataclasses.replace(accel.covariance, matrix=tuple(map(tuple, (1e-20 * np.eye(len(names))).tolist())))
+    exact, keep = (
+        dataclasses.replace(accel, covariance=zero),
+        np.exp(-1 / FREQUENCY / correlation) if correlation else 0,
+    )
+    lean = np.tan(np.radians(1)) * np.eye(3)[[1, 2, 0]]
+    made, scores = whole(SIX[::2], tilt=2e-3, leans=lean, table=swept()), []
+    for seed in range(8):
+        rng, noisy = np.random.default_rng(seed), []
+        for one in made.recordings:
+            own = 0.05 * np.sqrt(1 - keep**2) * rng.standard_normal((len(one) + 200, 3))
+            for k in range(1, len(own)):
+                own[k] += keep * own[k - 1]
+            columns = {f"accel_{a}": one.column(f"accel_{a}") + own[200:, i] for i, a in enumerate("xyz")}
+            noisy.append(one.with_columns(columns, dict.fromkeys(columns, "m/s^2")))
+        found = il.fit_rate(dataclasses.replace(made, recordings=tuple(noisy)), accel=exact, order=1).calibration
+        turns = {n: p for n, p in found.parameters.items() if "gyro_misalignment" in n}
+        scores.append([(p.value - TRUTH[n]) / p.standard_uncertainty for n, p in turns.items()])
+    # the root of a mean of 48 squares scatters by 0.10 about 1
+    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
+
+
 def test_a_sweep_that_hardly_turns_the_table_tells_no_axis(accel):
     made = whole(SIX[::2], table=swept(20.0, 0.2))
     with pytest.raises(il.ImulabError, match=r"0.csv .*the table axis .* by a whole turn or more, found \d+ deg"):

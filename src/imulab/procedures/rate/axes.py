@@ -27,6 +27,8 @@ BY_ACCELEROMETERS = "that of the accelerometers"
 """The frame of a record's misalignments."""
 _FACE = np.cos(np.radians(30))
 _PIECE = 0.02  # s
+_BATCHES, _FEWEST = 32, 8
+"""Parts of a sweep, and pieces in each."""
 _TRIAD = tuple(f"accel_{axis}" for axis in AXES)
 
 
@@ -43,7 +45,8 @@ class TableAxes:
     arm
         See `force`.
     spread
-        Standard uncertainty of each component of a direction by the scatter of the dwells, rad, shape (m,).
+        Standard uncertainty of each component of a direction by the scatter of the dwells, or of parts of a sweep, rad,
+        shape (m,).
     changes
         What one standard uncertainty of each of p parameters of the accelerometers does to it, shape (p, m, 3).
     correlation
@@ -80,7 +83,8 @@ def find_axes(
 
     def axes_by(record: Calibration) -> list[tuple[Array, Array, float]]:
         force = corrected_means(record, outputs, unit)
-        return [_intercept(force[runs == k], each[1]) for k, each in enumerate(seen)]
+        swept = [found.sweep is not None for found in dwells]
+        return [_intercept(force[runs == k], each[1], swept[k]) for k, each in enumerate(seen)]
 
     found = axes_by(accel)
     force = np.array([each[0] for each in found])
@@ -178,7 +182,7 @@ def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
             f"{place}: the table axis by accelerometers needs a sweep that turns the table by a whole turn or more, "
             f"found {from_si(float(np.ptp(angle)), 'deg'):.0f} deg: sweep more slowly, or faster"
         )
-    size = max(1, round(_PIECE / float(np.median(np.diff(time)))))
+    size = max(1, min(round(_PIECE / float(np.median(np.diff(time)))), len(time) // (_FEWEST * _BATCHES)))
     count = len(time) // size
 
     def pieces(values: Array) -> Array:
@@ -189,15 +193,25 @@ def _seen_in_a_sweep(recording: Recording, place: str) -> tuple[Array, Array]:
     return force, np.column_stack([np.ones(count), *columns])
 
 
-def _intercept(force: Array, columns: Array) -> tuple[Array, Array, float]:
-    """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it."""
+def _intercept(force: Array, columns: Array, swept: bool) -> tuple[Array, Array, float]:
+    """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it.
+
+    Dwells are independent of one another. Pieces of a sweep are not, where noise is filtered or vibration goes on from
+    piece to piece: there the scores of longer parts tell. Source: batch means; Liang and Zeger, Biometrika 73 (1986) 13.
+    """
     root, largest = columns[:, :1], np.abs(columns).max(axis=0)
     scaled = columns / largest
-    coefficients, *_ = np.linalg.lstsq(scaled, force * root, rcond=None)
+    inverse = np.linalg.inv(scaled.T @ scaled)
+    coefficients = inverse @ (scaled.T @ (force * root))
     left = force * root - scaled @ coefficients
-    variance = float(np.mean(np.sum(left**2, axis=0))) / max(len(force) - columns.shape[1], 1)
-    u = float(np.sqrt(variance * np.linalg.inv(scaled.T @ scaled)[0, 0])) / largest[0]
-    return coefficients[0] / largest[0], coefficients[1] / largest[1], u
+    if swept:
+        edges = np.linspace(0, len(force), _BATCHES, endpoint=False).astype(np.int64)
+        scores = np.add.reduceat((scaled @ inverse[:, :1]) * left, edges)
+        variance = float(np.mean(np.sum(scores**2, axis=0))) * _BATCHES / (_BATCHES - columns.shape[1])
+    else:
+        freedom = max(len(force) - columns.shape[1], 1)
+        variance = float(np.mean(np.sum(left**2, axis=0))) / freedom * float(inverse[0, 0])
+    return coefficients[0] / largest[0], coefficients[1] / largest[1], float(np.sqrt(variance)) / largest[0]
 
 
 def _up(direction: Array) -> str:
