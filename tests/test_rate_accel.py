@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import imulab as il
 from imulab.cli import main
@@ -104,18 +105,14 @@ def test_a_sweep_states_the_error_of_its_axis_whatever_the_noise(accel, correlat
     """Noise of the accelerometers alone, white or correlated over 0.2 s, in which it erred by 4 times its statement."""
     names = accel.covariance.names
     zero = dataclasses.replace(accel.covariance, matrix=tuple(map(tuple, (1e-20 * np.eye(len(names))).tolist())))
-    exact, keep = (
-        dataclasses.replace(accel, covariance=zero),
-        np.exp(-1 / FREQUENCY / correlation) if correlation else 0,
-    )
+    exact = dataclasses.replace(accel, covariance=zero)
+    keep = np.exp(-1 / FREQUENCY / correlation) if correlation else 0.0
     lean = np.tan(np.radians(1)) * np.eye(3)[[1, 2, 0]]
     made, scores = whole(SIX[::2], tilt=2e-3, leans=lean, table=swept()), []
     for seed in range(8):
         rng, noisy = np.random.default_rng(seed), []
         for one in made.recordings:
-            own = 0.05 * np.sqrt(1 - keep**2) * rng.standard_normal((len(one) + 200, 3))
-            for k in range(1, len(own)):
-                own[k] += keep * own[k - 1]
+            own = 0.05 * lfilter([np.sqrt(1 - keep**2)], [1, -keep], rng.standard_normal((len(one) + 200, 3)), axis=0)
             columns = {f"accel_{a}": one.column(f"accel_{a}") + own[200:, i] for i, a in enumerate("xyz")}
             noisy.append(one.with_columns(columns, dict.fromkeys(columns, "m/s^2")))
         found = il.fit_rate(dataclasses.replace(made, recordings=tuple(noisy)), accel=exact, order=1).calibration

@@ -197,7 +197,7 @@ def _intercept(force: Array, columns: Array, swept: bool) -> tuple[Array, Array,
     """Return mean force at rate 0 and its slope over the rate squared, and the uncertainty of a component of it.
 
     Dwells are independent of one another. Pieces of a sweep are not, where noise is filtered or vibration goes on from
-    piece to piece: there the scores of longer parts tell. Source: batch means; Liang and Zeger, Biometrika 73 (1986) 13.
+    piece to piece: there the scores of longer parts tell. Source: Liang and Zeger, Biometrika 73 (1986) 13.
     """
     root, largest = columns[:, :1], np.abs(columns).max(axis=0)
     scaled = columns / largest
