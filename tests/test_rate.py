@@ -363,3 +363,124 @@ def test_a_table_is_stated_in_parts_of_the_rate(tmp_path):
     (tmp_path / "t.toml").write_text(below, encoding="utf-8")
     with pytest.raises(il.ImulabError, match="rates: proportional_standard_uncertainty: expected 0 or more, found -1"):
         load_test(tmp_path / "t.toml")
+
+
+def _written(folder, faces=("+x", "+y", "+z"), **head):
+    """A test of three faces as files, and its manifest."""
+    made = whole(False, faces=faces)
+    for number, one in enumerate(made.recordings):
+        serial = {"serial": head["serials"][number]} if "serials" in head else {}
+        il.write(dataclasses.replace(one, metadata=serial), folder / one.name)
+    text = manifest_text(made.test)
+    (folder / "t.toml").write_text(text, encoding="utf-8")
+    return text
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda t: t.replace('"+y.csv"', '"+x.csv"').replace('= "+y"', '= "+x"'),
+            "the same recording as +x.csv, which",
+        ),
+        (
+            lambda t: t.replace('mounting = "+z"', 'mounting = "-z"'),
+            "each the other way round: is the sign of mounting",
+        ),
+    ],
+)
+def test_a_run_that_is_not_what_the_manifest_says_is_refused(change, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    text = _written(tmp_path)
+    Path("t.toml").write_text(change(text), encoding="utf-8")
+    ran("rate", "fit", "t.toml", "-o", "r.json", status=2)
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+    assert not Path("r.json").exists()
+
+
+def test_runs_of_two_units_are_refused_and_one_of_another_than_the_manifest_says_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    _written(tmp_path, serials=("SN1", "SN1", "SN2"))
+    ran("rate", "fit", "t.toml", "-o", "r.json", status=2)
+    assert "serial SN2, but +x.csv is of serial SN1" in capsys.readouterr().err
+    text = _written(tmp_path, serials=("SN1", "SN1", "SN1"))
+    Path("t.toml").write_text(f'{text}\n[sensor]\nserial = "SN7"\n', encoding="utf-8")
+    ran("rate", "fit", "t.toml", "-o", "r.json")
+    assert "+x.csv is of serial SN1, the manifest of SN7" in capsys.readouterr().err
+
+
+def test_a_record_is_not_written_over_a_run_of_the_manifest(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    _written(tmp_path)
+    before = Path("+y.csv").read_bytes()
+    ran("rate", "fit", "t.toml", "-o", "+y.csv", status=2)
+    assert "would overwrite" in capsys.readouterr().err
+    assert Path("+y.csv").read_bytes() == before
+
+
+def test_a_rate_that_the_list_lacks_is_not_taken_for_its_neighbour():
+    """10 and -10 deg/s next to 0, between listed rates that are 50 deg/s apart; S would be off by 8000 ppm or so."""
+    kept = [rate for rate in RATES if abs(rate) != 10 * DEGREE]
+    with pytest.raises(il.ImulabError, match=r"is at -?10 deg/s, none of the listed rates .*is a listed rate missing"):
+        il.fit_rate(recording(column=False), rates=kept)
+    assert il.fit_rate(recording(column=False), rates=RATES).calibration.value("gyro_scale_factor_z") > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--latitude", "95"], "expected -90 to 90 deg"),
+        (["--table-uncertainty", "-1"], "expected an uncertainty of 0 or more"),
+        (["--table-uncertainty", "200%"], "expected an uncertainty of 0 or more"),
+    ],
+)
+def test_an_option_out_of_its_range_is_refused(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    _written(tmp_path)
+    il.write(recording(), "z.csv")
+    for name in ("t.toml", "z.csv"):
+        ran("rate", "fit", name, *words, "-o", "r.json", status=2)
+        assert said in capsys.readouterr().err
+        assert not Path("r.json").exists()
+
+
+SEVEN = [0, 30, 70, 100, 150, 200, 150, 100, 70, 30, 0, -30, -70, -100, -150, -200, -150, -100, -70, -30, 0]
+
+
+def test_a_kink_at_zero_is_said_since_no_power_of_the_rate_compensates_it():
+    """Positive rates by 300 ppm more: beside five powers; a bend of the same size alone is none."""
+    made = recording(way=SEVEN, noise=5e-5, rng=np.random.default_rng(3))
+    rate = reference.steps(SEVEN, 3.0, 50.0)
+    kinked = changed(made, gyro_z=made.column("gyro_z") + 3e-4 * SCALE[2] * np.maximum(rate, 0))
+    found = il.fit_rate(kinked)
+    assert found.linearity["z"].kink == pytest.approx(3e-4, rel=0.15)
+    assert any("with a kink at 0 that no power" in w for w in found.calibration.warnings)
+    assert found.calibration.verdict.state == "look"
+    bent = changed(made, gyro_z=made.column("gyro_z") + 1e-4 * SCALE[2] * rate**2)
+    assert il.fit_rate(bent).linearity["z"].kink is None
+
+
+def test_a_bend_beyond_the_order_that_was_asked_for_is_said():
+    made = whole(powers=([1e-4] * 3,), noise=1e-4, rng=np.random.default_rng(1))
+    said = il.fit_rate(made, order=1).calibration.warnings
+    assert any("beyond order 1, and beyond the noise" in w for w in said)
+    assert not any("predicts single rates better" in w for w in said)
+    assert not any("beyond order" in w for w in il.fit_rate(made, order=2).calibration.warnings)
+
+
+def test_a_zero_that_walks_makes_no_loop():
+    """Visits of one rate scatter by more than their noise, by which the loop is judged; 1 in 4 were alarms before."""
+    alarms = 0
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        runs = []
+        for _ in range(3):
+            made = recording(noise=1e-4, rng=rng)
+            steps = 3e-5 * rng.standard_normal(len(made))
+            runs.append(changed(made, gyro_z=made.column("gyro_z") + np.cumsum(steps)))
+        test = RateTest(tuple(Run(f"{k}.csv", "+z") for k in range(3)), relative_uncertainty=0.0)
+        loop = il.fit_rate(RateRecordings(test, tuple(runs), {}), order=1).linearity["z"].loop
+        alarms += loop < 0.01
+    assert alarms <= 3

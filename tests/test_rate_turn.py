@@ -272,3 +272,31 @@ def test_a_turn_faster_than_the_range_is_refused():
         il.fit_turns(clipped)
     coarse = _with(made, **{n: np.round(made.column(n) / 0.5) * 0.5 for n in ("gyro_x", "gyro_y", "gyro_z")})
     assert il.fit_turns(coarse).turns["z"].scale == pytest.approx(1, abs=3e-3)
+
+
+def test_a_unit_that_was_lifted_and_tipped_over_on_its_way_is_refused():
+    """Tipped by 80 deg in the middle of each turn: another gyroscope sees most of it."""
+    parts = [np.zeros((300, 3))]
+    for way in (1, 1, -1, -1):
+        u = (np.arange(400) + 0.5) / 400
+        turn = way * 90 * (1 - np.cos(2 * np.pi * u))
+        tip = np.radians(80) * np.sin(np.pi * u) ** 2
+        rate = np.column_stack([np.degrees(np.gradient(tip)) * FREQUENCY, turn * np.sin(tip), turn * np.cos(tip)])
+        parts += [rate, np.zeros((300, 3))]
+    out = 1.02 * np.vstack(parts) + 0.02 * np.random.default_rng(1).standard_normal((len(np.vstack(parts)), 3))
+    with pytest.raises(il.ImulabError, match=r"is about y and z together .*was the unit lifted or tipped"):
+        il.fit_turns({"gyro": out}, rate=FREQUENCY, unit="deg/s")
+
+
+def test_a_stated_number_of_turns_that_does_not_go_with_the_others_is_refused():
+    with pytest.raises(il.ImulabError, match=r"-2 turns as stated, but -1\.00 as the others go: is --turns right"):
+        il.fit_turns(turned([1, 1, -1, -1]), turns="1,1,-1,-2")
+
+
+@pytest.mark.parametrize("clock", ["-1", "300%"])
+def test_a_clock_that_is_no_uncertainty_is_refused_and_leaves_no_record(clock, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    il.write(turned([1, -1]), "turns.csv")
+    assert main(["rate", "turn", "turns.csv", "--clock", clock, "-o", "t.json"], project=False) == 2
+    assert "expected an uncertainty of 0 or more" in capsys.readouterr().err
+    assert not Path("t.json").exists()

@@ -136,12 +136,16 @@ def fit(
 
     Each recording holds steps of rate in both directions; its manifest says which body axis was along the table's.
     """
+    from pathlib import Path
+
     from imulab.cli.result import finish
+    from imulab.procedures.rate.manifest import load_test
     from imulab.procedures.run import run_task
 
-    check_outputs(
-        [output, report], [name for name in (file, options["layout"], options["accel"], options["prior"]) if name]
-    )
+    runs = load_test(file).runs if file.lower().endswith(".toml") and "://" not in file else ()
+    inputs = [file, options["layout"], options["accel"], options["prior"]]
+    inputs += [str(Path(file).parent / run.file) for run in runs]
+    check_outputs([output, report], [name for name in inputs if name])
     finish(run_task("rate", [file], options, GivenFiles()), output, report, json=json)
 
 

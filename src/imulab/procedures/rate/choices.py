@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from imulab.errors import OptionError
+from imulab.quantities import fraction
 from imulab.units import to_si
 
 if TYPE_CHECKING:
@@ -36,6 +37,20 @@ def rates_of(text: str, option: str) -> tuple[float, ...]:
         found = ()
     if len(set(found)) < 2 or not all(abs(rate) < 1e6 for rate in found):
         raise OptionError(f"{option} {text!r}: expected rates of the table, deg/s, such as 0,10,100,-10,-100")
+    return found
+
+
+def part_of_one(value: float | str, option: str) -> float:
+    """Return an uncertainty as a fraction of 0 or more and below 1.
+
+    Raises
+    ------
+    OptionError
+        It is none.
+    """
+    found = fraction(value, option)
+    if not 0 <= found < 1:
+        raise OptionError(f"{option} {value}: expected an uncertainty of 0 or more as a fraction, such as 20ppm")
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -21,6 +22,8 @@ _BATCHES = 8
 _FEW, _OF_RANGE, _SWEEP, _FLAT = 3, 0.02, 500, 0.03
 """Rates of steps; share of the range that a step keeps to; samples of a sweep; share of its range at one output."""
 _NEXT_TO = 0.3
+_ALIKE, _OUT = 5e-3, 5.0
+"""Of the largest rate, and of what is usual: by how much visits of one rate differ at most."""
 _STANDS = 0.2
 _WRONG = 0.5
 _ROUNDING = 1e-9
@@ -299,13 +302,22 @@ def _listed_rates(
         scale, zero = np.polyfit(nearest, reading, 1).tolist()
     off = np.abs((reading - zero) / scale - nearest)
     worst = int(np.argmax(off))
+    if off[worst] <= _NEXT_TO * gap:  # what one listed rate was taken for is one rate
+        off = np.abs(seen - np.array([np.median(seen[nearest == rate]) for rate in nearest]))
+        worst, gap = int(np.argmax(off)), max(_ALIKE * np.abs(listed).max(), _OUT * float(np.median(off))) / _NEXT_TO
     if off[worst] > _NEXT_TO * gap:
         a, b = stretches[worst]
         seen_rate = (reading[worst] - zero) / scale
         raise SegmentError(
-            f"{place}: the dwell at {time[a]:.1f} to {time[b - 1]:.1f} s is at {_degrees(seen_rate)} deg/s, next to "
-            f"none of the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, or is the "
-            "mounting's sign wrong?"
+            f"{place}: the dwell at {time[a]:.1f} to {time[b - 1]:.1f} s is at {_degrees(seen_rate)} deg/s, none of "
+            f"the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, is a listed rate missing "
+            "or wrong, or the mounting's sign?"
+        )
+    order, found = ([rate for rate, _ in groupby(each)] for each in (rates, nearest.tolist()))
+    if order == [-rate for rate in found] != found:
+        raise SegmentError(
+            f"{place}: {main} saw the listed rates in their order, each the other way round: is the sign of mounting "
+            "wrong?"
         )
     missing = sorted(set(listed.tolist()) - set(nearest.tolist()))
     if missing:

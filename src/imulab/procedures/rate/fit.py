@@ -11,9 +11,10 @@ from typing import Any, Unpack
 import numpy as np
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
+from imulab.gravity import checked_latitude
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.rate.axes import TableAxes, find_axes, with_accelerometers
-from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, gyros_of, rates_of
+from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
 from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
@@ -24,7 +25,7 @@ from imulab.procedures.rate.record import make_record
 from imulab.procedures.rate.simulate import RateRecordings
 from imulab.procedures.rate.solve import Problem, Solution, solve, without_lean
 from imulab.procedures.result import Result
-from imulab.quantities import fraction, in_si
+from imulab.quantities import in_si
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 
@@ -119,8 +120,8 @@ def fit_rate(
     highest = str(order)
     if highest not in ORDERS:
         raise OptionError(f"order {highest!r}: expected one of {listed(ORDERS, highest)}")
-    place = None if latitude is None else in_si(latitude, "latitude", "angle", "deg")
-    common = None if table_uncertainty is None else fraction(table_uncertainty, "table_uncertainty")
+    place = None if latitude is None else checked_latitude(in_si(latitude, "latitude", "angle", "deg"))
+    common = None if table_uncertainty is None else part_of_one(table_uncertainty, "table_uncertainty")
     manifest = isinstance(data, str | os.PathLike) and os.fspath(data).lower().endswith(".toml")
     if isinstance(data, RateRecordings) or manifest:
         if rates is not None or axis != "+z":
@@ -210,7 +211,19 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
     if not first:
         recordings[0].column("gyro_x")
     unit = recordings[0].units[first[0]]
+    seen: dict[str, str] = {}
     for index, recording in enumerate(recordings):
+        for key in ("serial", "element"):
+            mine, its = recordings[0].metadata.get(key), recording.metadata.get(key)
+            if mine and its and mine != its:
+                raise DataError(
+                    f"{test.place(index)}: {key} {its}, but {test.runs[0].file} is of {key} {mine}; expected "
+                    "recordings of one unit"
+                )
+        of = "" if recording.source is None else recording.source.sha256
+        if of in seen:
+            raise DataError(f"{test.place(index)}: the same recording as {seen[of]}, which would count twice")
+        seen |= {of: test.runs[index].file} if of else {}
         if gyro_columns(recording) != first:
             raise DataError(
                 f"{test.place(index)}: columns {' '.join(gyro_columns(recording)) or 'without gyroscopes'}, but "

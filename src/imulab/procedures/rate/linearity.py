@@ -20,6 +20,8 @@ _EXACT = 1e-10
 _CHANCE = 0.01
 _ONE_SIDED = 1.645
 _SMALL = 1e-3
+_RATES, _POWERS, _SURE = 7, 5, 3.29
+"""Different rates that tell a kink from powers of the rate, such powers, and standard uncertainties of 1 in 1000."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,9 @@ class Linearity:
         Least rate that shows, and its standard uncertainty by the rates below it, rad/s; None without small rates.
     by_polynomial
         Largest residual of the powers of the rate that were taken.
+    kink
+        By how much the slopes of positive and negative rates differ beside five powers of the rate, where noise alone
+        does that less than once in a thousand tests; else None.
     """
 
     rate: Array
@@ -62,6 +67,7 @@ class Linearity:
     repeatability: tuple[float, float] | None
     threshold: tuple[float, float] | None
     by_polynomial: float
+    kink: float | None
 
 
 def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linearity:
@@ -90,7 +96,8 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
     direction = _directions(rate, runs)
     powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
     rest = _fitted(powers, values, variance)[0]
-    loop, hysteresis = _hysteresis(left, variance, key, runs, direction, rate)
+    beyond = _beyond_noise(key, direction, zeros, values, variance)
+    loop, hysteresis = _hysteresis(left, variance, key, runs, direction, rate, beyond)
     return Linearity(
         rate=rate,
         residual=left / largest,
@@ -105,6 +112,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
         repeatability=_repeatability(rate, values, variance, runs),
         threshold=_threshold(rate, problem.table[own], left, variance, key),
         by_polynomial=max(abs(float(rest[key == k].mean())) for k in np.unique(key)) / largest,
+        kink=_kink(rate / largest, values / largest, (variance + of_rate) / largest**2, zeros, len(means)),
     )
 
 
@@ -144,8 +152,37 @@ def _asymmetry(
     return float(found[0, 0] - found[1, 0]), float(u)
 
 
+def _kink(rate: Array, values: Array, variance: Array, zeros: Array, count: int) -> float | None:
+    """Return the difference of slopes beside powers of the rate, all over the largest, where it is significant."""
+    if count < _RATES:
+        return None
+    powers = range(1, min(_POWERS, count - 3) + 1)
+    columns = np.column_stack([np.abs(rate), *(rate**power for power in powers), zeros])
+    left, found = _fitted(columns, values, variance)
+    freedom = len(values) - np.linalg.matrix_rank(columns)
+    beyond = max(float(np.sum(left**2 / variance)) / freedom, 1.0) if freedom > 0 else 1.0
+    return 2 * float(found[0, 0]) if abs(found[0, 0]) > _SURE * np.sqrt(found[0, 1] * beyond) else None
+
+
+def _beyond_noise(
+    key: NDArray[Any], direction: NDArray[np.int64], zeros: Array, values: Array, variance: Array
+) -> tuple[float, int] | None:
+    """Return chi-square and degrees of freedom of visits of one rate from one side, where they scatter beyond noise."""
+    cells = np.unique(3 * key + direction, return_inverse=True)[1]
+    columns = np.column_stack([cells[:, None] == np.arange(cells.max() + 1), zeros]).astype(np.float64)
+    freedom = len(values) - int(np.linalg.matrix_rank(columns))
+    chi_square = float(np.sum(_fitted(columns, values, variance)[0] ** 2 / variance))
+    return (chi_square, freedom) if freedom and chi_square_probability(chi_square, freedom) < _CHANCE else None
+
+
 def _hysteresis(
-    left: Array, variance: Array, key: NDArray[Any], runs: NDArray[Any], direction: NDArray[np.int64], rate: Array
+    left: Array,
+    variance: Array,
+    key: NDArray[Any],
+    runs: NDArray[Any],
+    direction: NDArray[np.int64],
+    rate: Array,
+    beyond: tuple[float, int] | None,
 ) -> tuple[float | None, tuple[float, float] | None]:
     """Return the probability of a loop by noise, and the largest rising less falling over the largest rate."""
     from imulab.estimation.special import ndtr, stdtr
@@ -168,17 +205,19 @@ def _hysteresis(
     worst = int(np.argmax(np.abs(table[:, 1])))
     size = (float(table[worst, 1]) / largest, float(np.sqrt(table[worst, 2])) / largest)
     loop = 1 - (table[:, 0] / largest) ** 2
-    weight = 1 / table[:, 2]
-    spread = weight @ loop**2
+    spread = float(np.sum(loop**2 / table[:, 2]))
     if len(rows) < 2 or spread <= 0:
         return None, size
-    slope = weight @ (loop * table[:, 1]) / spread
-    residual = table[:, 1] - slope * loop
-    chi_square, freedom = float(weight @ residual**2), len(rows) - 1
+    slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
+    chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
     t = float(abs(slope) * np.sqrt(spread))
+    found = [2 * float(ndtr(-t))]
+    freedom = len(rows) - 1
     if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
-        return 2 * float(stdtr(freedom, -t / np.sqrt(chi_square / freedom))), size
-    return 2 * float(ndtr(-t)), size
+        found.append(2 * float(stdtr(freedom, -t / np.sqrt(chi_square / freedom))))
+    if beyond:
+        found.append(2 * float(stdtr(beyond[1], -t / np.sqrt(beyond[0] / beyond[1]))))
+    return max(found), size
 
 
 def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:

@@ -16,8 +16,9 @@ import numpy as np
 
 from imulab.atomic_write import write_text
 from imulab.errors import ObservabilityError, OptionError, RecordError, listed
+from imulab.gravity import checked_latitude
 from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.rate.choices import EARTH, FENCE, MOUNTINGS, ORDERS, RATES, rates_of
+from imulab.procedures.rate.choices import EARTH, FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
 from imulab.procedures.rate.engineering import shown as as_read
 from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
 from imulab.procedures.rate.parameters import model_parameters
@@ -257,8 +258,8 @@ def plan_rate(
         for word in words
         for cycle in range(1, count + 1)
     )
-    common = None if table_uncertainty is None else fraction(table_uncertainty, "table_uncertainty")
-    place = None if latitude is None else in_si(latitude, "latitude", "angle", "deg")
+    common = None if table_uncertainty is None else part_of_one(table_uncertainty, "table_uncertainty")
+    place = None if latitude is None else checked_latitude(in_si(latitude, "latitude", "angle", "deg"))
     test = RateTest(runs, common, latitude=place, name="plan")
     stay = {each.rate: each.duration for each in planned}
     return RatePlan(

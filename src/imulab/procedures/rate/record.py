@@ -76,7 +76,11 @@ def make_record(
         sensor={**sensor, **test.sensor},
         sources=tuple(recording.source for recording in recordings if recording.source is not None),
         warnings=(
-            *_findings(test, problem, solution, linearity, parameters, unit),
+            *_of_sensor(test, recordings),
+            *_of_unit(parameters, unit),
+            *_of_table(test, parameters, axes is not None, any("table_angle" in one for one in recordings)),
+            *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order),
+            *_of_scatter(problem, solution),
             *(faces_said(test, recordings, dwells) if axes is None else lean_said(axes, test)),
             *of_sines(test, dwells),
         ),
@@ -152,20 +156,12 @@ def _dwells(linearity: Mapping[str, Linearity]) -> dict[str, Any]:
     }
 
 
-def _findings(
-    test: RateTest,
-    problem: Problem,
-    solution: Solution,
-    linearity: Mapping[str, Linearity],
-    parameters: Mapping[str, Parameter],
-    unit: str,
-) -> list[str]:
-    return [
-        *_of_unit(parameters, unit),
-        *_of_table(test, parameters, problem.lean is not None),
-        *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True))),
-        *_of_scatter(problem, solution),
-    ]
+def _of_sensor(test: RateTest, recordings: Sequence[Recording]) -> list[str]:
+    stated = test.sensor.get("serial")
+    other = [one for one in recordings if stated and one.metadata.get("serial", stated) != stated]
+    if not other:
+        return []
+    return [f"{other[0].name} is of serial {other[0].metadata['serial']}, the manifest of {stated}: which is the unit?"]
 
 
 def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
@@ -179,13 +175,14 @@ def _of_unit(parameters: Mapping[str, Parameter], unit: str) -> list[str]:
     return [Bad(f"the scale factors are off by {said}: is the unit ({unit}) right, or that of the table's rates?")]
 
 
-def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool) -> list[str]:
+def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool, by_angle: bool) -> list[str]:
     found: list[str] = []
     if test.relative_uncertainty is None:
+        clock = ", with that of the recorder's clock by which table_angle became a rate," if by_angle else ""
         found.append(
             Note(
-                "the uncertainty that all rates of the table have in common was not stated, and is in no uncertainty "
-                "of a scale factor (relative_standard_uncertainty, or --table-uncertainty)"
+                f"the uncertainty that all rates of the table have in common{clock} was not stated, and is in no "
+                "uncertainty of a scale factor (relative_standard_uncertainty, or --table-uncertainty)"
             )
         )
     triad = any(name.startswith("gyro_misalignment") for name in parameters)
@@ -201,16 +198,27 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool
     return found
 
 
-def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int]) -> list[str]:
+def _of_line(linearity: Mapping[str, Linearity], orders: Mapping[str, int], asked: str) -> list[str]:
     found: list[str] = []
     for axis, of in linearity.items():
-        if of.probability < _CHANCE and orders[axis] == 1:
+        if asked != "auto" and of.probability < _CHANCE and of.by_polynomial > of.by_noise:
+            found.append(
+                f"gyro_{axis}: the output bends by {1e6 * of.by_polynomial:.3g} ppm of the largest rate beyond order "
+                f"{asked}, and beyond the noise of its dwells: is a higher order supported (--order auto)?"
+            )
+        elif asked == "auto" and of.probability < _CHANCE and orders[axis] == 1:
             found.append(
                 Note(
                     f"gyro_{axis}: the output bends by {1e6 * of.nonlinearity[0]:.3g} ppm of the largest rate, beyond "
                     "the noise of its dwells, and no power of the rate predicts single rates better: may some of the "
                     "table's be off? (--order 2 to 5 fits powers all the same)"
                 )
+            )
+        if of.kink is not None:
+            found.append(
+                f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * of.kink:+.3g} ppm, with a "
+                f"kink at 0 that no power of the rate compensates: at most {1e6 * of.by_polynomial:.3g} ppm of the "
+                "largest rate are left"
             )
         if of.loop is not None and of.loop < _CHANCE and of.hysteresis is not None:
             found.append(

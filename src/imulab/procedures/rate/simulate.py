@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from imulab.errors import OptionError, readable
+from imulab.gravity import checked_latitude
 from imulab.procedures.rate.choices import AXES, EARTH, RATES, rates_of
 from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
 from imulab.quantities import fraction, in_si, whole
@@ -127,7 +128,10 @@ def simulate_rate(
     if not all(len(word) == 2 and word[0] in "+-" and word[1] in AXES for word in words):
         raise OptionError(f"faces {faces!r}: expected body axes such as +x,+y,+z")
     duration, period = in_si(hold, "hold", "time", "s"), 1 / in_si(rate, "rate", "frequency", "Hz")
-    spread, place = in_si(noise, "noise", "rate", "deg/s"), in_si(latitude, "latitude", "angle", "deg")
+    spread, place = (
+        in_si(noise, "noise", "rate", "deg/s"),
+        checked_latitude(in_si(latitude, "latitude", "angle", "deg")),
+    )
     common, bent, split = fraction(table, "table"), fraction(bend, "bend"), fraction(loop, "loop")
     if sizes.size < 2 or not duration >= 1 or not 0 < period <= 0.1:
         raise OptionError("rates, hold, rate: expected two rates or more, a hold of 1 s or more, and 10 Hz or more")
@@ -151,7 +155,7 @@ def simulate_rate(
                 _profile(way, duration, period) if swept is None else _sweep(float(sizes[-1]), swept, period)
             )
             body = np.zeros((len(time), 3))
-            body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(place))
+            body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(checked_latitude(place)))
             angle = np.cumsum(table_rate) * period
             body[:, (axis + 1) % 3] += EARTH * np.cos(place) * np.cos(angle)
             body[:, (axis + 2) % 3] -= EARTH * np.cos(place) * np.sin(angle) * sign

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from imulab.errors import OptionError
+from imulab.gravity import checked_latitude
 from imulab.procedures.options import (
     ELEMENT,
     READING,
@@ -18,8 +19,7 @@ from imulab.procedures.options import (
     read_options,
 )
 from imulab.procedures.procedure import Files, Task, source_of
-from imulab.procedures.rate.choices import MOUNTINGS, ORDERS, rates_of
-from imulab.quantities import fraction
+from imulab.procedures.rate.choices import MOUNTINGS, ORDERS, part_of_one, rates_of
 
 if TYPE_CHECKING:
     from imulab.records.calibration import Calibration
@@ -32,7 +32,7 @@ OPTIONS = (
     choice("order", "Highest power of the rate in the model.", ORDERS, "auto"),
     measure("latitude", "Of the place, deg, for the Earth's rate.", "angle", "deg", shows="DEG"),
     Option("table_uncertainty", "Standard uncertainty that all rates have in common, such as 20ppm.",
-           lambda text, called: fraction(text, called), None, "FRACTION"),
+           part_of_one, None, "FRACTION"),
     file_option("accel", "Tumble record of the unit, whose accelerometers tell the table axis.", "RECORD"),
     file_option("prior", "Earlier record of the same gyroscopes, as prior knowledge.", "RECORD"),
     *READING,
@@ -63,7 +63,7 @@ def _fit(
         )
     test = load_test(access.path(name), name)
     if values["latitude"] is not None:
-        test = replace(test, latitude=values["latitude"])
+        test = replace(test, latitude=checked_latitude(values["latitude"]))
     if values["table_uncertainty"] is not None:
         test = replace(test, relative_uncertainty=values["table_uncertainty"])
     recordings = [access.recording(access.beside(name, run.file), values["layout"], **part) for run in test.runs]

@@ -14,7 +14,7 @@ from imulab.units import parse_unit, to_si
 
 _BLOCK = 0.1  # s
 _LEAST, _TRIM = 6, 1
-_STILL, _OF_LARGEST, _OUT = 5.0, 0.02, 3.0
+_STILL, _OF_LARGEST, _NOISE, _OUT, _OUT_WIDE, _WIDEST = 5.0, 0.02, 4.0, 3.0, 2.0, 10
 _TURNED = np.radians(15)
 
 
@@ -127,7 +127,7 @@ def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
     calm = variance <= _STILL**2 * quiet + 1e-24
     zero = np.median(means[calm][: 2 * _LEAST], axis=0)
     off = np.linalg.norm(means - zero, axis=1)
-    still = calm & (off < max(_OF_LARGEST * float(off.max()), 10 * np.sqrt(quiet / size)))
+    still = calm & (off < max(_OF_LARGEST * float(off.max()), _NOISE * np.sqrt(quiet / size)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
     steady = [_steady(means, a, b) for a, b in edges.tolist() if b - a >= _LEAST]
     return [((a + _TRIM) * size, (b - _TRIM) * size) for a, b in steady if b - a >= _LEAST]
@@ -135,17 +135,22 @@ def _rests(time: Array, rate: Array) -> list[tuple[int, int]]:
 
 def _steady(means: Array, first: int, last: int) -> tuple[int, int]:
     """Return first block and end of a rest without what at its ends stands out of it, as a turn that begins slowly."""
-    part = means[first:last]
+    width = int(np.clip((last - first) // 5, 1, _WIDEST))
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(means[first:last], axis=0)])
+    part = (sums[width:] - sums[:-width]) / width
     off = np.linalg.norm(part - np.median(part, axis=0), axis=1)
-    usual = np.flatnonzero(off <= _OUT * np.median(off))
-    return first + int(usual[0]), first + int(usual[-1]) + 1
+    usual = np.flatnonzero(off <= (_OUT if width == 1 else _OUT_WIDE) * np.median(off))
+    return first + int(usual[0]), first + int(usual[-1]) + width
 
 
 def _of_mean(rate: Array) -> Array:
-    """Return the standard uncertainty of a mean by those of its four quarters, shape (3,)."""
+    """Return the standard uncertainty of a mean by those of its four quarters, or by the middle two, shape (3,).
+
+    By these where the mean lies further from theirs, as a slow start or end of a turn in the rest makes it.
+    """
     quarter = len(rate) // 4
     means = rate[: 4 * quarter].reshape(4, quarter, 3).mean(axis=1)
-    return np.asarray(means.std(axis=0, ddof=1) / 2)
+    return np.asarray(np.maximum(means.std(axis=0, ddof=1) / 2, np.abs(means.mean(axis=0) - means[1:3].mean(axis=0))))
 
 
 def composed(steps: Array) -> Array:

@@ -17,13 +17,13 @@ from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
-from imulab.procedures.rate.choices import AXES, FENCE, gyros_of
+from imulab.procedures.rate.choices import AXES, FENCE, gyros_of, part_of_one
 from imulab.procedures.rate.prior import prior_at, with_prior
 from imulab.procedures.rate.turnaxes import check_accel, with_axes
 from imulab.procedures.rate.turnrecord import turns_record
 from imulab.procedures.rate.turnrests import Motions, carried, composed, find_motions
 from imulab.procedures.result import Result
-from imulab.quantities import fraction, in_si
+from imulab.quantities import in_si
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -31,6 +31,8 @@ _TURN = 2 * np.pi
 _SAME, _OTHER = np.radians(10), np.radians(30)
 _PART, _WHOLE, _FIRST, _OFF = 0.4, 0.12, 0.2, 0.1
 """Parts of a turn: less is none; what whole turns miss by at most, and the first that tell the scale; of the scale."""
+_ASKEW = 0.4
+"""Turn about a second axis over that about the first, beyond which the axes of a turn cannot be told."""
 _CHANCE = 0.01
 _FACTORS = np.geomspace(0.4, 2.5, 41)
 _CARRIES = np.radians(15)
@@ -152,7 +154,7 @@ def fit_turns(
     width = in_si(fence, "fence", "angle", "deg")
     if not 0 < width < 1:
         raise OptionError(f"fence {fence}: expected the uncertainty of the difference of two stops, such as 0.5 deg")
-    of_clock = None if clock is None else fraction(clock, "clock")
+    of_clock = None if clock is None else part_of_one(clock, "clock")
     stated = None if turns is None else _counts(turns)
     held = None if accel is None else as_record(accel, "fit_turns: accel")
     recording = as_recording(data, reading, fit_turns, gyros_of)
@@ -170,6 +172,7 @@ def fit_turns(
             angle = np.array([_whole_angle(motions, k, axis) for k in own])
             given = None if stated is None else np.array([stated[which.index(k)] for k in own], dtype=np.float64)
             count = _numbered(angle, motions, own, recording.name) if given is None else given
+            _check_counts(angle / _TURN, count, motions, own, recording.name)
             found[AXES[axis]] = _scale(motions, own, axis, angle, count, width)
     record = turns_record(recording, motions, found, width, of_clock)
     if held is not None:
@@ -238,6 +241,14 @@ def _turning(motions: Motions, name: str) -> list[int]:
                 "the gyroscopes: half a turn, or a whole one with a stated sample rate twice too high; expected whole "
                 "turns"
             )
+        first, second = np.argsort(-np.abs(motions.angle[k]))[:2].tolist()
+        if abs(motions.angle[k, second]) > _ASKEW * abs(motions.angle[k, first]):
+            degrees = np.degrees(motions.angle[k])
+            raise DataError(
+                f"{name}: the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s is about {AXES[first]} and "
+                f"{AXES[second]} together ({degrees[first]:.0f} and {degrees[second]:.0f} deg): was the unit lifted or "
+                "tipped, or do its axes lie askew? Expected turns about one axis"
+            )
         found.append(k)
     if not found:
         raise DataError(f"{name}: no whole turn between two rests; expected one turn or more back to the same place")
@@ -279,6 +290,19 @@ def _numbered(angle: Array, motions: Motions, own: list[int], name: str) -> Arra
         done.append(k)
         scale = float(np.abs(ratio[done]).sum() / np.abs(count[done]).sum())
     return count
+
+
+def _check_counts(ratio: Array, count: Array, motions: Motions, own: list[int], name: str) -> None:
+    """Refuse a stated number of turns that does not go with the others."""
+    scale = float(np.median(ratio / count))
+    off = np.abs(ratio / scale - count)
+    k = int(np.argmax(off))
+    if off[k] > 0.5:
+        raise DataError(
+            f"{name}: the turn at {motions.start[own[k]]:.1f} to {motions.stop[own[k]]:.1f} s is of "
+            f"{360 * ratio[k]:.0f} deg, {count[k]:+.0f} turns as stated, but {ratio[k] / scale:+.2f} as the others go: "
+            "is --turns right?"
+        )
 
 
 def _scale(motions: Motions, own: list[int], axis: int, angle: Array, count: Array, fence: float) -> AxisTurns:
