@@ -275,6 +275,16 @@ def test_one_recording_twice_is_refused(made, tmp_path):
         il.fit_thermal([str(tmp_path / name) for name in ("a.csv", "b.csv", "a.csv")])
 
 
+def test_a_recording_and_a_part_of_it_are_refused(made):
+    late = made[1].time >= 30.0
+    part = il.recording.Recording(
+        columns={name: values[late] for name, values in made[1].columns.items()},
+        units=made[1].units, metadata=made[1].metadata, name="part.csv",
+    )  # fmt: skip
+    with pytest.raises(il.ImulabError, match=r"part.csv: 100 % of its rows are in tumble_0.csv, too"):
+        il.fit_thermal([*made, part])
+
+
 def test_a_knock_in_a_rest_ramp_is_named():
     recordings = il.simulate_thermal(ramps=3, turn_on=0.0)
     chosen = [r for r in recordings if r.name in ("tumble_25.csv", "ramp_1.csv", "ramp_2.csv", "ramp_3.csv")]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.errors import DataError, OptionError
@@ -22,6 +23,9 @@ _STUCK, _SHORT, _READINGS, _STEPS = 200, 20.0, 20, 1.5
 that changes by so many steps otherwise."""
 _LATER = (1.5, 1.25)
 """How many times as long as the one before the last step to a reading takes, and the one before it, if it settles."""
+_SHARED, _DISTINCT = 0.3, 0.9
+"""Share of rows that are in another recording, too, which is one by chance where rows hardly repeat in either."""
+_MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 def prepared(
@@ -87,7 +91,7 @@ def _called(recording: Recording, column: str) -> Recording:
 
 def _check_together(recordings: Sequence[Recording]) -> None:
     first = recordings[0]
-    seen: dict[bytes, str] = {}
+    seen: list[tuple[str, NDArray[np.uint64]]] = []
     for recording in recordings:
         for key in ("serial", "element"):
             mine, its = first.metadata.get(key), recording.metadata.get(key)
@@ -102,10 +106,35 @@ def _check_together(recordings: Sequence[Recording]) -> None:
                 f"{recording.name}: columns accel_x accel_y accel_z are in {other}, but in {unit} in {first.name}; "
                 "expected one unit"
             )
-        own = np.column_stack([recording.column(name) for name in triad("accel")]).tobytes()
-        if own in seen:
-            raise DataError(f"{recording.name}: the same recording as {seen[own]}, which would count twice")
-        seen[own] = recording.name
+        own = np.sort(_marks(recording))
+        for before, marks in seen:
+            if np.array_equal(own, marks):
+                raise DataError(f"{recording.name}: the same recording as {before}, which would count twice")
+            shared = _share(own, marks)
+            if shared > _SHARED and min(len(np.unique(each)) / len(each) for each in (own, marks)) > _DISTINCT:
+                raise DataError(
+                    f"{recording.name}: {100 * shared:.0f} % of its rows are in {before}, too, and would count twice; "
+                    "expected recordings of their own"
+                )
+        seen.append((recording.name, own))
+
+
+def _share(own: NDArray[np.uint64], other: NDArray[np.uint64]) -> float:
+    """Return the share of rows that are in another recording, from a few thousand of them, both in order."""
+    if not (len(own) and len(other)):
+        return 0.0
+    few = own[:: max(1, len(own) // 4000)]
+    return float((other[np.searchsorted(other, few).clip(max=len(other) - 1)] == few).mean())
+
+
+def _marks(recording: Recording) -> NDArray[np.uint64]:
+    """Return a number for each row of outputs, shape (n,), the same for the same row alone."""
+    found = np.zeros(len(recording), dtype=np.uint64)
+    for name in triad("accel"):
+        bits = np.ascontiguousarray(recording.column(name), dtype=np.float64).view(np.uint64)
+        found = (found ^ bits ^ (bits >> np.uint64(29))) * _MIX
+        found ^= found >> np.uint64(32)
+    return found
 
 
 def _check_temperature(recording: Recording) -> None:
