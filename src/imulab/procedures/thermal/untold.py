@@ -2,7 +2,7 @@
 
 A term left out of the laws moves all others: with the Jacobian J and the derivatives A by what is left out, times its
 usual size, both whitened, coefficients err by ``-J^+ A a``, a of size 1. What of A is left beside J, B, tells a to the
-covariance ``(1 + B'B)^-1``. Where the error that this leaves in the biases is more than half of their uncertainty, it is said.
+covariance ``(1 + B'B)^-1``. Where what this leaves in the biases is more than half of their uncertainty, it is said.
 """
 
 from __future__ import annotations
