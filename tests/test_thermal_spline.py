@@ -269,13 +269,13 @@ def worst(law, count, attitudes, trials, turn_on):
     return 1e6 * np.sqrt(np.mean(errors, axis=0))
 
 
-def test_gyroscopes_beside_a_spline_follow_their_polynomials(tmp_path):
+def test_a_stated_spline_is_that_of_the_gyroscopes_too(tmp_path):
     made = il.simulate_thermal(gyro=True, attitudes=10)
     record = il.fit_thermal(made, degrees="spline,2,1", with_="gyro").calibration
-    assert record.model["gyro"]["degrees"]["bias"] == 3
+    assert len(record.model["gyro"]["knots"]) == 5
     plain = il.fit_thermal(made, degrees="3,2,1", with_="gyro").calibration
     fixed, free = (il.apply(one, made[1]) for one in (plain, record))
-    assert np.abs(fixed.triad("gyro") - free.triad("gyro")).max() < 0.01  # deg/s
+    assert np.abs(fixed.triad("gyro") - free.triad("gyro")).max() < 0.05  # deg/s
     changes = il.compare_records(plain, record).changes
     assert {each.name.split(" at ")[0] for each in changes} >= {"bias_x", "gyro_bias_z", "scale_factor_y"}
     assert il.export("blob", record, tmp_path)

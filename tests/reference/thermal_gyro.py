@@ -5,7 +5,7 @@ Gyroscopes: M = S(T) (T w + b(T) + G f), IEEE Std 528 for the acceleration-sensi
 
 import numpy as np
 
-from reference.thermal import Triad, directions
+from reference.thermal import Triad, directions, natural_spline
 
 G = 9.81
 
@@ -38,6 +38,29 @@ class Gyros:
         """Rate (3,) of one output: the model inverted by hand."""
         scaled = output / self.scale_at(temperature)[0] - self.bias_at(temperature)[0] - self.sensitivity @ force
         return np.linalg.solve(self.matrix, scaled)
+
+
+class BentGyros(Gyros):
+    """Gyroscopes whose biases have more than a cubic: a kink of 0.025 deg/s/K, bends of some 25 K, or own splines."""
+
+    def __init__(self, rng, law, knots=(), **sizes):
+        super().__init__(rng, **sizes)
+        self.law, self.knots = law, knots
+        self.place, self.sign = rng.uniform(0, 40), rng.choice([-1.0, 1.0], 3)
+        self.size, self.phase = rng.uniform(0.3, 1.0, 3), rng.uniform(0, 2 * np.pi, 3)
+        self.values = np.radians(0.5) * rng.standard_normal((3, len(knots)))
+
+    def bias_at(self, temperature):
+        """(n, 3)."""
+        t = np.atleast_1d(temperature)
+        if self.law == "spline":
+            return np.array([[natural_spline(self.knots, own, each) for own in self.values.tolist()] for each in t])
+        bias = super().bias_at(t)
+        if self.law == "kink":
+            bias = bias + np.radians(0.025) * self.sign * np.maximum(t - self.place, 0.0)[:, None]
+        elif self.law == "rough":
+            bias = bias + np.radians(0.03) * self.size * np.sin(t[:, None] / 8.0 + self.phase)
+        return bias
 
 
 def turned(up, axis, angle):

@@ -115,11 +115,15 @@ def _rest(
             "without --with gyro"
         )
     triads = laws.at(temperature)
-    rest = np.linalg.lstsq(design, np.array([triad.scale * triad.bias for triad in triads]))[0]
+    exact = np.array([triad.scale * triad.bias for triad in triads])
+    rest = np.linalg.lstsq(design, exact)[0]
     slope = np.abs(np.diff(design @ rest, axis=0) / np.diff(temperature)[:, None]).max()
     worst = max(triads, key=lambda triad: float(np.abs(triad.gain - np.eye(3)).sum(axis=1).max()))
     names, costs = gyro_terms(worst, bias=False)
     lost = [f"{' '.join(names)}, which changes outputs by {', '.join(costs)}"] if names else []
+    if len(laws.knots) > 2:
+        bent = np.degrees(3600 * np.abs(design @ rest - exact).max())
+        lost.insert(0, f"the bends of the gyroscopes' bias beyond a cubic, up to {bent:.3g} deg/h")
     follows = f"the offset of the gyroscopes changes by up to {np.degrees(slope) * 3600:.3g} deg/h per K"
     return rest, lost, [follows]
 

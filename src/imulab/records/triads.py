@@ -62,13 +62,7 @@ class AccelerometerLaws:
 
     def parameters(self, temperature: Array) -> Array:
         """Return the nine parameters at temperatures (n,), shape (n, 9)."""
-        held = np.clip(temperature, self.low, self.high)
-        piece = np.clip(np.searchsorted(self.knots, held, side="right") - 1, 0, len(self.knots) - 2)
-        start, stop = self.knots[piece], self.knots[piece + 1]
-        theta = (2 * held - start - stop) / (stop - start)
-        powers = theta[:, None] ** np.arange(self.coefficient.shape[2])
-        found: Array = np.einsum("nk,nik->ni", powers, self.coefficient[piece])
-        return found
+        return _in_pieces(self.knots, self.coefficient, temperature)
 
     def output(self, force: Array, temperature: Array) -> Array:
         """Return the outputs for specific forces (k, 3) at temperatures (n,), shape (n, k, 3)."""
@@ -79,16 +73,26 @@ class AccelerometerLaws:
         return np.asarray(scale * (sensed + bias), dtype=np.float64)
 
 
+def _in_pieces(knots: Array, coefficient: Array, temperature: Array) -> Array:
+    """Return laws of pieces between knots, (pieces, rows, terms), at temperatures (n,), shape (n, rows)."""
+    held = np.clip(temperature, knots[0], knots[-1])
+    piece = np.clip(np.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
+    start, stop = knots[piece], knots[piece + 1]
+    theta = (2 * held - start - stop) / (stop - start)
+    powers = theta[:, None] ** np.arange(coefficient.shape[2])
+    found: Array = np.einsum("nk,nik->ni", powers, coefficient[piece])
+    return found
+
+
 @dataclass(frozen=True)
 class GyroscopeLaws:
-    """``M = S(T) (T w + G f + b(T))`` over temperature: laws in powers of theta, -1 at `low` to 1 at `high`, degC.
+    """``M = S(T) (T w + G f + b(T))`` over temperature: laws in powers of theta between `knots`, as of accelerometers.
 
-    The rows of `coefficient` (6, terms) are b_x b_y b_z, rad/s, and S_x S_y S_z, unit of M per rad/s; matrix T (3, 3)
-    and sensitivity G (3, 3).
+    The rows of `coefficient` (pieces, 6, terms) are b_x b_y b_z, rad/s, and S_x S_y S_z, unit of M per rad/s; matrix T
+    (3, 3) and sensitivity G (3, 3).
     """
 
-    low: float
-    high: float
+    knots: Array
     coefficient: Array
     matrix: Array
     sensitivity: Array
@@ -96,8 +100,7 @@ class GyroscopeLaws:
 
     def at(self, temperature: Array) -> list[Gyroscopes]:
         """Return the triad at temperatures (n,)."""
-        theta = (np.clip(temperature, self.low, self.high) - 0.5 * (self.low + self.high)) * 2 / (self.high - self.low)
-        law = np.asarray(np.polynomial.polynomial.polyval(theta, self.coefficient.T).T, dtype=np.float64)
+        law = _in_pieces(self.knots, self.coefficient, temperature)
         return [Gyroscopes(row[3:], self.matrix, self.sensitivity, row[:3], self.unit) for row in law]
 
 

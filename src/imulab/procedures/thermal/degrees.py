@@ -9,7 +9,7 @@ of its knots it must bridge twice the distance, which costs polynomials nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -182,9 +182,13 @@ def choose(
         The holds cannot separate the coefficients; the message names them.
     """
     cluster = clusters_of(problem.temperature)
-    knots = _knots(problem.temperature, cluster, laws)
+    knots = knots_at(problem.temperature, cluster, laws)
     limit = max(len(knots) - 2, 0)
     highest = replace(laws, degrees=(min(DEGREES[0], limit), min(DEGREES[1], limit), min(DEGREES[2], limit)))
+
+    def solved(own: Laws, known: float | None) -> Solution:
+        return solve(problem, own, tau=known)
+
     if wanted != "auto":
         own = replace(laws, degrees=(int(wanted[0]), int(wanted[1]), int(wanted[2])), knots=knots if spline else ())
         if max(own.degrees) >= len(knots) or (spline and len(knots) < LEAST_KNOTS):
@@ -194,7 +198,7 @@ def choose(
                 "more temperatures"
             )
         solution, view = _observable(problem, own, tau, name)
-        solution = _bounded(problem, solution, tau)
+        solution = bounded(solution, tau, solved)
         held = left_out(splits(solution, cluster), np.ones(own.size, dtype=np.bool_))
         missed = _missed(problem, solution, highest, tau, name)
         return Found(solution, [], _at(held, problem, cluster), view, missed)
@@ -207,8 +211,8 @@ def choose(
             pass  # the holds do not tell so many values of the bias
         else:
             steps = steps + bent.steps
-            if _bends(bent.solution, tau) and _predicts(bent.left_out, found.left_out):
-                solution = _bounded(problem, bent.solution, tau)
+            if bends(bent.solution, tau) and predicts(bent.left_out, found.left_out):
+                solution = bounded(bent.solution, tau, solved)
                 held = left_out(splits(solution, cluster), np.ones(solution.laws.size, dtype=np.bool_))
                 found = replace(bent, solution=solution, left_out=held)
     own = found.solution.laws
@@ -241,20 +245,22 @@ def _missed(
     return (higher.laws.degrees, probability) if probability < _INSIGNIFICANT else None
 
 
-def _bounded(problem: Problem, solution: Solution, tau: float | None) -> Solution:
+def bounded(solution: Solution, tau: float | None, solved: Callable[[Laws, float | None], Solution]) -> Solution:
     """Return a spline's solution with the scatter between power cycles that polynomials leave, if it cannot tell it.
+
+    `solved` returns the solution of laws with a scatter, or with none known.
 
     A spline takes the offset of the only recording at a knot for the law. What polynomials leave is that scatter and
     the bends that they do not follow: a bound.
     """
     if not solution.laws.knots or solution.scatter.rank or tau is not None:
         return solution
-    scatter = solve(problem, replace(solution.laws, knots=())).scatter
-    again = solve(problem, solution.laws, tau=float(scatter.tau[0]))
+    scatter = solved(replace(solution.laws, knots=()), None).scatter
+    again = solved(solution.laws, float(scatter.tau[0]))
     return replace(again, scatter=replace(scatter, bound=True)) if scatter.rank and again.converged else solution
 
 
-def _knots(temperature: Array, cluster: NDArray[np.int64], laws: Laws) -> tuple[float, ...]:
+def knots_at(temperature: Array, cluster: NDArray[np.int64], laws: Laws) -> tuple[float, ...]:
     """Return the temperatures that were calibrated, degC, the outer ones at the ends of the range."""
     inner = [float(temperature[cluster == number].mean()) for number in range(1, int(cluster.max(initial=0)))]
     return (laws.low, *inner, laws.high)
@@ -294,7 +300,7 @@ def _highest(problem: Problem, laws: Laws, tau: float | None, name: str) -> tupl
         laws = replace(laws, degrees=(lowered[0], lowered[1], lowered[2]))
 
 
-def _bends(solution: Solution, tau: float | None) -> bool:
+def bends(solution: Solution, tau: float | None) -> bool:
     """Return whether a spline's values at the knots lie on no cubic (F at 1 %), or nobody can tell.
 
     That is where a spline takes the offset of the only recording at a knot for the law.
@@ -304,13 +310,13 @@ def _bends(solution: Solution, tau: float | None) -> bool:
     laws, count = solution.laws, len(solution.laws.knots)
     cubics = np.vander(laws.place(np.array(laws.knots)), 4)
     beside = np.linalg.qr(cubics, mode="complete").Q[:, 4:].T
-    weights = np.zeros((3 * (count - 4), laws.size))
+    weights = np.zeros((3 * (count - 4), 3 * count))
     for axis, part in enumerate(laws.parts[:3]):
         weights[axis * (count - 4) : (axis + 1) * (count - 4), part] = beside
     return _wald(solution, weights) < _INSIGNIFICANT
 
 
-def _predicts(bent: Sequence[LeftOut], straight: Sequence[LeftOut]) -> bool:
+def predicts(bent: Sequence[LeftOut], straight: Sequence[LeftOut]) -> bool:
     """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
     both = {each.temperature for each in bent} & {each.temperature for each in straight}
     errors = [_rms([each for each in given if each.temperature in both]) for given in (bent, straight)]
@@ -344,8 +350,8 @@ def _step(solution: Solution, group: int, given: Sequence[Split]) -> Step:
 
 
 def _wald(solution: Solution, weights: Array) -> float:
-    """Return the probability of such ``weights . coefficients``, shape (k, laws.size), if the true ones were 0."""
-    size = solution.laws.size
+    """Return the probability of such ``weights . coefficients``, (k, first ones), if the true ones were 0."""
+    size = weights.shape[1]
     value = weights @ solution.coefficients[:size]
     covariance = weights @ solution.covariance[:size, :size] @ weights.T
     square = float(value @ np.linalg.solve(covariance, value)) / len(value)

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import Polynomial
 
 from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
 from imulab.device.unit import DeviceUnit
-from imulab.errors import RecordError
-from imulab.procedures.thermal.gyrodevice import gyro_table_of
-from imulab.procedures.thermal.model import cardinal_spline
-from imulab.procedures.thermal.sections import Model, thermal_of
+from imulab.procedures.thermal.gyrodevice import check_scale_factors, gyro_table_of
+from imulab.procedures.thermal.sections import thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.triads import AccelerometerLaws
 from imulab.units import STANDARD_GRAVITY
-
-_NODES = np.linspace(-1.0, 1.0, 65)
 
 
 def laws_of(record: Calibration) -> Array:
@@ -36,32 +30,18 @@ def laws_of(record: Calibration) -> Array:
     model = thermal_of(record).model
     laws, units = model.laws, model.laws.units(model.output_unit)
     values = np.array([values_of(record, [name], unit)[0] for name, unit in zip(laws.names(), units, strict=True)])
-    edges = knots_of(model)
-    found = np.zeros((len(edges) - 1, 9, max(laws.degrees) + 1))
-    for piece, (start, stop) in enumerate(pairwise(edges.tolist())):
-        middle, half = 0.5 * (start + stop), 0.5 * (stop - start)
-        for row, part in enumerate(laws.parts):
-            if row < 3 and laws.knots:
-                cubic, about = cardinal_spline(laws.knots).c[::-1, piece] @ values[part], start
-            else:
-                cubic, about = values[part], model.reference_temperature.value
-            law = Polynomial(cubic)(Polynomial([middle - about, half])).coef
-            found[piece, row, : len(law)] = law
-    scale = np.polynomial.polynomial.polyval(_NODES, found[:, 3:6].reshape(-1, found.shape[2]).T).reshape(-1, 3, 65)
-    if not (np.sign(scale) == np.sign(scale[:1, :, :1])).all() or not scale.all():
-        raise RecordError("the record has a scale factor of 0 within its range of temperature")
+    found = np.zeros((len(laws.edges) - 1, 9, max(laws.degrees) + 1))
+    for row, part in enumerate(laws.parts):
+        law = laws.in_pieces(row // 3, values[part], model.reference_temperature.value)
+        found[:, row, : law.shape[1]] = law
+    check_scale_factors(found)
     return found
 
 
 def accelerometers(record: Calibration) -> AccelerometerLaws:
     """Return the laws as exporters take them; errors as for `laws_of`."""
     model = thermal_of(record).model
-    return AccelerometerLaws(knots_of(model), laws_of(record), model.output_unit)
-
-
-def knots_of(model: Model) -> Array:
-    """Return the temperatures between which each piece of the laws holds, degC: the range, or the bias's knots."""
-    return np.array(model.knots or model.range)
+    return AccelerometerLaws(model.laws.edges, laws_of(record), model.output_unit)
 
 
 def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
@@ -70,7 +50,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     fields = (
         Field("pieces", whole(len(laws))),
         Field("terms", whole(laws.shape[2])),
-        Field("knot", knots_of(model), pointed=True),
+        Field("knot", model.laws.edges, pointed=True),
         Field("coefficient", laws, pointed=True),
     )
     column = str(record.options.get("temperature_column") or "temperature")

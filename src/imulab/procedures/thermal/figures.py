@@ -101,12 +101,17 @@ def _coefficients(record: Calibration) -> ReportTable:
         value, u = format_uncertain(row.value, row.standard_uncertainty)
         rows.append([row.name, value, u, row.unit])
     reference = record.model["reference_temperature"]["value"]
-    knots = ", ".join(f"{knot:.4g}" for knot in record.model.get("knots", ()))
+    model = thermal_of(record).model
+    splines = [("bias_x", model.knots), ("gyro_bias_x", None if model.gyro is None else model.gyro.knots)]
+    at_knots = [
+        f" Of a spline, {name}_at_1 ... are the values at {', '.join(f'{knot:.4g}' for knot in knots)} degC."
+        for name, knots in splines
+        if knots
+    ]
     return ReportTable(
         f"Coefficients of powers of T - {reference:g} degC",
         "bias_x is the value at that temperature, bias_x_t1 its change per kelvin, bias_x_t2 the coefficient of the "
-        "square ... Outside the range each law is held at its end."
-        + (f" Of a spline, bias_x_at_1 ... are the values at {knots} degC." if knots else ""),
+        "square ... Outside the range each law is held at its end." + "".join(at_knots),
         ["parameter", "value", "u", "unit"],
         rows,
     )

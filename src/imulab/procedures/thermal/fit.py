@@ -171,7 +171,7 @@ def fit_thermal(
     options = {key: value for key, value in options.items() if value is not None}
     record = make_record(holds, problem, found, drift, local, scale, options, name)
     if further:
-        record = _with_gyroscopes(record, holds, problem, found.solution, scale, wanted, rates, name, earth)
+        record = _with_gyroscopes(record, holds, problem, found.solution, scale, wanted, spline, rates, name, earth)
     return ThermalFit(record, found.view, tuple(found.steps), tuple(found.left_out))
 
 
@@ -191,6 +191,7 @@ def _with_gyroscopes(
     solution: Solution,
     scale: Array,
     wanted: str | Degrees,
+    spline: bool,
     tau: float | None,
     name: str,
     earth: EarthRate | None,
@@ -200,7 +201,7 @@ def _with_gyroscopes(
     force, _ = forces(laws.design(problem.temperature) @ solution.coefficients[: laws.size], problem.reading)
     nominal = nominal_output(holds, record, holds.recordings[0].triad_unit("gyro"))
     rest = replace(rates_at_rest(holds, force, nominal), earth=earth)
-    gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, tau, name)
+    gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, tau, name, spline=spline)
     turned = scale_from_turns(holds, problem, solution, record, gyros, scale)
     return with_gyroscopes(record, holds, gyros, turned, name)
 

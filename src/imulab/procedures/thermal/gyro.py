@@ -19,8 +19,19 @@ from numpy.typing import NDArray
 from imulab.earth import EARTH
 from imulab.errors import ObservabilityError
 from imulab.estimation.ranked import MAD_TO_SIGMA
-from imulab.procedures.thermal.choices import DEGREES
-from imulab.procedures.thermal.degrees import Degrees, LeftOut, clusters_of, left_out, splits, tail
+from imulab.procedures.thermal.choices import DEGREES, LEAST_KNOTS
+from imulab.procedures.thermal.degrees import (
+    Degrees,
+    LeftOut,
+    bends,
+    bounded,
+    clusters_of,
+    knots_at,
+    left_out,
+    predicts,
+    splits,
+    tail,
+)
 from imulab.procedures.thermal.gyroholds import RatesAtRest
 from imulab.procedures.thermal.lag import ALL, Drift, tested, untold
 from imulab.procedures.thermal.model import Laws
@@ -58,9 +69,10 @@ class Gyroscopes:
 
     def at_rest(self, temperature: Array) -> Array:
         """Return the biases at temperatures (n,), rad/s, shape (n, 3)."""
-        laws, degree = self.solution.laws, self.solution.laws.degrees[0]
-        rows = self.solution.coefficients[: self.size].reshape(3, degree + 1)
-        return np.asarray(np.polynomial.chebyshev.chebvander(laws.place(temperature), degree) @ rows.T, np.float64)
+        laws = self.solution.laws
+        rows = self.solution.coefficients[: self.size].reshape(3, -1)
+        found: Array = laws.of_bias(temperature) @ rows.T
+        return found
 
     def sensitivities(self, gravity: float) -> Array:
         """Return G, rad/s per m/s^2, shape (3, 3)."""
@@ -81,52 +93,109 @@ class Gyroscopes:
     @property
     def size(self) -> int:
         """Number of coefficients of the biases."""
-        return 3 * (self.solution.laws.degrees[0] + 1)
+        return 3 * self.solution.laws.terms[0]
 
 
 def fit_gyroscopes(
-    held: RatesAtRest, low: float, high: float, wanted: str | Degrees, tau: float | None, name: str
+    held: RatesAtRest,
+    low: float,
+    high: float,
+    wanted: str | Degrees,
+    tau: float | None,
+    name: str,
+    *,
+    spline: bool = False,
 ) -> Gyroscopes:
     """Fit the biases over the range of temperature, degC; `tau` is their scatter between power cycles, rad/s, if known.
+
+    `spline`: they are natural cubic splines with a knot at each temperature; `wanted` ``auto`` chooses between these
+    and polynomials.
 
     Raises
     ------
     ObservabilityError
         The holds are at too few temperatures.
     """
-    cluster = clusters_of(held.temperature)
-    count = int(cluster.max(initial=0)) + 1
-    if wanted == "auto":
-        degree = min(DEGREES[0], max(count - 2, 0))
-    elif int(wanted[0]) < count:
-        degree = int(wanted[0])
-    else:
+    count = int(clusters_of(held.temperature).max(initial=0)) + 1
+    degree = min(DEGREES[0], max(count - 2, 0)) if wanted == "auto" else int(wanted[0])
+    least = LEAST_KNOTS if spline else degree + 1
+    if count < least:
+        what = "a spline" if spline else f"a bias of degree {degree}"
         raise ObservabilityError(
-            f"{name}: the gyroscopes are at rest at {count} temperatures (5 K apart), too few for a bias of degree "
-            f"{wanted[0]}: record at more temperatures, or lower --degrees"
+            f"{name}: the gyroscopes are at rest at {count} temperatures (5 K apart), too few for {what}: record at "
+            "more temperatures, or lower --degrees"
         )
     laws = Laws(low, high, (degree, 0, 0))
     held, aside = _without_turns(held, laws)
     cluster = clusters_of(held.temperature)
-    solution, sensitivity, probability = _solved(held, laws, tau)
-    while wanted == "auto" and laws.degrees[0]:
-        lower = _lower(solution, laws, cluster)
-        if lower is None:
-            break
-        laws = lower
-        solution, sensitivity, probability = _solved(held, laws, tau)
-    drift = _drift(held, solution, sensitivity, tau)
+    found = _Search(held, cluster, tau).chosen(laws, auto=wanted == "auto", spline=spline)
+    solution = found.solution
+    if solution.scatter.bound:
+        tau = float(solution.scatter.tau[0])
+    drift = _drift(held, solution, found.sensitivity, tau)
     if drift.free:
-        solution = solve(held, laws, tau, sensitivity=sensitivity, free=drift.free) or solution
-    found = left_out(splits(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
+        solution = solve(held, solution.laws, tau, sensitivity=found.sensitivity, free=drift.free) or solution
+        if found.solution.scatter.bound:
+            solution = replace(solution, scatter=found.solution.scatter)
     places = [
         replace(e, temperature=float(held.temperature[cluster == e.temperature].mean()), holds=e.holds // 3)
-        for e in found
+        for e in _left_out(solution, cluster)
     ]
-    return Gyroscopes(held, solution, sensitivity, probability, tuple(places), aside, drift)
+    return Gyroscopes(held, solution, found.sensitivity, found.probability, tuple(places), aside, drift)
 
 
-def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> tuple[Solution, bool, float | None]:
+@dataclass(frozen=True)
+class _Solved:
+    """A solution, whether G is in it, and the probability of so large a G."""
+
+    solution: Solution
+    sensitivity: bool
+    probability: float | None
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What a choice of laws starts from: holds, the number of the temperature of each, and tau."""
+
+    held: RatesAtRest
+    cluster: NDArray[np.int64]
+    tau: float | None
+
+    def chosen(self, laws: Laws, *, auto: bool, spline: bool) -> _Solved:
+        """Return the solution of laws as stated, or that of the laws that the data support."""
+        knots = knots_at(self.held.temperature, self.cluster, laws)
+        bent = replace(laws, degrees=(DEGREES[0], 0, 0), knots=knots)
+        if spline:
+            return self._bounded(_solved(self.held, bent, self.tau))
+        found = _solved(self.held, laws, self.tau)
+        while auto and found.solution.laws.degrees[0]:
+            lower = _lower(found.solution, self.cluster)
+            if lower is None:
+                break
+            found = _solved(self.held, lower, self.tau)
+        if not auto or len(knots) < LEAST_KNOTS:
+            return found
+        try:
+            by_knots = _solved(self.held, bent, self.tau)
+        except ObservabilityError:
+            return found  # the holds do not tell so many values of the bias
+        errors = (_left_out(each.solution, self.cluster) for each in (by_knots, found))
+        return self._bounded(by_knots) if bends(by_knots.solution, self.tau) and predicts(*errors) else found
+
+    def _bounded(self, found: _Solved) -> _Solved:
+        def solved(laws: Laws, tau: float | None) -> Solution:
+            solution = solve(self.held, laws, tau, sensitivity=found.sensitivity)
+            assert solution is not None
+            return solution
+
+        return replace(found, solution=bounded(found.solution, self.tau, solved))
+
+
+def _left_out(solution: Solution, cluster: NDArray[np.int64]) -> list[LeftOut]:
+    return left_out(splits(solution, cluster), np.ones(len(solution.coefficients), dtype=np.bool_))
+
+
+def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
     """Solve with the g-sensitivity where it is told and significant, else without."""
     whole = solve(held, laws, tau, sensitivity=True)
     probability = None
@@ -134,11 +203,11 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> tuple[Solution,
         gone = np.arange(len(whole.coefficients) - 9, len(whole.coefficients))
         probability = wald(whole, gone)
         if probability < _SIGNIFICANT:
-            return whole, True, probability
+            return _Solved(whole, True, probability)
     plain = solve(held, laws, tau, sensitivity=False)
     if plain is None:
         raise ObservabilityError(f"{len(held)} holds do not determine the biases of the gyroscopes")
-    return plain, False, probability
+    return _Solved(plain, False, probability)
 
 
 def wald(solution: Solution, which: NDArray[np.intp]) -> float:
@@ -149,9 +218,9 @@ def wald(solution: Solution, which: NDArray[np.intp]) -> float:
     return tail(square, len(value), freedom)
 
 
-def _lower(solution: Solution, laws: Laws, cluster: NDArray[np.int64]) -> Laws | None:
+def _lower(solution: Solution, cluster: NDArray[np.int64]) -> Laws | None:
     """Return laws of a degree less, or None where that step is significant or temperatures left out are told worse."""
-    degree = laws.degrees[0]
+    laws, degree = solution.laws, solution.laws.degrees[0]
     top = np.arange(3) * (degree + 1) + degree
     kept = np.ones(len(solution.coefficients), dtype=np.bool_)
     if not wald(solution, top) > _SIGNIFICANT:
@@ -189,7 +258,7 @@ def solve(
 
     Those of the biases, of G where it is taken, and of what is `free` of lag and loops, as in `Problem`.
     """
-    count = 3 * (laws.degrees[0] + 1) + 9 * sensitivity
+    count = 3 * laws.terms[0] + 9 * sensitivity
     coefficients = np.zeros(count + len(free))
     if free:  # a lag is the shift of laws that must be there first
         begun = solve(held, laws, tau, sensitivity=sensitivity)
@@ -215,7 +284,7 @@ def solve(
 
 def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int, ...]) -> Rows:
     """Return the rows at these coefficients, three for each hold."""
-    n, size = len(held), 3 * (laws.degrees[0] + 1)
+    n, size = len(held), 3 * laws.terms[0]
     jacobian = laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size)
     slope = laws.slope(held.temperature)[:, :3, :size] @ coefficients[:size]
     if len(coefficients) - len(free) > size:
@@ -273,7 +342,7 @@ def _spread(number: NDArray[np.int64]) -> Array:
 
 def _without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
     """Leave out holds whose outputs lie far from those of the others in their recording: a slow turn the whole time."""
-    n, size = len(held), 3 * (laws.degrees[0] + 1)
+    n, size = len(held), 3 * laws.terms[0]
     columns = np.hstack([
         laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size),
         _by_axis(held.recording),

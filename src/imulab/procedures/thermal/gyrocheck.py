@@ -89,9 +89,9 @@ def check_gyros(
     # In a record without a latitude the vertical part is in the g-sensitivities: taken off, it would count twice.
     known = earth if fit.latitude is not None or not model.gyro.g_sensitivity else None
     held = replace(_rates(record, holds, force), earth=known)
-    degree, laws = model.gyro.degrees.bias, model.gyro_laws
-    names, _ = names_and_units(degree, sensitivity=model.gyro.g_sensitivity)
-    size = 3 * (degree + 1)
+    laws = model.gyro_laws
+    names, _ = names_and_units(laws, sensitivity=model.gyro.g_sensitivity)
+    size = 3 * laws.terms[0]
     factor = np.eye(len(names)) / model.gravity.value
     factor[:size, :size] = laws.to_powers()[:size, :size]
     inverse = np.linalg.inv(factor)

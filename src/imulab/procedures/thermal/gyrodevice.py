@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import Polynomial
 
 from imulab.device.golden import VECTORS
 from imulab.device.tables import DeviceTable, Field, field_of, values_of, whole
 from imulab.device.unit import DeviceUnit
 from imulab.errors import RecordError
-from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, law_names
+from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES
 from imulab.procedures.thermal.sections import GyroModel, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
@@ -23,7 +22,9 @@ _NODES = np.linspace(-1.0, 1.0, 65)
 
 
 def gyro_laws_of(record: Calibration) -> Array:
-    """Return biases (rad/s) and scale factors (output per rad/s) in powers of theta, -1 to 1, shape (6, terms).
+    """Return biases (rad/s) and scale factors (output per rad/s) in powers of theta, shape (pieces, 6, terms).
+
+    Theta goes from -1 to 1 over the range, or from each knot of the bias to the next.
 
     Raises
     ------
@@ -33,29 +34,33 @@ def gyro_laws_of(record: Calibration) -> Array:
     model = thermal_of(record).model
     gyro = model.gyro
     assert gyro is not None
-    low, high = model.range
-    place = Polynomial([0.5 * (low + high) - model.reference_temperature.value, 0.5 * (high - low)])
-    found = np.zeros((6, max(gyro.degrees.bias, gyro.degrees.scale_factor) + 1))
+    laws, about = model.gyro_laws, model.reference_temperature.value
+    found = np.zeros((len(laws.edges) - 1, 6, max(laws.degrees) + 1))
     for i, axis in enumerate(AXES):
-        for row, kind, unit, degree in (
-            (i, "bias", "rad/s", gyro.degrees.bias),
-            (3 + i, "scale_factor", f"{gyro.output_unit}/(rad/s)", gyro.degrees.scale_factor),
+        for row, group, kind, unit in (
+            (i, 0, "bias", "rad/s"),
+            (3 + i, 1, "scale_factor", f"{gyro.output_unit}/(rad/s)"),
         ):
             if kind == "scale_factor" and gyro.scale == "nominal":
                 if parse_unit(gyro.output_unit).quantity != "rate":
                     raise RecordError(
                         f"the record has outputs of gyroscopes in {gyro.output_unit}, and no scale factor"
                     )
-                found[row, 0] = from_si(1.0, gyro.output_unit)
+                found[:, row, 0] = from_si(1.0, gyro.output_unit)
                 continue
-            names, units = law_names(f"gyro_{kind}_{axis}", unit, degree)
+            names, units = laws.named(group, f"gyro_{kind}_{axis}"), laws.measured(group, unit)
             values = [values_of(record, [name], per)[0] for name, per in zip(names, units, strict=True)]
-            law = Polynomial(values)(place)
-            found[row, : len(law.coef)] = law.coef
-    scale = np.polynomial.polynomial.polyval(_NODES, found[3:].T)
-    if not (np.sign(scale) == np.sign(scale[:, :1])).all() or not scale.all():
-        raise RecordError("the record has a scale factor of 0 within its range of temperature")
+            law = laws.in_pieces(group, np.array(values), about)
+            found[:, row, : law.shape[1]] = law
+    check_scale_factors(found)
     return found
+
+
+def check_scale_factors(laws: Array) -> None:
+    """Refuse laws, shape (pieces, rows, terms), of which rows 3 to 5, the scale factors, are 0 anywhere."""
+    scale = np.polynomial.polynomial.polyval(_NODES, laws[:, 3:6].reshape(-1, laws.shape[2]).T).reshape(-1, 3, 65)
+    if not (np.sign(scale) == np.sign(scale[:1, :, :1])).all() or not scale.all():
+        raise RecordError("the record has a scale factor of 0 within its range of temperature")
 
 
 def _matrix(record: Calibration, gyro: GyroModel) -> Array:
@@ -75,12 +80,11 @@ def gyroscopes(record: Calibration) -> GyroscopeLaws | None:
     model = thermal_of(record).model
     if model.gyro is None:
         return None
-    low, high = model.range
     laws = gyro_laws_of(record)
     factor, unit = output_to_si(model.gyro.output_unit, "rad/s")
-    laws[3:] *= factor
+    laws[:, 3:] *= factor
     felt = _sensitivity(record) if model.gyro.g_sensitivity else np.zeros((3, 3))
-    return GyroscopeLaws(low, high, laws, _matrix(record, model.gyro), felt, unit)
+    return GyroscopeLaws(model.gyro_laws.edges, laws, _matrix(record, model.gyro), felt, unit)
 
 
 def gyro_table_of(record: Calibration, columns: Mapping[str, Any]) -> DeviceTable:
@@ -90,13 +94,13 @@ def gyro_table_of(record: Calibration, columns: Mapping[str, Any]) -> DeviceTabl
     laws = gyro_laws_of(record)
     fields = [
         Field("has_sensitivity", whole(model.gyro.g_sensitivity)),
-        Field("pieces", whole(1)),
-        Field("terms", whole(laws.shape[1])),
+        Field("pieces", whole(len(laws))),
+        Field("terms", whole(laws.shape[2])),
         Field("turn", np.linalg.inv(_matrix(record, model.gyro))),
     ]
     if model.gyro.g_sensitivity:
         fields.append(Field("sensitivity", _sensitivity(record)))
-    fields += [Field("knot", np.array(model.range), pointed=True), Field("coefficient", laws[None], pointed=True)]
+    fields += [Field("knot", model.gyro_laws.edges, pointed=True), Field("coefficient", laws, pointed=True)]
     return DeviceTable("thermal_gyro", tuple(fields), {"output_unit": model.gyro.output_unit, **columns})
 
 

@@ -27,7 +27,8 @@ def gyro_exhibits(record: Calibration, temperature: Array) -> tuple[list[tuple[s
     assert data is not None
     values, spread = (from_si(each, "deg/s") for each in gyro_predicted(record, temperature))
     tau = fit.between_recordings
-    told = "not known" if tau.from_ == "unknown" else f"{plain_number(_hourly(tau.bias.value), 2)} deg/h ({tau.from_})"
+    told = f"{plain_number(_hourly(tau.bias.value), 2)} deg/h"
+    told = {"unknown": "not known", "polynomials": f"at most {told}"}.get(tau.from_, f"{told} ({tau.from_})")
     left = fit.left_out_temperature
     worst = f"{plain_number(_hourly(max(row.rms for row in left)), 2)} deg/h rms at worst" if left else "–"
     facts = [

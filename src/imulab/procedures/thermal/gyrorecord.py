@@ -12,7 +12,7 @@ from imulab.procedures.thermal.gyroscale import ScaleLaws, block_diagonal, joint
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import entries
 from imulab.procedures.thermal.model import AXES, MISALIGNMENTS, SENSITIVITIES, Laws, law_names
-from imulab.procedures.thermal.record import interval_of, law_at
+from imulab.procedures.thermal.record import at_reference, interval_of, law_at, told_by
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -27,8 +27,8 @@ def with_gyroscopes(
 ) -> Calibration:
     """Return the record with the gyroscopes' laws, their covariance (independent of the accelerometers') and data."""
     gyros = gyros if turned is None else rescaled(gyros, turned)
-    degree = gyros.solution.laws.degrees[0]
-    names, units = names_and_units(degree, sensitivity=gyros.sensitivity)
+    laws = gyros.solution.laws
+    names, units = names_and_units(laws, sensitivity=gyros.sensitivity)
     matrix, n = _to_si(gyros, record.model["gravity"]["value"]), gyros.count
     coefficients, covariance = gyros.solution.coefficients[:n], gyros.solution.covariance[:n, :n]
     freedom = [gyros.solution.degrees_of_freedom(row) for row in matrix]
@@ -43,6 +43,8 @@ def with_gyroscopes(
         key: Parameter(float(value), float(u), unit, interval_95=interval_of(float(value), float(u), nu))
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(covariance)), units, freedom, strict=True)
     }
+    if laws.knots:
+        parameters = at_reference(laws, values, covariance, "gyro_bias", "rad/s") | parameters
     joined = block_diagonal(record.covariance.array(), covariance)
     fit = _fit(gyros, known="gyro_turn_on_scatter" in record.options)
     return replace(
@@ -53,7 +55,8 @@ def with_gyroscopes(
             **record.model,
             "gyro": {
                 "output_unit": gyros.held.unit,
-                "degrees": {"bias": degree, "scale_factor": 0 if turned is None else turned.degree},
+                "degrees": {"bias": laws.degrees[0], "scale_factor": 0 if turned is None else turned.degree},
+                **({"knots": list(laws.knots)} if laws.knots else {}),
                 "g_sensitivity": gyros.sensitivity,
                 "scale": "nominal" if turned is None else "turns",
             },
@@ -99,10 +102,10 @@ def _turns(turned: ScaleLaws) -> dict[str, Any]:
     }
 
 
-def names_and_units(degree: int, *, sensitivity: bool) -> tuple[list[str], list[str]]:
+def names_and_units(laws: Laws, *, sensitivity: bool) -> tuple[list[str], list[str]]:
     """Return the names and units of the biases' coefficients and of the g-sensitivities."""
-    laws = [law_names(f"gyro_bias_{axis}", "rad/s", degree) for axis in AXES]
-    names, units = ([each for law in laws for each in law[k]] for k in range(2))
+    names = [name for axis in AXES for name in laws.named(0, f"gyro_bias_{axis}")]
+    units = laws.measured(0, "rad/s") * len(AXES)
     if sensitivity:
         names += SENSITIVITIES
         units += ["rad/s/(m/s^2)"] * len(SENSITIVITIES)
@@ -121,7 +124,7 @@ def _fit(gyros: Gyroscopes, *, known: bool) -> dict[str, Any]:
             "bias": {"value": float(solution.scatter.tau[0]), "unit": "rad/s"},
             "rank": solution.scatter.rank,
             "resolution": {"value": solution.scatter.resolution, "unit": "rad/s"},
-            "from": "argument" if known else "recordings" if solution.scatter.rank else "unknown",
+            "from": "argument" if known else told_by(solution.scatter),
         },
         "g_sensitivity_probability": gyros.probability,
         "latitude": None if gyros.held.earth is None else gyros.held.earth.latitude,
@@ -161,11 +164,21 @@ def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, turned: Scal
         for each in gyros.left_out
         if each.chi_square > _WORSE**2
     ]
+    if scatter.bound:
+        left = np.degrees(3600 * scatter.tau[0])
+        found.append(
+            Note(
+                f"gyro: {name}: a spline cannot tell the offset of a power cycle from the law where a temperature has "
+                f"one recording; {left:.3g} deg/h, what polynomials of degree 3 leave, counts as the scatter between "
+                "power cycles, an upper bound: come back to temperatures to learn more"
+            )
+        )
     found += _drifts(gyros, name)
-    degree = gyros.solution.laws.degrees[0]
+    laws = gyros.solution.laws
+    bias = f"bias by a spline with {len(laws.knots)} knots" if laws.knots else f"bias of degree {laws.degrees[0]}"
     if turned is None:
-        return [*found, Note(f"gyro: bias of degree {degree}; no turns tell the scale factors, which are as stated")]
-    said = f"gyro: bias of degree {degree}, scale factor of degree {turned.degree} from {turned.turns} turns"
+        return [*found, Note(f"gyro: {bias}; no turns tell the scale factors, which are as stated")]
+    said = f"gyro: {bias}, scale factor of degree {turned.degree} from {turned.turns} turns"
     return [*found, *turned.notes, Note(said)]
 
 
@@ -193,10 +206,9 @@ def _drifts(gyros: Gyroscopes, name: str) -> list[str]:
 def gyro_scale_predicted(record: Calibration, temperature: Array) -> tuple[Array, Array]:
     """Return the three scale factors over temperature and their standard uncertainties, SI, shapes (3, n)."""
     model = thermal_of(record).model
-    assert model.gyro is not None
-    laws = Laws(model.range[0], model.range[1], (model.gyro.degrees.scale_factor, 0, 0))
-    powers = laws.recorded(0, temperature, model.reference_temperature.value)
-    found = [law_at(record, laws.named(0, f"gyro_scale_factor_{axis}"), powers) for axis in AXES]
+    laws = model.gyro_laws
+    powers = laws.recorded(1, temperature, model.reference_temperature.value)
+    found = [law_at(record, laws.named(1, f"gyro_scale_factor_{axis}"), powers) for axis in AXES]
     return np.array([values for values, _ in found]), np.array([spread for _, spread in found])
 
 

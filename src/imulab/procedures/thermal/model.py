@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.polynomial import chebyshev
+from numpy.polynomial import Polynomial, chebyshev
 
 from imulab.recording import Array
 
@@ -83,7 +84,13 @@ class Laws:
     def design(self, temperature: Array) -> Array:
         """Return the derivatives of the nine parameters by the coefficients, shape (n, 9, size)."""
         functions = np.asarray(chebyshev.chebvander(self.place(temperature), max(self.degrees)), np.float64)
-        return self._spread(functions, self.cardinal(temperature) if self.knots else functions)
+        return self._spread(functions, self.of_bias(temperature))
+
+    def of_bias(self, temperature: Array) -> Array:
+        """Return what the coefficients of a bias are multiplied by in the fit, shape (n, terms)."""
+        if self.knots:
+            return self.cardinal(temperature)
+        return np.asarray(chebyshev.chebvander(self.place(temperature), self.degrees[0]), np.float64)
 
     def slope(self, temperature: Array) -> Array:
         """Return the derivatives of `design` by the temperature, 1/K."""
@@ -140,6 +147,25 @@ class Laws:
         found: Array = offset[:, None] ** np.arange(self.degrees[group] + 1)
         return found
 
+    @property
+    def edges(self) -> Array:
+        """Temperatures between which each piece of the laws holds, degC: the range, or the bias's knots."""
+        return np.array(self.knots or (self.low, self.high))
+
+    def in_pieces(self, group: int, coefficients: Array, about: float) -> Array:
+        """Return a law of a record in powers of theta, -1 to 1 between two `edges`, shape (pieces, terms).
+
+        `about` is the record's reference temperature, degC.
+        """
+        edges, of_spline = self.edges.tolist(), bool(group == 0 and self.knots)
+        found = np.zeros((len(edges) - 1, self.degrees[group] + 1))
+        for piece, (start, stop) in enumerate(pairwise(edges)):
+            middle, half = 0.5 * (start + stop), 0.5 * (stop - start)
+            cubic = cardinal_spline(self.knots).c[::-1, piece] @ coefficients if of_spline else coefficients
+            law = Polynomial(cubic)(Polynomial([middle - (start if of_spline else about), half])).coef
+            found[piece, : len(law)] = law
+        return found
+
     def names(self) -> list[str]:
         """Return the names of the coefficients in a record: ``bias_x``, ``bias_x_t1`` (per K), ``bias_x_t2`` ...
 
@@ -169,11 +195,14 @@ class Laws:
 
     def units(self, output: str) -> list[str]:
         """Return the units of the coefficients in a record."""
-        found = []
-        for group, unit in enumerate(("m/s^2", f"{output}/(m/s^2)", "rad")):
-            of_spline = group == 0 and self.knots
-            found += 3 * ([unit] * len(self.knots) if of_spline else law_names("", unit, self.degrees[group])[1])
-        return found
+        kinds = enumerate(("m/s^2", f"{output}/(m/s^2)", "rad"))
+        return [each for group, unit in kinds for each in 3 * self.measured(group, unit)]
+
+    def measured(self, group: int, unit: str) -> list[str]:
+        """Return the units of the coefficients of one law in a record, `unit` that of its values."""
+        if group == 0 and self.knots:
+            return [unit] * len(self.knots)
+        return law_names("", unit, self.degrees[group])[1]
 
 
 @lru_cache(maxsize=256)

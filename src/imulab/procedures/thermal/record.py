@@ -17,7 +17,7 @@ from imulab.procedures.thermal.lag import Drift, entries, findings
 from imulab.procedures.thermal.model import AXES, GROUPS, Laws
 from imulab.procedures.thermal.rows import Problem, together
 from imulab.procedures.thermal.sections import thermal_of
-from imulab.procedures.thermal.solve import Solution
+from imulab.procedures.thermal.solve import Scatter, Solution
 from imulab.procedures.thermal.untold import untold
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -52,7 +52,7 @@ def make_record(
         for key, value, u, unit, nu in zip(names, values, np.sqrt(np.diag(matrix)), units, freedom, strict=True)
     }
     if laws.knots:
-        parameters = _at_reference(laws, values, matrix) | parameters
+        parameters = at_reference(laws, values, matrix, "bias", "m/s^2") | parameters
     residual, uncertainty = _residuals(problem, solution)
     sensor = {
         key: text for key in ("serial", "model", "element") for r in holds.recordings if (text := r.metadata.get(key))
@@ -82,12 +82,12 @@ def make_record(
     )
 
 
-def _at_reference(laws: Laws, values: Array, covariance: Array) -> dict[str, Parameter]:
+def at_reference(laws: Laws, values: Array, covariance: Array, kind: str, unit: str) -> dict[str, Parameter]:
     """Return the biases at T0 that a spline has there, by the name that those of polynomials have."""
     weights, found = laws.cardinal(np.array([laws.middle]))[0], {}
     for axis, part in zip(AXES, laws.parts[:3], strict=True):
         u = float(np.sqrt(weights @ covariance[part, part] @ weights))
-        found[f"bias_{axis}"] = Parameter(float(weights @ values[part]), u, "m/s^2")
+        found[f"{kind}_{axis}"] = Parameter(float(weights @ values[part]), u, unit)
     return found
 
 
@@ -215,14 +215,18 @@ def _residuals(problem: Problem, solution: Solution) -> tuple[Array, Array]:
 def _turn_on(solution: Solution, options: Mapping[str, Any], g: float) -> dict[str, Any]:
     scatter = solution.scatter
     known = "turn_on_scatter" in options
-    told = "polynomials" if scatter.bound else "recordings" if scatter.rank else "unknown"
     return {
         "bias": {"value": g * float(scatter.tau[0]), "unit": "m/s^2"},
         "scale_factor": {"value": float(scatter.tau[1]), "unit": "1"},
         "rank": scatter.rank,
         "resolution": {"value": g * scatter.resolution, "unit": "m/s^2"},
-        "from": "argument" if known else told,
+        "from": "argument" if known else told_by(scatter),
     }
+
+
+def told_by(scatter: Scatter) -> str:
+    """Return what tells the scatter between power cycles, as a record says it, where it was not stated."""
+    return "polynomials" if scatter.bound else "recordings" if scatter.rank else "unknown"
 
 
 def _findings(

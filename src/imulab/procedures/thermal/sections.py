@@ -45,12 +45,16 @@ class GyroDegrees(Part):
 
 
 class GyroModel(Part):
-    """``model.gyro``: the unit of the gyroscopes' outputs, the degrees of their laws, and what else was fitted."""
+    """``model.gyro``: the unit of the gyroscopes' outputs, the degrees of their laws, and what else was fitted.
+
+    The knots of their biases are in degC, None where these are polynomials.
+    """
 
     output_unit: str
     degrees: GyroDegrees
     g_sensitivity: bool
     scale: Literal["nominal", "turns"]
+    knots: list[float] | None = None
 
 
 class Model(Part):
@@ -72,9 +76,10 @@ class Model(Part):
 
     @property
     def gyro_laws(self) -> Laws:
-        """The laws of the gyroscopes' biases."""
+        """The laws of the gyroscopes' biases and scale factors."""
         assert self.gyro is not None
-        return Laws(self.range[0], self.range[1], (self.gyro.degrees.bias, 0, 0))
+        degrees = self.gyro.degrees.bias, self.gyro.degrees.scale_factor, 0
+        return Laws(self.range[0], self.range[1], degrees, tuple(self.gyro.knots or ()))
 
 
 class LeftOut(Part):
@@ -119,7 +124,7 @@ class Tested(Quantity):
 
 
 class GyroTurnOn(Part):
-    """``fit.gyro.between_recordings``: what biases move by from one power cycle to the next."""
+    """``fit.gyro.between_recordings``: what biases move by from one power cycle to the next, known as in `TurnOn`."""
 
     bias: Length
     rank: int
@@ -225,16 +230,23 @@ def check(record: Calibration) -> None:
     low, high = found.model.range
     if not low < high:
         raise RecordError(f"model.range: expected two temperatures in rising order, found {low:g} and {high:g}")
-    knots = found.model.knots
-    if knots is not None and not (
-        len(knots) > 2 and [low, high] == [knots[0], knots[-1]] and sorted(set(knots)) == knots
-    ):
+    _check_knots(found.model, found.model, "model")
+    if found.model.gyro is not None:
+        _check_knots(found.model, found.model.gyro, "model.gyro")
+
+
+def _check_knots(model: Model, own: Model | GyroModel, where: str) -> None:
+    """Check the knots of the biases of a triad, if they have any."""
+    (low, high), knots = model.range, own.knots
+    if knots is None:
+        return
+    if not (len(knots) > 2 and [low, high] == [knots[0], knots[-1]] and sorted(set(knots)) == knots):
         raise RecordError(
-            f"model.knots: expected three temperatures or more in rising order, from {low:g} to {high:g}, the ends of "
-            f"the range; found {' '.join(f'{knot:g}' for knot in knots)}"
+            f"{where}.knots: expected three temperatures or more in rising order, from {low:g} to {high:g}, the ends "
+            f"of the range; found {' '.join(f'{knot:g}' for knot in knots)}"
         )
-    if knots is not None and found.model.degrees.bias != 3:
-        raise RecordError(f"model.degrees.bias: expected 3 of a spline, found {found.model.degrees.bias}")
+    if own.degrees.bias != 3:
+        raise RecordError(f"{where}.degrees.bias: expected 3 of a spline, found {own.degrees.bias}")
 
 
 def thermal_of(record: Calibration) -> Thermal:
