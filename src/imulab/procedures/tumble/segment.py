@@ -137,9 +137,7 @@ def find_attitudes(
     width = _window_width(blocks, recording, time, window)
     variance = _window_variance(blocks, width)
     quiet, resolution = _quietest(variance, recording, names)
-    candidates = _sweep(variance, quiet, blocks, width, settling, shortest)
-    best = _choose(candidates, drifting=_drifts(recording))
-    pieces, threshold = candidates[best], float(_THRESHOLDS[best] * quiet)
+    pieces, threshold = _sweep(variance, quiet, blocks, width, settling, shortest, _drifts(recording))
     trace = _trace(variance, time, blocks, width, threshold, quiet)
     if not pieces.start.size:
         raise SegmentError(f"{recording.name}: no static attitude found: {trace.describe()}")
@@ -243,13 +241,15 @@ def _window_variance(blocks: _Blocks, width: int) -> Array:
 
 
 def _sweep(
-    variance: Array, quiet: float, blocks: _Blocks, width: int, settling: float, shortest: float
-) -> list[_Pieces]:
-    """Return the attitudes under each threshold."""
+    variance: Array, quiet: float, blocks: _Blocks, width: int, settling: float, shortest: float, drifting: bool
+) -> tuple[_Pieces, float]:
+    """Return the attitudes that predict each other best, and the threshold of the variance that they lie below."""
     whole = len(blocks.mean) * blocks.duration
     trim = int(np.ceil(min(settling, whole) / blocks.duration))
     fewest = max(2, int(np.ceil(min(shortest, 2 * whole) / blocks.duration)))
-    return _candidates(variance, quiet, blocks, width, trim, fewest)
+    candidates = _candidates(variance, quiet, blocks, width, trim, fewest)
+    best = _choose(candidates, drifting=drifting)
+    return candidates[best], _THRESHOLDS[best] * quiet
 
 
 def _candidates(variance: Array, quiet: float, blocks: _Blocks, width: int, trim: int, fewest: int) -> list[_Pieces]:
