@@ -141,9 +141,7 @@ def fit_thermal(
     nominal = conversion_factor(holds.unit, "m/s^2") if parse_unit(holds.unit).quantity == "acceleration" else None
     check_holds(holds, local.value, nominal)
     scale, zero = _scaling(holds, local.value, nominal)
-    leaning = in_si(tilt, "tilt", "angle", "mrad")
-    if not 0 < leaning < np.inf:
-        raise OptionError(f"tilt {leaning:g}: expected a size above 0")
+    leaning = _leaning(tilt)
     scatter = _scatter(turn_on_scatter, "turn_on_scatter", "acceleration", "mg", local.value)
     if gyro_turn_on_scatter is not None and not further:
         raise OptionError("gyro_turn_on_scatter: no gyroscopes are fitted; expected --with gyro beside it")
@@ -204,6 +202,14 @@ def _with_gyroscopes(
     gyros = fit_gyroscopes(rest, laws.low, laws.high, wanted, tau, name, spline=spline)
     turned = scale_from_turns(holds, problem, solution, record, gyros, scale)
     return with_gyroscopes(record, holds, gyros, turned, name)
+
+
+def _leaning(tilt: float | str) -> float:
+    """Return how far a hold tips, rad."""
+    found = in_si(tilt, "tilt", "angle", "mrad")
+    if not 0 < found < np.inf:
+        raise OptionError(f"tilt {found:g}: expected a size above 0")
+    return found
 
 
 def _scatter(given: float | str | None, name: str, quantity: str, unit: str, size: float = 1.0) -> float | None:
