@@ -91,7 +91,7 @@ def fit_thermal(
     data
         One recording or several: files, recordings or data frames with columns ``accel_*`` and ``temperature``.
     degrees
-        Of bias, scale factor and misalignment, as ``"3,2,1"``; ``"spline,2,1"``: the bias a natural cubic spline with
+        Of bias, scale factor and misalignment, as ``"3,2,1"``; ``"spline,2,1"``: biases are natural cubic splines with
         a knot at each temperature; ``"auto"``: from 3,2,1 down, as data allow, or the spline where it predicts as well.
     gravity, latitude, height
         As for `fit_tumble`.
