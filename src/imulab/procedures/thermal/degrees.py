@@ -371,7 +371,8 @@ def _rms(found: Sequence[LeftOut]) -> float | None:
 
 
 def _no_worse(error: float | None, before: float | None) -> bool:
-    return error is None or before is None or error <= _NO_WORSE * before
+    """Return whether temperatures left out are known to be predicted no worse: an F-test alone may lack all power."""
+    return error is not None and before is not None and error <= _NO_WORSE * before
 
 
 def _at(found: Sequence[LeftOut], problem: Problem, cluster: NDArray[np.int64]) -> list[LeftOut]:
