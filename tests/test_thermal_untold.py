@@ -8,6 +8,7 @@ import pytest
 
 import imulab as il
 from imulab.estimation.least_squares import coverage_factor
+from imulab.procedures.thermal.lag import Drift, drift_of
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.solve import solve
 from imulab.procedures.thermal.untold import untold
@@ -44,7 +45,7 @@ def test_what_one_ramp_does_not_tell_costs_as_much_as_is_said():
         triad = reference.Triad(rng, degrees=(3, 1, 0))
         given = one_ramp(rng, triad)
         found = solve(given, laws, tau=0.0)
-        (text, *_) = untold(given, found, "ramp")
+        (text, *_) = untold(given, found, Drift(), "ramp")
         said.append(float(re.search(r"scale factor follows .* errs biases by (\S+) mg", text)[1]))
         biases = laws.design(AT)[:, :3] @ found.coefficients
         errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
@@ -60,6 +61,28 @@ def test_ramps_name_what_they_do_not_tell_and_their_verdict_is_not_good():
         named[ramps] = re.findall(r"do not tell whether ([a-z ]+) follows", " ".join(record.warnings))
         assert not named[ramps] or record.verdict.state == "look"
     assert named == {1: ["scale factor", "misalignment"], 3: ["misalignment"], 4: []}
+
+
+def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs():
+    """Attitudes while 80 K pass in 13 minutes, all of them warming, and a lag of 5 s; half as fast twice less."""
+    from test_thermal_lag import HALF, driven, part
+
+    laws, given = Laws(-20.0, 60.0, (3, 2, 1)), []
+    for seed in range(8):
+        fast, triad, _ = driven(np.random.default_rng([53, seed]), lag=5.0 * HALF / 800.0, rough=0.0)
+        warming = part(fast, fast.rate > 0)
+        given.append((replace(warming, rate=warming.rate * HALF / 800.0), triad))
+    said, errors = [], []
+    for problem_, triad in given:
+        found = solve(problem_, laws, tau=0.0)
+        drift = drift_of(problem_, found, 0.0)
+        assert "only warm" in drift.reason
+        texts = [text for text in untold(problem_, found, drift, "ramp") if "behind the thermometer" in text]
+        said += [float(re.search(r"errs biases by (\S+) mg", text)[1]) for text in texts]
+        biases = laws.design(AT)[:, :3] @ found.coefficients
+        errors.append(1e3 * (biases - np.array([triad.at(t)[0] for t in AT]) / G))
+    assert len(said) > 4
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.4)
 
 
 @pytest.fixture(scope="module")

@@ -263,7 +263,7 @@ def _findings(
             "few recordings do not tell whether by their temperature or from power cycle to power cycle: record five "
             "temperatures or more, or state --degrees"
         )
-    found += untold(problem, solution, name)
+    found += untold(problem, solution, drift, name)
     if options["degrees"] == "auto":
         found.append(Note(f"degrees chosen: {spoken_degrees(solution.laws.degrees, len(solution.laws.knots))}"))
     far = [each for each in fitted.left_out if each.chi_square > _WORSE**2]
