@@ -108,3 +108,46 @@ def test_what_cannot_be_tested_is_said(unit):
     said = il.check_thermal(replace(record, fit=plain), later)
     assert said.gyro.between is None
     assert any("state --gyro-turn-on-scatter" in str(note) for note in said.notes)
+
+
+def test_a_hold_with_a_slow_turn_about_the_vertical_is_left_out_as_by_the_fit(unit):
+    """5 deg/s during the whole of the fifth hold, which no accelerometer sees."""
+    _, triad, gyros, record = unit
+    later = measured(np.random.default_rng(4), triad, gyros)
+    hold, turn = round(4.0 * 50), round(2.0 * 50)
+    during = slice(4 * (hold + turn), 4 * (hold + turn) + hold)
+    up = later.triad("accel")[during].mean(axis=0) / G
+    columns = {}
+    for k, a in enumerate("xyz"):
+        columns[f"gyro_{a}"] = later.columns[f"gyro_{a}"].copy()
+        columns[f"gyro_{a}"][during] += np.radians(5.0) * up[k]
+    turning = later.with_columns(columns, dict.fromkeys(columns, "rad/s"))
+    check = il.check_thermal(record, turning)
+    assert check.passed
+    assert check.gyro.holds.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
+    said = [note for note in check.notes if "left out" in note]
+    assert len(said) == 1
+    assert said[0].startswith("gyro: later.csv, ")
+    assert said[0].endswith("the unit turned")
+    both = [turning, replace(measured(np.random.default_rng(6), triad, gyros, at=50.0), name="warmer.csv")]
+    fitted = il.fit_thermal(both, degrees="1,0,0", with_="gyro", gyro_turn_on_scatter=TAU).calibration
+    assert said[0] in fitted.warnings
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (lambda v: 0 * v + 0.01, "column gyro_x: the same output in every sample at rest: a dead axis"),
+        (lambda v: np.where(np.arange(len(v)) % 20 == 3, np.nan, v), "column gyro_x: expected a finite number"),
+    ],
+)
+def test_faulty_columns_of_gyroscopes_leave_the_verdict_on_the_accelerometers(unit, broken, said):
+    _, triad, gyros, record = unit
+    later = measured(np.random.default_rng(5), triad, gyros)
+    faulty = later.with_columns({"gyro_x": broken(later.columns["gyro_x"])}, {"gyro_x": "rad/s"})
+    check, sound = (il.check_thermal(record, one) for one in (faulty, later))
+    assert check.gyro is None
+    assert (check.passed, check.within, check.between) == (True, sound.within, sound.between)
+    assert any(note.startswith("gyroscopes not tested: later.csv: ") and said in note for note in check.notes)
+    with pytest.raises(OptionError, match="gyro_turn_on_scatter -1: expected 0 or more"):
+        il.check_thermal(record, faulty, gyro_turn_on_scatter=-1)

@@ -33,6 +33,7 @@ from imulab.procedures.thermal.degrees import (
     tail,
 )
 from imulab.procedures.thermal.gyroholds import RatesAtRest
+from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import ALL, Drift, tested, untold
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.rows import Rows, whitener
@@ -126,7 +127,7 @@ def fit_gyroscopes(
             "more temperatures, or lower --degrees"
         )
     laws = Laws(low, high, (degree, 0, 0))
-    held, aside = _without_turns(held, laws)
+    held, aside = without_turns(held, laws)
     cluster = clusters_of(held.temperature)
     found = _Search(held, cluster, tau).chosen(laws, auto=wanted == "auto", spline=spline)
     solution = found.solution
@@ -340,8 +341,11 @@ def _spread(number: NDArray[np.int64]) -> Array:
     return np.repeat(_one_hot(number), 3, axis=0)
 
 
-def _without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
-    """Leave out holds whose outputs lie far from those of the others in their recording: a slow turn the whole time."""
+def without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:
+    """Leave out holds whose outputs lie far from those of the others in their recording: a slow turn the whole time.
+
+    Return the others, and the places of what is left out among the holds of all recordings.
+    """
     n, size = len(held), 3 * laws.terms[0]
     columns = np.hstack([
         laws.design(held.temperature)[:, :3, :size].reshape(3 * n, size),
@@ -359,3 +363,11 @@ def _without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[
     own = np.sqrt(np.einsum("nii->ni", held.covariance)).max(axis=1)
     out = (far > _FAR) & many & (np.abs(left).max(axis=1) > np.maximum(_FAR * own, EARTH))
     return held.part(~out), held.index[out]
+
+
+def notes_on_turns(holds: Holds, aside: NDArray[np.int64]) -> list[str]:
+    """Return what is said of the holds that `without_turns` left out."""
+    return [
+        f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
+        for index in aside.tolist()
+    ]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.earth import EarthRate
-from imulab.errors import OptionError, UnitError
-from imulab.procedures.thermal.gyro import rows_of
+from imulab.errors import DataError, OptionError, UnitError
+from imulab.procedures.thermal.gyro import notes_on_turns, rows_of, without_turns
 from imulab.procedures.thermal.gyroholds import RatesAtRest, rates_at_rest
 from imulab.procedures.thermal.gyrorecord import gyro_scale_predicted, names_and_units
 from imulab.procedures.thermal.holds import Holds
@@ -71,8 +71,6 @@ def check_gyros(
         The gyroscopes are in another unit than those of the record.
     OptionError
         The scatter is below 0.
-    DataError
-        The columns are of no gyroscopes.
     """
     model = thermal_of(record).model
     if model.gyro is None:
@@ -88,8 +86,11 @@ def check_gyros(
     assert fit is not None
     # In a record without a latitude the vertical part is in the g-sensitivities: taken off, it would count twice.
     known = earth if fit.latitude is not None or not model.gyro.g_sensitivity else None
-    held = replace(_rates(record, holds, force), earth=known)
     laws = model.gyro_laws
+    try:
+        held, aside = without_turns(replace(_rates(record, holds, force), earth=known), laws)
+    except DataError as error:  # faulty columns of gyroscopes say nothing against the accelerometers
+        return None, [f"gyroscopes not tested: {error}"]
     names, _ = names_and_units(laws, sensitivity=model.gyro.g_sensitivity)
     size = 3 * laws.terms[0]
     factor = np.eye(len(names)) / model.gravity.value
@@ -103,7 +104,8 @@ def check_gyros(
     whole = together(rows, excess, np.array([tau or 0.0, 0.0])) + rows.jacobian @ covariance @ rows.jacobian.T
     within, between = parted(rows, whole, noise, np.zeros((len(whole), 0)), rank, by_share=False)
     residual, u = (each.reshape(-1, 3) for each in (rows.residual, np.sqrt(np.diag(whole))))
-    return GyroCheck(held.index, residual, u, within, between), [*held.notes, *([_UNSAID] if tau is None else [])]
+    notes = [*held.notes, *notes_on_turns(holds, aside), *([_UNSAID] if tau is None else [])]
+    return GyroCheck(held.index, residual, u, within, between), notes
 
 
 def _rates(record: Calibration, holds: Holds, force: Array) -> RatesAtRest:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.procedures.thermal.gyro import Gyroscopes
+from imulab.procedures.thermal.gyro import Gyroscopes, notes_on_turns
 from imulab.procedures.thermal.gyroscale import ScaleLaws, block_diagonal, joint_covariance, rescaled
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import entries
@@ -148,10 +148,7 @@ def _data(holds: Holds, gyros: Gyroscopes) -> dict[str, Any]:
 
 def _findings(record: Calibration, holds: Holds, gyros: Gyroscopes, turned: ScaleLaws | None, name: str) -> list[str]:
     found = [*gyros.held.notes, *([] if gyros.held.earth is None else [gyros.held.earth.note()])]
-    found += [
-        f"gyro: {holds.label(index)} left out: its outputs differ from the others of its recording: the unit turned"
-        for index in gyros.aside.tolist()
-    ]
+    found += notes_on_turns(holds, gyros.aside)
     scatter = gyros.solution.scatter
     if not scatter.rank and "gyro_turn_on_scatter" not in record.options:
         found.append(
