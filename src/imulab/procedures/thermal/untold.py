@@ -62,7 +62,7 @@ def untold(problem: Problem, solution: Solution, drift: Drift, name: str) -> lis
     if drift.reason and (error := error_by(rows.drift[:, :1] * _LAG)) > stated:
         found.append(
             f"{name}: the temperature changes fast, and the recordings do not tell a lag behind the thermometer: one "
-            f"of {_LAG:g} s errs biases by {1e3 * error:.2g} mg, where their uncertainty is {1e3 * stated:.2g} mg: let it "
-            "change more slowly, or record the way back too"
+            f"of {_LAG:g} s errs biases by {1e3 * error:.2g} mg, where their uncertainty is {1e3 * stated:.2g} mg: let "
+            "it change more slowly, or record the way back too"
         )
     return found
