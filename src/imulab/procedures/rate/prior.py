@@ -24,6 +24,7 @@ from imulab.units import parse_unit
 from imulab.verdict import Note
 
 _TINY = 1e-12
+_APART = 5.0  # K, beyond which a thermal record counts temperatures as different
 
 
 def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Calibration:
@@ -97,7 +98,6 @@ def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration
     """
     if prior.procedure != "thermal":
         return prior
-    from imulab.procedures.thermal.choices import APART
     from imulab.procedures.thermal.prior import gyros_at_temperature
 
     known = [
@@ -108,10 +108,10 @@ def prior_at(prior: Calibration, recordings: Sequence[Recording]) -> Calibration
         and np.isfinite(one.si("temperature")).any()
     ]
     (coldest, cold), (hottest, hot) = min(known, default=(0.0, "")), max(known, default=(0.0, ""))
-    if hottest - coldest > APART:
+    if hottest - coldest > _APART:
         raise DataError(
             f"prior: {cold} was made at {coldest:.1f} degC, {hot} at {hottest:.1f}; a thermal record is a prior of "
-            f"recordings at one temperature, {APART:g} K apart at most: fit each temperature alone"
+            f"recordings at one temperature, {_APART:g} K apart at most: fit each temperature alone"
         )
     whole = float(np.mean([each for each, _ in known])) if len(known) == len(recordings) else None
     return gyros_at_temperature(prior, whole, recordings[0].name)
