@@ -151,14 +151,15 @@ def _swept(
                 f"{place}: {main} stands still at {end:.6g} {recording.units[main]} while the rate changes: its output "
                 "is saturated; expected rates within its range"
             )
-    half = found.duration / 2
+    half, size = found.duration / 2, _block_size(time)
+    level = [part.mean() for part in _level(time, _block_means(rate, size), size)]
     return Dwells(
         start=found.middle - half,
         stop=found.middle + half,
         rate=found.rate,
         mean=found.mean,
         variance=found.variance,
-        level=np.zeros((len(found.rate), 2)),
+        level=np.tile(level, (len(found.rate), 1)),
         recorded=True,
         sweep=sweep,
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
 from imulab.gravity import checked_latitude
@@ -254,7 +255,28 @@ def _problem(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> Prob
         level=np.vstack([found.level for found in dwells]),
         rate_uncertainty=test.spread_of(table),
         scale_error=np.repeat([0.0 if found.sweep is None else found.sweep.scale_error for found in dwells], counts),
+        zero_error=np.repeat(
+            [np.zeros(len(names)) if found.sweep is None else found.sweep.zero_error for found in dwells],
+            counts,
+            axis=0,
+        ),
+        loop_error=np.repeat([_loop_error(found) for found in dwells], counts),
+        reach=np.repeat([0.0 if found.sweep is None else found.sweep.largest for found in dwells], counts),
+        branch=np.concatenate([_branch(found) for found in dwells]),
     )
+
+
+def _branch(found: Dwells) -> NDArray[np.int64]:
+    if found.sweep is None:
+        return np.zeros(len(found.rate), dtype=np.int64)
+    return np.where(np.arange(len(found.rate)) < found.sweep.rising, 1, -1)
+
+
+def _loop_error(found: Dwells) -> float:
+    """Return what a run's delay adds to its loop; steps know none, and sweeps that do not tell it no loop."""
+    if found.sweep is None:
+        return 0.0
+    return float(np.inf) if found.sweep.loop_error is None else found.sweep.loop_error
 
 
 def _pooled(found: Dwells) -> Any:

@@ -20,6 +20,8 @@ _EXACT = 1e-10
 _CHANCE = 0.01
 _ONE_SIDED = 1.645
 _SMALL = 1e-3
+_BY_PARTS = 15
+"""Degrees of freedom of what the parts of a sweep say of its delay: half of them, since frequencies differ."""
 _RATES, _POWERS, _SURE = 7, 5, 3.29
 """Different rates that tell a kink from powers of the rate, such powers, and standard uncertainties of 1 in 1000."""
 
@@ -79,7 +81,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
     key = np.unique(np.round(problem.table[own] * problem.sign[own], 6), return_inverse=True)[1]
     of_rate = problem.rate_uncertainty[own] ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
-    largest = float(np.abs(rate).max())
+    largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[own].max()))
     left, _ = _fitted(np.column_stack([rate, zeros]), values, variance)
     means = np.array(
         [
@@ -93,11 +95,15 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
     chi_square = float(np.sum((means[:, 0] / spread) ** 2))
     probability = chi_square_probability(chi_square, freedom) if freedom > 0 else 1.0
     reach = coverage_factor(None, 1 - 0.05 / len(means))
-    direction = _directions(rate, runs)
+    branch = np.zeros(len(rate), dtype=np.int64) if problem.branch is None else problem.branch[own] * problem.sign[own]
+    direction = np.where(branch != 0, branch, _directions(rate, runs))
     powers = np.column_stack([*(rate**power for power in range(1, order + 1)), zeros])
     rest = _fitted(powers, values, variance)[0]
     beyond = _beyond_noise(key, direction, zeros, values, variance)
-    loop, hysteresis = _hysteresis(left, variance, key, runs, direction, rate, beyond)
+    error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[own]
+    loop, hysteresis = _hysteresis(
+        left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
+    )
     return Linearity(
         rate=rate,
         residual=left / largest,
@@ -182,36 +188,39 @@ def _hysteresis(
     runs: NDArray[Any],
     direction: NDArray[np.int64],
     rate: Array,
+    error: Array,
     beyond: tuple[float, int] | None,
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the probability of a loop by noise, and the largest rising less falling over the largest rate."""
+    """Return the probability of a loop by noise, and the largest rising less falling, all over the largest rate.
+
+    `error` is what not knowing the delay of a sweep adds to a loop at rate 0, infinite where it tells no loop.
+    """
     from imulab.estimation.special import ndtr, stdtr
 
-    largest = float(np.abs(rate).max())
     rows = []
     for k in np.unique(key):
         pairs = []
         for run in np.unique(runs):
             up, down = (np.flatnonzero((key == k) & (runs == run) & (direction == d)) for d in (1, -1))
-            if up.size and down.size:
+            if up.size and down.size and np.isfinite(error[up[0]]):
                 u2 = variance[up].sum() / up.size**2 + variance[down].sum() / down.size**2
-                pairs.append((float(left[up].mean() - left[down].mean()), float(u2)))
+                pairs.append((float(left[up].mean() - left[down].mean()), float(u2), float(error[up[0]]) ** 2))
         if pairs:
             means = np.array(pairs).mean(axis=0)
-            rows.append((float(rate[key == k].mean()), means[0], means[1] / len(pairs)))
+            rows.append((float(rate[key == k].mean()), means[0], *(means[1:] / len(pairs))))
     if not rows:
         return None, None
     table = np.array(rows)
     worst = int(np.argmax(np.abs(table[:, 1])))
-    size = (float(table[worst, 1]) / largest, float(np.sqrt(table[worst, 2])) / largest)
-    loop = 1 - (table[:, 0] / largest) ** 2
+    loop = 1 - table[:, 0] ** 2
+    size = float(table[worst, 1]), float(np.sqrt(table[worst, 2] + table[worst, 3] * loop[worst] ** 2))
     spread = float(np.sum(loop**2 / table[:, 2]))
     if len(rows) < 2 or spread <= 0:
         return None, size
     slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
     chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
-    t = float(abs(slope) * np.sqrt(spread))
-    found = [2 * float(ndtr(-t))]
+    t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
+    found = [2 * float(stdtr(_BY_PARTS, -t) if table[:, 3].any() else ndtr(-t))]
     freedom = len(rows) - 1
     if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
         found.append(2 * float(stdtr(freedom, -t / np.sqrt(chi_square / freedom))))

@@ -15,7 +15,7 @@ from imulab.procedures.rate.linearity import Linearity
 from imulab.procedures.rate.manifest import RateTest
 from imulab.procedures.rate.parameters import model_parameters
 from imulab.procedures.rate.solve import Problem, Solution
-from imulab.procedures.rate.sweeprecord import dynamics_of, motion_of, of_sines, swept
+from imulab.procedures.rate.sweeprecord import dynamics_of, motion_of, of_sweeps, swept
 from imulab.procedures.rate.temperature import temperature_slopes
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
@@ -61,7 +61,7 @@ def make_record(
         "axes": "".join(linearity),
         "from": motion_of(dwells),
         "frame": "the faces on which the unit was mounted" if axes is None else BY_ACCELEROMETERS,
-        "largest_rate": {"value": float(np.abs(problem.table).max()), "unit": "rad/s"},
+        "largest_rate": {"value": _largest(problem), "unit": "rad/s"},
     }
     if temperatures:
         model["temperature"] = {"value": float(np.mean(temperatures)), "unit": "degC"}
@@ -82,9 +82,13 @@ def make_record(
             *_of_line(linearity, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order),
             *_of_scatter(problem, solution),
             *(faces_said(test, recordings, dwells) if axes is None else lean_said(axes, test)),
-            *of_sines(test, dwells),
+            *of_sweeps(test, dwells),
         ),
     )
+
+
+def _largest(problem: Problem) -> float:
+    return max(float(np.abs(problem.table).max()), 0.0 if problem.reach is None else float(problem.reach.max()))
 
 
 def _of_cycles(

@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 
 from imulab.recording import Array
 
-ONE, TIME, RATE, SQUARE, CUBE, *DERIVATIVES = range(9)
-"""Places of the columns of `regressors`: 1, time from its mean, s, the rate, its powers, and its four derivatives."""
+ONE, TIME, RATE, SQUARE, CUBE, TURN, BOW, *DERIVATIVES = range(11)
+"""Places of the columns of `regressors`: 1, time from its mean, s, the rate, its powers, 1 where it rises and -1 where
+it falls, that times the square of the rate over its largest, and its four derivatives."""
 WHOLE = 8.8
 """Steps that eight steps take at most where no sample is missing."""
 _BATCHES, _BLOCK = 32, 1 << 15
-_ONCE, _TWICE = np.array([1, -8, 0, 8, -1]) / 12, np.array([-1, 16, -30, 16, -1]) / 12
-KERNELS = np.array([np.pad(_ONCE, 2), np.pad(_TWICE, 2), np.convolve(_ONCE, _TWICE), np.convolve(_TWICE, _TWICE)])
-"""Four derivatives by differences of fourth order, over the spacing to the power of their order, shape (4, 9)."""
+_POWERS = np.vander(np.arange(-4.0, 5.0), increasing=True).T
+KERNELS = np.linalg.solve(_POWERS, np.diag([1.0, 1.0, 2.0, 6.0, 24.0, 0.0, 0.0, 0.0, 0.0]))[:, 1:5].T
+"""Four derivatives of polynomials of degree 8, over the spacing to the power of their order, shape (4, 9)."""
 
 
 @dataclass(frozen=True)
@@ -100,13 +101,18 @@ class Moments:
     def covariance(self, columns: Sequence[int], fitted: Sequence[int], output: int, found: Array) -> Array:
         """Return the covariance of coefficients of columns by what coefficients `found` of columns `fitted` leave.
 
-        By parts of the run, so that what is left may be correlated.
+        By the scores of parts of the run, so that what is left may be correlated; each score stands for what the fit
+        took from its part, too. Source: Bell and McCaffrey, Survey Methodology 28 (2002) 169.
         """
         both = self.batches[:, columns]
-        scores = both[:, :, self.columns + output] - both[:, :, fitted] @ found
         size, normal = self._normal(columns)
-        scores = scores / size @ normal / size
-        return np.asarray(scores.T @ scores * (_BATCHES / (_BATCHES - 1)))  # the scores of all batches add up to zero
+        scores = (both[:, :, self.columns + output] - both[:, :, fitted] @ found) / size
+        spread, turn = np.linalg.eigh(normal)
+        half = turn * np.sqrt(np.maximum(spread, 0.0)) @ turn.T
+        share, turn = np.linalg.eigh(half @ (both[:, :, columns] / np.outer(size, size)) @ half)
+        kept = np.einsum("bji,bj->bi", turn, scores @ half) / np.sqrt(np.maximum(1 - share, 1 / _BATCHES))
+        scores = np.einsum("bij,bj->bi", turn, kept) @ half / size
+        return np.asarray(scores.T @ scores)
 
     def _normal(self, columns: Sequence[int]) -> tuple[Array, Array]:
         """Return the size of columns, and the inverse of the sums of their products over it."""
@@ -133,18 +139,32 @@ def moments(count: int, columns: Callable[[slice], Sequence[Array] | Array], out
     return Moments(found, number)
 
 
-def regressors(samples: Samples) -> Moments:
-    """Return the sums of products of the rate's powers and derivatives, a constant, time, and the outputs."""
-    middle = float(samples.time.mean())
+def regressors(samples: Samples, felt: Array | None = None) -> Moments:
+    """Return the sums of products of the rate's powers, branches and derivatives, a constant, time, and the outputs.
+
+    The branches are those of the rate as the gyroscopes felt it, where that is known.
+    """
+    middle, largest = float(samples.time.mean()), float(np.abs(samples.rate).max())
+    rises = None if felt is None else rising(felt)
     scales = samples.spacing ** -np.arange(1.0, 5.0)
 
     def columns(part: slice) -> list[Array]:
         near = samples.neighbours(part)
         rate = near[4]
         derivatives = scales[:, None] * (KERNELS @ near)
-        return [np.ones(len(rate)), samples.time[part] - middle, rate, rate**2, rate**2 * rate, *derivatives]
+        square = rate**2
+        turn = np.sign(derivatives[0]) if rises is None else np.where(rises[part], 1.0, -1.0)
+        loop = turn, turn * (square if felt is None else felt[part] ** 2) / largest**2
+        return [np.ones(len(rate)), samples.time[part] - middle, rate, square, square * rate, *loop, *derivatives]
 
     return moments(len(samples.time), columns, samples.outputs)
+
+
+def rising(rate: Array) -> NDArray[np.bool_]:
+    """Return whether a rate rises at each sample, shape (n,)."""
+    rises = np.empty(len(rate), dtype=bool)
+    rises[1:-1], rises[0], rises[-1] = rate[2:] > rate[:-2], rate[1] > rate[0], rate[-1] > rate[-2]
+    return rises
 
 
 def felt_rate(samples: Samples, weights: Array) -> Array:

@@ -50,6 +50,15 @@ class Problem:
         Of the commanded rate of each dwell, which all visits of it share, rad/s, shape (n,).
     scale_error
         What each dwell's run adds to its scale factor, which delay and bandwidth share with it, shape (n,).
+    zero_error
+        What it adds to the zeros of its outputs, shape (n, g).
+    loop_error
+        What it adds to rising less falling at rate 0, a fraction of the largest rate; infinite where a loop cannot be
+        told from a delay, shape (n,).
+    reach
+        Largest rate of its run, beyond all means by rate, rad/s, shape (n,); 0 for steps.
+    branch
+        1 where the rate of a sweep rises, -1 where it falls, shape (n,); 0 for steps.
     lean
         Of the table axis: its components over that along the body axis, shape (n, 3); None along the body axis.
     force
@@ -67,6 +76,10 @@ class Problem:
     level: Array
     rate_uncertainty: Array
     scale_error: Array | None = None
+    zero_error: Array | None = None
+    loop_error: Array | None = None
+    reach: Array | None = None
+    branch: NDArray[np.int64] | None = None
     lean: Array | None = None
     force: Array | None = None
 
@@ -150,6 +163,8 @@ def solve(problem: Problem, orders: Sequence[int]) -> Solution:
         same = problem.run[:, None] == problem.run
         of_run = cycle**2 if problem.scale_error is None else cycle**2 + problem.scale_error**2
         blocks[i, i] = blocks[i, i] + of_run * same * np.outer(own_rate, own_rate) + np.diag(variance[:, i])
+        if problem.zero_error is not None:
+            blocks[i, i] += same * np.outer(problem.zero_error[:, i], problem.zero_error[:, i])
     whole = np.block([[blocks[i, k] for k in range(count)] for i in range(count)])
     columns = _diagonal([design(problem, i, orders[i]) for i in range(count)])
     found, matrix, _ = _general(columns, problem.mean.T.ravel(), whole)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.procedures.rate.regression import (
+    BOW,
     CUBE,
     DERIVATIVES,
     KERNELS,
@@ -21,14 +22,17 @@ from imulab.procedures.rate.regression import (
     RATE,
     SQUARE,
     TIME,
+    TURN,
     WHOLE,
     Moments,
     blocks,
     felt_rate,
     moments,
     regressors,
+    rising,
     with_neighbours,
 )
+from imulab.procedures.rate.wander import PARTS, variance_of_mean
 from imulab.recording import Array
 
 _BINS, _LEAST = 20, 10
@@ -40,6 +44,8 @@ _LONGEST = 1 << 17
 _SHOWN = 3.0
 _OWN, _CLEAR = 1e-3, 100
 """Share of a derivative's power that is its own, not the rate's and lower ones', and how far that exceeds noise."""
+_TOLD = 0.05
+"""Share of the power of w' that no function of rate and branch has; of one sine 0.01, of a chirp from 0 Hz 0.25."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,15 @@ class Sweep:
         Of the one sine that the rate is, Hz; None of a sweep.
     scale_error
         What not knowing delay, bandwidth and drift adds to the scale factor, a fraction.
+    loop_error
+        What not knowing the delay adds to rising less falling at rate 0, a fraction of the largest rate; None where
+        loop and delay cannot be told apart.
+    zero_error
+        What the zero of each of g gyroscopes wanders beyond the noise of the means by rate, output, shape (g,).
+    largest
+        Largest rate of the table, beyond the means by rate, rad/s.
+    rising
+        Number of the means by rate at which it rises; they come first.
     """
 
     delay: tuple[float, float]
@@ -65,6 +80,10 @@ class Sweep:
     beyond: float | None
     frequency: float | None
     scale_error: float
+    loop_error: float | None
+    zero_error: Array
+    largest: float
+    rising: int
 
 
 @dataclass(frozen=True)
@@ -73,6 +92,8 @@ class Binned:
 
     Attributes
     ----------
+    rising
+        Number of rising rates.
     rate
         Of the table, as the gyroscopes feel it, rad/s, shape (n,).
     duration
@@ -81,13 +102,17 @@ class Binned:
         Mean time, s, shape (n,).
     mean, variance
         Of the outputs, and of those means by the passes through each rate, shape (n, g).
+    wander
+        Variance of the mean over the whole run, shape (g,).
     """
 
+    rising: int
     rate: Array
     duration: Array
     middle: Array
     mean: Array
     variance: Array
+    wander: Array
 
 
 def is_smooth(rate: Array, blocks: Array) -> bool:
@@ -124,30 +149,40 @@ def reduce_sweep(time: Array, rate: Array, outputs: list[Array], main: int) -> t
     side = max(1, round(1 / (many * top * step)))
     samples = with_neighbours(time, rate, outputs, side, step)
     sums = regressors(samples)
-    count = _apart(sums, _noise(time, rate, step, side * step))
+    noise = _noise(time, rate, step, side * step)
+    count = _apart(sums, noise)
     if frequency is None and count < 2:  # a part of one period, whose spectrum has no peak
         frequency = float(np.sqrt(sums.variance(DERIVATIVES[0]) / sums.variance(RATE)) / (2 * np.pi))
-    sweep, weights = _regressed(sums, main, DERIVATIVES[: 1 if frequency is not None else count], frequency)
+    largest, derivatives = float(np.abs(rate).max()), DERIVATIVES[: 1 if frequency is not None else count]
+    loop = [TURN, BOW] if frequency is None and _loop_told(sums, noise[0]) else []
+    sweep, weights = _regressed(sums, main, derivatives, loop, frequency, largest)
     felt = felt_rate(samples, weights)
-    curve = _curve(samples.time, felt, samples.outputs)
+    if loop:  # the branches change when the gyroscope feels it
+        sums = regressors(samples, felt)
+        sweep, weights = _regressed(sums, main, derivatives, loop, frequency, largest)
+        felt = felt_rate(samples, weights)
+    rises = rising(felt)
+    curve = _curve(samples.time, felt, rises, samples.outputs)
     sweep = replace(sweep, scale_error=float(np.hypot(sweep.scale_error, curve.by_drift(main))))
-    binned = _by_rate(samples.time, felt, curve, step)
+    binned = _by_rate(samples.time, felt, rises, curve, step)
     if sweep.frequency is not None:
         factor = max(1, min(side, len(felt) // _LONGEST))
         binned = replace(binned, variance=binned.variance * _colour(samples.time, felt, curve, binned, factor))
-    return sweep, binned
+    known = np.mean(binned.variance * binned.duration[:, None], axis=0) / binned.duration.sum()
+    zero = np.sqrt(np.maximum(binned.wander - known, 0.0))
+    return replace(sweep, zero_error=zero, rising=binned.rising), binned
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """Outputs of g gyroscopes as a constant, a drift over time, and three powers of the rate over its largest.
+    """Outputs of g gyroscopes as a constant, a drift over time, powers of the rate over its largest, and a loop.
 
     Attributes
     ----------
     columns
-        Of these five, for a part of the samples, shape (5, n).
+        Of these seven, for a part of the samples, shape (7, n): 1, time, and what `_by_branch` returns.
     fits
-        Coefficients of each gyroscope, shape (g, 5).
+        Coefficients of each gyroscope, shape (g, 7).
     sums
         Of the products of the columns and the outputs.
     outputs
@@ -175,16 +210,22 @@ class _Curve:
         return drift * float(together / line) / self.sums.variance(2)
 
 
-def _curve(time: Array, felt: Array, outputs: list[Array]) -> _Curve:
+def _curve(time: Array, felt: Array, rises: NDArray[np.bool_], outputs: list[Array]) -> _Curve:
     middle, span, largest = float(time.mean()), float(np.ptp(time)), float(np.abs(felt).max())
 
     def columns(part: slice) -> Array:
         rate = felt[part] / largest
-        return np.array([np.ones(len(rate)), (time[part] - middle) / span, rate, rate**2, rate**2 * rate])
+        return np.array([np.ones(len(rate)), (time[part] - middle) / span, *_by_branch(rate, rises[part])])
 
     sums = moments(len(felt), columns, outputs)
     fits = np.array([sums.fitted(range(sums.columns), k) for k in range(len(outputs))])
     return _Curve(columns, fits, sums, outputs)
+
+
+def _by_branch(rate: Array, rises: NDArray[np.bool_]) -> list[Array]:
+    """Return three powers of a rate, 1 where it rises and -1 where it falls, and that times the square."""
+    square, turn = rate**2, np.where(rises, 1.0, -1.0)
+    return [rate, square, square * rate, turn, turn * square]
 
 
 def _spectrum(rate: Array, step: float) -> tuple[float, float | None]:
@@ -226,21 +267,39 @@ def _apart(found: Moments, noise: list[float]) -> int:
     return len(DERIVATIVES)
 
 
-def _regressed(moments: Moments, main: int, derivatives: Sequence[int], frequency: float | None) -> tuple[Sweep, Array]:
+def _loop_told(found: Moments, noise: float) -> bool:
+    """Return whether w' differs from pass to pass at one rate, as no loop does; its noise does not count."""
+    slope, count = DERIVATIVES[0], float(found.whole[ONE, ONE])
+    left = found.left_of(slope, [ONE, TIME, RATE, TURN, BOW])
+    return left - noise * count > _TOLD * float(found.whole[slope, slope])
+
+
+def _regressed(
+    moments: Moments,
+    main: int,
+    derivatives: Sequence[int],
+    loop: Sequence[int],
+    frequency: float | None,
+    largest: float,
+) -> tuple[Sweep, Array]:
     """Return what a gyroscope says of delay and bandwidth, and the weights of rate and derivatives in what it felt."""
-    still = [RATE, ONE, TIME, SQUARE, *([] if frequency is not None else [CUBE])]
-    columns = [*still[:1], *derivatives, *still[1:]]
+    still = [RATE, *loop, ONE, TIME, SQUARE, *([] if frequency is not None else [CUBE])]
+    columns = [RATE, *derivatives, *still[1:]]
     found = moments.fitted(columns, main)
     spread = moments.covariance(columns, columns, main, found)
     scale, weights = float(found[0]), np.zeros(5)
-    known = float(moments.covariance(still, columns, main, found)[0, 0])
-    more = float(np.sqrt(max(float(spread[0, 0]) - known, 0.0))) / abs(scale)
+    known = moments.covariance(still, columns, main, found)
+    more = float(np.sqrt(max(float(spread[0, 0] - known[0, 0]), 0.0))) / abs(scale)
+    of_loop = None
+    if loop:
+        at = columns.index(TURN)
+        of_loop = 2 * float(np.sqrt(max(float(spread[at, at] - known[1, 1]), 0.0))) / abs(scale) / largest
     if frequency is not None:
         omega = 2 * np.pi * frequency
         phase = float(np.arctan2(-found[1] * omega * np.sign(scale), abs(scale)))
         u = float(np.sqrt(spread[1, 1])) / abs(scale)
         weights[:2] = np.cos(phase), -np.sin(phase) / omega
-        return Sweep((phase / omega, u), None, None, frequency, more), weights
+        return Sweep((phase / omega, u), None, None, frequency, more, None, np.zeros(0), largest, 0), weights
     tau, c = -found[1] / scale, found[2] / scale
     lines = np.zeros((2, len(found)))
     lines[0, :2] = -tau / scale, -1 / scale
@@ -254,7 +313,8 @@ def _regressed(moments: Moments, main: int, derivatives: Sequence[int], frequenc
     else:
         beyond = float(1 / (2 * np.pi * np.sqrt(max(square, 0.0) + 2 * u_square + 1e-300)))
     weights[: len(derivatives) + 1] = [1.0, *(found[1 : len(derivatives) + 1] / scale)]
-    return Sweep((float(tau), float(np.sqrt(both[0, 0]))), bandwidth, beyond, None, more), weights
+    delay = float(tau), float(np.sqrt(both[0, 0]))
+    return Sweep(delay, bandwidth, beyond, None, more, of_loop, np.zeros(0), largest, 0), weights
 
 
 def _colour(time: Array, felt: Array, curve: _Curve, binned: Binned, factor: int) -> Array:
@@ -293,10 +353,10 @@ def _thin(values: Array, factor: int) -> Array:
     return values if factor == 1 else values[: len(values) // factor * factor].reshape(-1, factor).mean(axis=1)
 
 
-def _by_rate(time: Array, felt: Array, curve: _Curve, step: float) -> Binned:
+def _by_rate(time: Array, felt: Array, rises: NDArray[np.bool_], curve: _Curve, step: float) -> Binned:
     """Return the means of outputs by rate, each moved along its curve to the middle of its bin, without their drift."""
     low, high = float(felt.min()), float(felt.max())
-    number = _bins(felt, low, high)
+    number = _bins(felt, rises, low, high)
     middle = low + (np.arange(_BINS) + 0.5) / _BINS * (high - low)
     middle = np.concatenate([middle, middle[::-1]])
     count = np.bincount(number, minlength=2 * _BINS)
@@ -308,29 +368,31 @@ def _by_rate(time: Array, felt: Array, curve: _Curve, step: float) -> Binned:
 
     starts = np.concatenate([[0], np.flatnonzero(number[1:] != number[:-1]) + 1])
     place = number[starts]
-    powers = np.array([(middle[which] / max(abs(low), abs(high))) ** p for p in range(1, 4)])
-    means, variances = [], []
+    powers = np.array(_by_branch(middle[which] / max(abs(low), abs(high)), which < _BINS))
+    parts = np.linspace(0, len(felt), PARTS, endpoint=False).astype(np.int64)
+    means, variances, wander = [], [], []
     for k, fit in enumerate(curve.fits):
         rest = curve.left(k)
         means.append(mean(rest) + fit[0] + fit[2:] @ powers)
         passes = np.add.reduceat(rest, starts) ** 2
         variances.append(np.bincount(place, passes, minlength=2 * _BINS)[which] / size**2)
+        wander.append(variance_of_mean(np.add.reduceat(rest, parts) / np.diff(parts, append=len(felt))))
     return Binned(
+        int(np.count_nonzero(which < _BINS)),
         middle[which],
         np.asarray(size * step, dtype=np.float64),
         mean(time),
         np.column_stack(means),
         np.column_stack(variances),
+        np.array(wander),
     )
 
 
-def _bins(felt: Array, low: float, high: float) -> NDArray[np.int64]:
+def _bins(felt: Array, rises: NDArray[np.bool_], low: float, high: float) -> NDArray[np.int64]:
     """Return the number of each sample's rate: of its bin where it rises, and on beyond those where it falls."""
     number = np.empty(len(felt), dtype=np.int64)
     for _, part in blocks(len(felt)):
         number[part] = (felt[part] - low) / (high - low) * _BINS
     np.minimum(number, _BINS - 1, out=number)
-    rises = np.empty(len(felt), dtype=bool)
-    rises[1:-1], rises[0], rises[-1] = felt[2:] > felt[:-2], felt[1] > felt[0], felt[-1] > felt[-2]
     np.subtract(2 * _BINS - 1, number, out=number, where=~rises)
     return number

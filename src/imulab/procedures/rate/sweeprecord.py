@@ -59,17 +59,25 @@ def swept(test: RateTest, dwells: Sequence[Dwells]) -> dict[str, Any]:
     return {"sweeps": found} if found else {}
 
 
-def of_sines(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
-    """Say of each run at one frequency that its scale factor is the amplitude there."""
-    return [
-        Note(
-            f"{test.place(index)}: the rate is one sine of {one.sweep.frequency:.4g} Hz: the scale factor is the "
-            "amplitude at that frequency, and no bandwidth can be told from it; a sweep of frequencies, or steps, "
-            "shows that at rest"
-        )
-        for index, one in enumerate(dwells)
-        if one.sweep is not None and one.sweep.frequency is not None
-    ]
+def of_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
+    """Say of each run at one frequency that its scale factor is the amplitude there, and which tell no hysteresis."""
+    said = []
+    for index, one in enumerate(dwells):
+        if one.sweep is None or one.sweep.loop_error is not None:
+            continue
+        place = test.place(index)
+        if one.sweep.frequency is None:
+            said.append(
+                f"{place}: the rate passes each value always equally fast: hysteresis cannot be told from the delay, "
+                "which holds it; a sweep of frequencies, or steps, tells it"
+            )
+        else:
+            said.append(
+                f"{place}: the rate is one sine of {one.sweep.frequency:.4g} Hz: the scale factor is the amplitude at "
+                "that frequency, the delay holds hysteresis, and no bandwidth can be told from it; a sweep of "
+                "frequencies, or steps, shows that at rest, and the hysteresis"
+            )
+    return [Note(line) for line in said]
 
 
 def sweep_table(sweeps: Sequence[Swept]) -> ReportTable:
