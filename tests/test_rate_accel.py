@@ -238,3 +238,11 @@ def test_what_cannot_be_is_refused_in_a_line(accel):
         with pytest.raises(il.ImulabError, match=said) as refused:
             il.fit_rate(data, accel=record, order=1)
         assert "\n" not in str(refused.value)
+
+
+def test_a_record_of_both_triads_is_checked_by_holds_without_noise_that_are_alike(accel):
+    """Rests of a table between its rates are one attitude, many times."""
+    made = whole(SIX, arm=np.zeros(3), lean=np.radians(1))
+    both = il.fit_rate(made, accel=accel, order=1).calibration
+    found = il.check_tumble(both, made.recordings[0])
+    assert found.passed

@@ -194,7 +194,7 @@ def check_tumble(
     if not record.covariance.names:
         return Check(residuals, None, None, None, local, limit, tuple(notes), attitudes)
     mag = _mag(record, attitudes, notes)
-    own_variance = own[0] + _excess(record, g)
+    own_variance = np.maximum(own[0] + _excess(record, g), 1e-24)  # data without noise leave rounding
     more = scatter(rows, seen, own_variance)
     if more > 0:
         notes.append(

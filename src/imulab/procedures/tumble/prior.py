@@ -39,6 +39,7 @@ SCATTERED = 0.01
 FALSE_ALARM = 0.05
 _FEW = 9
 _IMPOSSIBLE = 1e-6
+_ALIKE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,9 @@ def contradiction(residuals: Array, jacobian: Array, known: Array, noise: Array)
     total = jacobian @ known @ jacobian.T + noise
     scale = np.sqrt(np.diag(total))
     white = residuals / scale
-    value = float(white @ np.linalg.solve(total / np.outer(scale, scale), white))
+    # attitudes without noise that are alike say one thing twice
+    correlation = total / np.outer(scale, scale) + _ALIKE * np.eye(len(scale))
+    value = float(white @ np.linalg.solve(correlation, white))
     return value, chi_square_probability(value, len(residuals))
 
 
