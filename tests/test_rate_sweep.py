@@ -10,6 +10,7 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
+from imulab.procedures.rate.regression import KERNELS, moments
 from reference.rate import DEGREE
 
 FREQUENCY, OVER = 200, 20
@@ -357,3 +358,39 @@ def test_gaps_in_a_sweep_leave_out_what_is_beside_them():
     found = il.fit_rate(cut).calibration.parameters
     assert found["gyro_scale_factor_z"].value * DEGREE == pytest.approx(SCALE, rel=1e-5)
     assert found["gyro_delay_z"].value == pytest.approx(TRUE_DELAY, abs=3e-5)
+
+
+def test_derivatives_are_those_of_fornberg():
+    """Central differences of eighth order, Math. Comp. 51 (1988) 699, table 1."""
+    first = [1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]
+    fourth = [7 / 240, -2 / 5, 169 / 60, -122 / 15, 91 / 8, -122 / 15, 169 / 60, -2 / 5, 7 / 240]
+    np.testing.assert_allclose(KERNELS[[0, 3]], [first, fourth], atol=1e-12)
+
+
+def test_the_covariance_by_parts_is_that_of_bell_and_mccaffrey():
+    """``A_b = (I - H_b)^(-1/2)`` before the residuals of each part b, written out with the whole matrices."""
+    rng = np.random.default_rng(0)
+    count = 32 * 6
+    x = np.column_stack([np.ones(count), rng.standard_normal((count, 2)) * np.linspace(0.1, 3, count)[:, None]])
+    y = x @ [1.0, 2.0, 3.0] + rng.standard_normal(count)
+    inverse = np.linalg.inv(x.T @ x)
+    left, expected = y - x @ inverse @ x.T @ y, np.zeros((3, 3))
+    for k in range(32):
+        own = slice(6 * k, 6 * k + 6)
+        size, turn = np.linalg.eigh(np.eye(6) - x[own] @ inverse @ x[own].T)
+        score = inverse @ x[own].T @ (turn / np.sqrt(size)) @ turn.T @ left[own]
+        expected += np.outer(score, score)
+    found = moments(count, lambda part: x[part].T, [y])
+    columns = [0, 1, 2]
+    covariance = found.covariance(columns, columns, 0, found.fitted(columns, 0))
+    np.testing.assert_allclose(covariance, expected, rtol=1e-9)
+
+
+def test_the_level_part_of_the_earths_rate_does_not_average_out_of_a_sweep():
+    """The table swings to and fro, so that the cosine and sine of its angle have a mean."""
+    made = il.simulate_rate("0,100", faces="+z", sweep="60s", rate="100 Hz", seed=1)
+    (found,) = il.fit_rate(made, order=1).dwells
+    angle = np.cumsum(made.recordings[0].si("table_rate")) / 100
+    expected = np.array([np.cos(angle).mean(), np.sin(angle).mean()])
+    assert np.hypot(*expected) > 0.1
+    np.testing.assert_allclose(found.level, np.tile(expected, (len(found.rate), 1)), atol=0.02)
