@@ -320,7 +320,11 @@ def test_a_simulated_sweep_gives_its_truth_back(tmp_path, monkeypatch, capsys):
     delay = record["gyro_delay_z"]
     assert abs(delay["value"] - 5e-3) < 4 * delay["standard_uncertainty"]
     capsys.readouterr()
-    for wrong, said in (("--sweep=5s", "sweep, rate: expected 20 s"), ("--lag=2s", "lag 2s: expected a time constant")):
+    for wrong, said in (
+        ("--sweep=5s", "sweep, rate: expected 20 s"),
+        ("--lag=2s", "lag 2s: expected a time constant"),
+        ("--hold=3s", "hold: a sweep rests at no rate"),
+    ):
         assert main(["rate", "simulate", "-o", "no", "--sweep", "30s", wrong], project=False) == 2
         assert said in capsys.readouterr().err
     assert not (tmp_path / "no").exists()

@@ -102,14 +102,16 @@ def simulate(
     rates: Annotated[str, typer.Option(metavar="R,R,...", help="Sizes of the rates, deg/s.")] = RATES,
     faces: Annotated[str, typer.Option(help="Body axes up along the table axis, one after the other.")] = "+x,+y,+z",
     cycles: Annotated[str, typer.Option(help="Runs of each face.")] = "1",
-    hold: Annotated[str, typer.Option(help="Time at each rate, s.")] = "8 s",
+    hold: Annotated[str | None, typer.Option(help="Time at each rate, s; 8 s if not given.")] = None,
     noise: Annotated[str, typer.Option(help="Standard deviation of one sample, deg/s.")] = "0.03 deg/s",
     rate: Annotated[str, typer.Option(help="Samples per second, Hz.")] = "100 Hz",
     bend: Annotated[str, typer.Option(help="Largest part of k3, a fraction of the largest rate.")] = "0",
     loop: Annotated[str, typer.Option(help="Rising less falling at rate 0, a fraction of the largest rate.")] = "0",
     latitude: Annotated[str, typer.Option(help="Of the place, deg.")] = "48 deg",
     table: Annotated[str, typer.Option(help="Standard deviation of what all rates are off by, a fraction.")] = "0",
-    sweep: Annotated[str | None, typer.Option(help="A sine of 0.05 to 2 Hz in place of steps, so long, s.")] = None,
+    sweep: Annotated[
+        str | None, typer.Option(help="Duration of a swept sine, 0.05 to 2 Hz, in place of steps, s.")
+    ] = None,
     lag: Annotated[str, typer.Option(help="Time constant of the gyroscopes, s.")] = "0 s",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:

@@ -68,7 +68,7 @@ def simulate_rate(
     *,
     faces: str = "+x,+y,+z",
     cycles: int | str = 1,
-    hold: float | str = "8 s",
+    hold: float | str | None = None,
     noise: float | str = "0.03 deg/s",
     rate: float | str = "100 Hz",
     bend: float | str = "0",
@@ -92,7 +92,7 @@ def simulate_rate(
     cycles
         Runs of each face.
     hold
-        Time at each rate, s.
+        Time at each rate, s; 8 s if not given.
     noise
         Standard deviation of one sample, rad/s.
     rate
@@ -106,7 +106,8 @@ def simulate_rate(
     table
         Standard deviation of what all rates of the table are off by, a fraction.
     sweep
-        So long, s, a sine of the largest rate from 0.05 to 2 Hz in place of steps, with the table's rate recorded.
+        Duration, s, of a sine of the largest rate that goes from 0.05 to 2 Hz, in place of steps; the table's rate is
+        recorded then.
     lag
         Time constant of the gyroscopes, a first-order lag, s.
     seed
@@ -127,11 +128,11 @@ def simulate_rate(
     words = faces.split(",")
     if not all(len(word) == 2 and word[0] in "+-" and word[1] in AXES for word in words):
         raise OptionError(f"faces {faces!r}: expected body axes such as +x,+y,+z")
-    duration, period = in_si(hold, "hold", "time", "s"), 1 / in_si(rate, "rate", "frequency", "Hz")
-    spread, place = (
-        in_si(noise, "noise", "rate", "deg/s"),
-        checked_latitude(in_si(latitude, "latitude", "angle", "deg")),
-    )
+    if sweep is not None and hold is not None:
+        raise OptionError("hold: a sweep rests at no rate; expected hold or sweep, not both")
+    duration, period = in_si(hold or "8 s", "hold", "time", "s"), 1 / in_si(rate, "rate", "frequency", "Hz")
+    spread = in_si(noise, "noise", "rate", "deg/s")
+    place = checked_latitude(in_si(latitude, "latitude", "angle", "deg"))
     common, bent, split = fraction(table, "table"), fraction(bend, "bend"), fraction(loop, "loop")
     if sizes.size < 2 or not duration >= 1 or not 0 < period <= 0.1:
         raise OptionError("rates, hold, rate: expected two rates or more, a hold of 1 s or more, and 10 Hz or more")
@@ -145,8 +146,7 @@ def simulate_rate(
     turn = np.eye(3) + _TILT * rng.standard_normal((3, 3)) * (1 - np.eye(3))
     off = common * rng.standard_normal()
     k3 = bent / sizes[-1] ** 2
-    up = sizes[sizes >= 0]
-    way = np.concatenate([up, up[-2::-1], -up[1:], -up[-2::-1]])
+    way = np.concatenate([sizes, sizes[-2::-1], -sizes[1:], -sizes[-2::-1]])
     runs, recordings = [], []
     for word in words:
         for cycle in range(1, whole(cycles, "cycles") + 1):
@@ -155,7 +155,7 @@ def simulate_rate(
                 _profile(way, duration, period) if swept is None else _sweep(float(sizes[-1]), swept, period)
             )
             body = np.zeros((len(time), 3))
-            body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(checked_latitude(place)))
+            body[:, axis] = sign * (table_rate * (1 + off) + EARTH * np.sin(place))
             angle = np.cumsum(table_rate) * period
             body[:, (axis + 1) % 3] += EARTH * np.cos(place) * np.cos(angle)
             body[:, (axis + 2) % 3] -= EARTH * np.cos(place) * np.sin(angle) * sign
