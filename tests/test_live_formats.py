@@ -14,7 +14,6 @@ import pytest
 from imulab.errors import ReadError
 from imulab.live.formats import STRAIGHTENED, Stream, UnknownFormatError
 from imulab.live.sources import open_source
-from imulab.live.stamps import Counts
 from imulab.readers import Layout, load_layout
 from imulab.recording import Recording
 from streams import drawn, mavlink, motioncal, msp, native, terminal, ximu3
@@ -124,89 +123,7 @@ def test_what_speaks_by_itself_is_not_asked():
         assert not stream.to_send
 
 
-def test_stamps_that_wrap_around_repeat_or_come_late():
-    stamps = (2**32 - 1_000_000 + 5000 * np.arange(600)) % 2**32
-    order = list(range(600))
-    order[300:302] = [301, 300]  # reordered
-    order.insert(400, 400)  # repeated
-    del order[500:503]  # lost
-    rows = [f"{stamps[k]},{k},0,1\n".encode() for k in order]
-    stream, found = decoded([b"time [us],accel_x [g],accel_y [g],accel_z [g]\n", *rows])
-    steps = np.diff(found.columns["time"])
-    assert steps.min() > 0
-    assert found.columns["time"][-1] - found.columns["time"][0] == 599 * 5000
-    counts = stream.counts
-    assert (counts.repeated, counts.reordered, counts.lost, counts.restarts) == (1, 1, 4, 0)
-
-
-def test_a_device_that_starts_again_goes_on_in_time():
-    rows = [f"{10_000 * (k % 300)},1,0,{k}\n".encode() for k in range(600)]
-    stream, found = decoded([b"time [us],accel_x [g],accel_y [g],accel_z [g]\n", *rows])
-    assert len(found) == 600
-    assert np.diff(found.columns["time"]).min() > 0
-    assert stream.counts.restarts == 1
-
-
 TITLES = b"time [ms],accel_x [g],accel_y [g],accel_z [g]\n"
-
-
-def stamped(stamps: list[float]) -> tuple[Stream, Recording]:
-    """Samples whose accel_z is their number, with these stamps, in pieces of five."""
-    rows = [f"{stamp:.0f},1,0,{k}\n".encode() for k, stamp in enumerate(stamps)]
-    return decoded([TITLES, *(b"".join(rows[k : k + 5]) for k in range(0, len(rows), 5))], step=0.05)
-
-
-@pytest.mark.parametrize("wild", [7_217_000, 3_499, 0, 95_000, 4_294_967_000])
-@pytest.mark.parametrize("at", [0, 299, 304, 455])  # the first of all, and each place in a piece
-def test_one_wild_stamp_costs_its_sample_and_no_other(wild, at):
-    stamps = [100_000.0 + 10 * k for k in range(600)]
-    stamps[at] = wild
-    stream, found = stamped(stamps)
-    kept = np.delete(np.arange(600), at)
-    np.testing.assert_array_equal(found.columns["accel_z"], kept)
-    np.testing.assert_array_equal(found.columns["time"], 100_000 + 10 * kept)
-    counts = stream.counts
-    assert (counts.stray, counts.restarts, counts.lost) == (1, 0, int(at > 0))
-
-
-@pytest.mark.parametrize("length", [2**16, 2**32])
-def test_counters_of_milliseconds_wrap_around(length):
-    stream, found = stamped([(length - 3000 + 10.0 * k) % length for k in range(600)])
-    np.testing.assert_array_equal(np.diff(found.columns["time"]), 10)
-    assert vars(stream.counts) == vars(Counts())
-
-
-def test_a_gap_is_believed_and_a_clock_that_was_set_is_no_gap():
-    gap = [10.0 * k + 5_000 * (k >= 303) for k in range(600)]
-    stream, found = stamped(gap)
-    np.testing.assert_array_equal(found.columns["time"], gap)
-    assert (stream.counts.gaps, stream.counts.lost, stream.counts.restarts) == (1, 500, 0)
-    stream, found = stamped([10.0 * k + 7e9 * (k >= 303) for k in range(600)])
-    assert len(found) == 600
-    assert np.ptp(found.columns["time"]) == 5990 - 10 + 1000
-    assert (stream.counts.restarts, stream.counts.stray) == (1, 0)
-
-
-def test_a_sample_that_is_sent_twice_is_counted_once():
-    stream, found = stamped([10.0 * (k // 2) for k in range(600)])
-    np.testing.assert_array_equal(found.columns["accel_z"], 2 * np.arange(300))
-    assert vars(stream.counts) == vars(Counts(repeated=300))
-
-
-def test_another_rate_is_no_loss():
-    stamps = np.cumsum([10.0] * 300 + [25.0] * 300)
-    stream, found = stamped(stamps.tolist())
-    np.testing.assert_array_equal(found.columns["time"], stamps)
-    assert stream.counts.lost <= 10  # those of the piece in which it changes
-
-
-def test_stamps_of_bursts_lose_nothing():
-    """A driver that stamps at arrival: sixteen samples within a millisecond, then nothing for 160 ms."""
-    stamps = [160.0 * (k // 16) + 0.0625 * (k % 16) for k in range(1600)]
-    rows = [f"{stamp},1,0,{k}\n".encode() for k, stamp in enumerate(stamps)]
-    stream, found = decoded([TITLES, *rows])
-    np.testing.assert_array_equal(found.columns["time"], stamps)
-    assert stream.counts.stray == stream.counts.restarts == 0
 
 
 def test_titles_that_come_again_in_another_order_are_followed():

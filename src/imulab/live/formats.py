@@ -151,7 +151,7 @@ class Stream:
         metadata = {"format": self.format, **self._decoder.metadata}
         if self._device is not None:
             times, kept, again = self._device.times(columns["time"])
-            self._again = rows[-1:] if again else None
+            self._again = rows[again] if again else None
             columns = {name: np.ascontiguousarray(column[kept]) for name, column in columns.items()}
             columns["time"] = times[kept]
         elif self._arrival is not None:

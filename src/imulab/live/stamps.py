@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +14,17 @@ from imulab.units import parse_unit
 _WRAPS = ((2**32, 1e-6), (2**32, 1e-3), (2**24, 1e-6), (2**16, 1e-3))
 """Counters that begin again: after how many ticks, and how long a tick is, s."""
 _NEAR, _NEAR_STEPS = 0.25, 10.0
-"""A stamp at most so far behind the last, s or usual steps, goes on from it."""
+"""A stamp at most so far behind another, s or usual steps, goes on from it."""
+_SURE = 2.5
+"""A stamp at most so many usual steps behind the last, or behind a wrap-around, needs no next one to be believed."""
 _SOON, _SOON_PART = 10.0, 0.005
-"""A stamp that goes on within both behind a wrap-around, s and part of the counter's length, has wrapped around."""
+"""A stamp within both behind a wrap-around, s and part of the counter's length, has wrapped around."""
 _RESTART = 1.0
 """Stamps that jump back by more than this, s, are those of a device that has started again."""
 _SET_ANEW = 600.0
 """Stamps that jump ahead by more than this, s, are those of a clock that was set: nobody waits so long in a test."""
+_SLOWEST = 10.0
+"""No rate has longer steps than this, s."""
 _LATE = 1.5
 """Steps in time longer than so many usual ones have lost samples between them."""
 _ALIKE = 5
@@ -73,63 +78,68 @@ class Counts:
 class DeviceClock:
     """Stamps of a device in their own unit, without wrap-around; they rise from sample to sample.
 
-    A stamp that jumps is believed once the next one goes on from it: a damaged digit moves one stamp, while a gap, a
-    counter that begins again or a device that does moves all that follow.
+    A stamp that jumps is believed once the next one goes on from it, or the next two do in steps that are alike: a
+    damaged digit moves one stamp, while a gap, a counter that begins again, a device that does or a slower rate moves
+    all that follow.
     """
 
     def __init__(self, unit: str, counts: Counts) -> None:
         factor = parse_unit(unit).factor
         self._restart, self._set_anew = _RESTART / factor, _SET_ANEW / factor
-        self._near = _NEAR / factor
+        self._near, self._slowest = _NEAR / factor, _SLOWEST / factor
         lengths = sorted(count * tick for count, tick in _WRAPS)
         self._wraps = [(length / factor, min(_SOON, _SOON_PART * length) / factor) for length in lengths]
         self._counts = counts
         self._offset = 0.0
         self._last: float | None = None
         self._step: float | None = None
+        self._recent: Array = np.empty(0)
+        self._missing: Array = np.empty(0)
 
-    def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], bool]:
+    def times(self, stamps: Array) -> tuple[Array, NDArray[np.bool_], list[int]]:
         """Take stamps on.
 
         Returns
         -------
         times, kept, again
-            Times in the stamps' unit and which samples to keep, both of shape (n,); whether the last sample is to be
-            given again with the next ones, because only they can tell what its stamp is worth.
+            Times in the stamps' unit and which samples to keep, both of shape (n,); the numbers of the samples to be
+            given again in front of the next ones, because only those can tell what their stamps are worth.
         """
         times = stamps + self._offset
         steps = np.diff(times) if self._last is None else np.diff(times, prepend=self._last)
-        again = False
-        if self._last is None or steps.min() <= 0 or steps.max() > self._reach(steps):
-            times, kept, again = self._judged(stamps.tolist(), self._reach(steps))
-        else:
-            kept = np.ones(len(times), dtype=np.bool_)
+        kept, again = np.ones(len(times), dtype=np.bool_), list[int]()
+        usual = self._step or 0.0
+        rising = steps[steps > 0]
+        if len(rising) >= _ALIKE:
+            usual = min(self._step or np.inf, _middle(rising))
+        if self._last is None or steps.min() <= 0 or steps.max() > _SURE * usual:
+            times, kept, again = self._judged(stamps.tolist(), usual)
         good = times[kept]
-        if not good.size:
-            return times, kept, again
-        steps = np.diff(good) if self._last is None else np.diff(good, prepend=self._last)
-        if steps.size:
-            usual = float(np.median(steps))
-            step = usual if self._step is None else self._step
-            if len(steps) >= _ALIKE and steps.max() < _LATE * steps.min():
-                step = usual  # all steps are alike: those of another rate, and no losses
-            late = steps > _LATE * step
-            if late.any():
-                self._counts.gaps += int(late.sum())
-                self._counts.lost += int((np.round(steps[late] / step) - 1).sum())
-            # The usual step follows slowly, and no further than a jitter, so that gaps do not become usual.
-            self._step = step + 0.05 * (min(usual, _LATE * step) - step)
-        self._last = float(good[-1])
+        if good.size:
+            self._count(np.diff(good) if self._last is None else np.diff(good, prepend=self._last))
+            self._last = float(good[-1])
         return times, kept, again
 
-    def _reach(self, steps: Array) -> float:
-        """Return how far a stamp goes on from the last at most; `steps` tell it where no step is known yet."""
-        step = self._step
-        if step is None:
-            step = float(np.median(np.abs(steps))) if steps.size else 0.0
-        return max(self._near, _NEAR_STEPS * step)
+    def _count(self, steps: Array) -> None:
+        """Count the samples that are missing, and follow the usual step."""
+        if not steps.size:
+            return
+        usual = _middle(steps)
+        known = longer = usual if self._step is None else self._step
+        joined = np.append(self._recent, steps)
+        newest = joined[-_ALIKE:]
+        if len(newest) == _ALIKE and _alike(newest.tolist()):
+            self._step = float(newest.mean())
+            longer = max(self._step, known)
+        else:  # slowly, and no further than a jitter, so that gaps do not become usual
+            self._step = known + 0.05 * (min(usual, _LATE * known) - known)
+        missing = np.append(self._missing, np.round(steps / longer) - 1)
+        missing[joined <= _LATE * longer] = 0  # of steps that turn out to be those of another rate, too
+        self._counts.gaps += int(np.count_nonzero(missing)) - int(np.count_nonzero(self._missing))
+        self._counts.lost += int(missing.sum() - self._missing.sum())
+        self._recent, self._missing = joined[1 - _ALIKE :], missing[1 - _ALIKE :]
 
-    def _judged(self, stamps: list[float], reach: float) -> tuple[Array, NDArray[np.bool_], bool]:
+    def _judged(self, stamps: list[float], usual: float) -> tuple[Array, NDArray[np.bool_], list[int]]:
         """Go through a block with a stamp that does not rise, or jumps ahead."""
         last = self._last
         times, kept = np.empty(len(stamps)), np.zeros(len(stamps), dtype=np.bool_)
@@ -139,29 +149,61 @@ class DeviceClock:
                 self._counts.repeated += step == 0
                 self._counts.reordered += step < 0
                 continue
-            if step is None or not 0 < step <= reach:
-                after = next((other for other in stamps[index + 1 :] if other != stamp), None)
-                if after is None:
-                    self._counts.repeated += len(stamps) - 1 - index
-                    return times, kept, True
-                if not 0 < after - stamp <= reach:
+            if step is None or not 0 < step <= _SURE * usual:
+                places = _others(stamps, index)
+                ahead = np.diff([stamps[place] for place in places]).tolist()
+                believed = self._believed(step, ahead, max(self._near, _NEAR_STEPS * usual))
+                if believed is None:
+                    self._counts.repeated += len(stamps) - index - len(places)
+                    return times, kept, places
+                if not believed:
                     self._counts.stray += 1
                     continue
                 if last is not None:
-                    self._jump(stamp, last)
+                    self._jump(stamp, last, _SURE * max(usual, ahead[0]))
             kept[index] = True
             times[index] = last = stamp + self._offset
-        return times, kept, False
+        return times, kept, []
 
-    def _jump(self, stamp: float, last: float) -> None:
+    def _believed(self, step: float | None, ahead: list[float], reach: float) -> bool | None:
+        """Tell whether to believe a stamp that jumped by `step`, from the one or two steps behind it; None: not yet."""
+        if not ahead:
+            return None
+        if ahead[0] <= 0 or (step is not None and 0 < step <= reach):
+            return ahead[0] > 0
+        if ahead[0] <= reach:  # a stamp that fell back is not believed where the next goes on from the last before it
+            return step is None or not step < 0 < step + ahead[0] <= reach
+        return ahead[0] <= self._slowest and _alike(ahead) if len(ahead) > 1 else None
+
+    def _jump(self, stamp: float, last: float, sure: float) -> None:
         """Take a jump of the stamps out of the time, where it is none of time."""
         step = stamp + self._offset - last
-        wrap = next((w for w, soon in self._wraps if step < 0 < step + w <= soon and stamp < w), None)
+        wrap = next((w for w, soon in self._wraps if step < 0 < step + w <= max(soon, sure) and stamp < w), None)
         if wrap is not None:
             self._offset += wrap
         elif step < 0 or step > self._set_anew:
             self._counts.restarts += 1
             self._offset = last + self._restart - stamp
+
+
+def _others(stamps: list[float], index: int) -> list[int]:
+    """Return the place of a stamp and those of the next two, each other than the one before."""
+    places = [index]
+    for place in range(index + 1, len(stamps)):
+        if stamps[place] != stamps[places[-1]]:
+            places.append(place)
+        if len(places) == 3:
+            break
+    return places
+
+
+def _middle(steps: Array) -> float:
+    """Return the median, the lesser of two; for a few numbers `numpy.median` takes ten times as long."""
+    return float(np.sort(steps)[(len(steps) - 1) // 2])
+
+
+def _alike(steps: Sequence[float]) -> bool:
+    return max(steps) < _LATE * min(steps)
 
 
 class ArrivalClock:

@@ -107,8 +107,14 @@ class Watch:
     def counts(self, counts: Counts, samples: int) -> list[str]:
         """Look at what the stream has lost."""
         found = []
-        if samples > _FEWEST:
-            came = samples + counts.repeated + counts.reordered + counts.stray
+        came = samples + counts.repeated + counts.reordered + counts.stray
+        if counts.stray:
+            found += self._once(
+                "stray",
+                "a sample whose time fits neither those before nor those after is left out, as any more will be: is "
+                "the cable all right?",
+            )
+        if came > _FEWEST:
             for key, number, text in (
                 ("lost", counts.lost, f"of {samples + counts.lost} samples are lost: a lower rate, or a faster link?"),
                 ("damaged", counts.damaged, "lines or messages were damaged: is the cable all right?"),
@@ -118,15 +124,15 @@ class Watch:
                     counts.reordered,
                     f"of {came} samples came too late and are left out: a faster link?",
                 ),
+                (
+                    "strays",
+                    counts.stray,
+                    f"of {came} samples have a time that fits neither those before nor those after and are left out: "
+                    "is the cable all right?",
+                ),
             ):
                 if number > _LOST * samples:
                     found += self._once(key, f"{number} {text}")
-        if counts.stray:
-            found += self._once(
-                "stray",
-                "a sample whose time fits neither those before nor those after is left out, as any more will be: is "
-                "the cable all right?",
-            )
         if counts.restarts:
             found += self._once(
                 f"restart {counts.restarts}",
