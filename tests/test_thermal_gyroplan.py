@@ -90,6 +90,8 @@ def test_what_the_soaks_tell_of_scale_factors_is_said(capsys):
         (["--with", "gyro", "--gyro-noise", "0"], "--gyro-noise '0': expected more than 0"),
         (["--with", "gyro", "--gyro-noise", "2 m"], "--gyro-noise '2 m': expected a number with one of deg/sqrt(h)"),
         (["--with", "gyro", "--gyro-turn-on-scatter=-1"], "--gyro-turn-on-scatter '-1': expected 0 or more"),
+        (["--gyro-noise", "0.3"], "--gyro-noise: no gyroscopes are planned; expected --with gyro beside it"),
+        (["--gyro-turn-on-scatter", "0.01"], "--gyro-turn-on-scatter: no gyroscopes are planned; expected --with gyro"),
     ],
 )
 def test_what_cannot_be_planned_of_gyroscopes_is_refused_in_one_line(options, said, capsys):

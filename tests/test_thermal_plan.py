@@ -32,6 +32,16 @@ def test_soaks_beyond_the_temperatures_come_back_to_inner_ones_from_the_other_si
     assert [soak.warming for soak in soaks] == [False, True, True, True, True, False, False, False]
 
 
+def test_as_many_offsets_tell_the_turn_on_scatter_as_the_fit_of_these_soaks_finds():
+    """Three for each soak beyond what the laws of the biases take, whatever the degrees of the others."""
+    plan = il.plan_thermal(time="8 h", degrees=(1, 2, 0))
+    assert len(plan.soaks) == 8
+    made = il.simulate_thermal([soak.temperature for soak in plan.soaks])
+    fit = il.fit_thermal(made, degrees="1,2,0").calibration.fit
+    assert fit["between_recordings"]["rank"] == 18
+    assert "18 independent offsets will tell the turn-on scatter" in plan.lead
+
+
 def worst(temperatures, sets=None, tau=0.0):
     design = Design(LAWS, np.asarray(temperatures), tau)
     found = (

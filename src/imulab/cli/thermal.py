@@ -64,11 +64,13 @@ def plan(
         str | None, one_of(("gyro",), "Say what the same soaks give of the gyroscopes, too.", "--with")
     ] = None,
     gyro_noise: Annotated[
-        str, typer.Option(metavar="N", help="Angle random walk of the gyroscopes, deg/sqrt(h).")
-    ] = "0.3 deg/sqrt(h)",
+        str | None,
+        typer.Option(metavar="N", help="Angle random walk of the gyroscopes, deg/sqrt(h); 0.3 if not given."),
+    ] = None,
     gyro_turn_on_scatter: Annotated[
-        str, typer.Option(help="What their biases move by from one power cycle to the next, deg/s.")
-    ] = "0.01 deg/s",
+        str | None,
+        typer.Option(help="What their biases move by from one power cycle to the next, deg/s; 0.01 if not given."),
+    ] = None,
     output: Annotated[str | None, typer.Option("-o", "--output", metavar="PLAN.csv", help="Plan to write.")] = None,
     report: Annotated[str | None, typer.Option("--report", metavar="SHEET.html", help="Sheet to print.")] = None,
     json: AsJson = False,

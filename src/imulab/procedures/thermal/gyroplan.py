@@ -19,6 +19,8 @@ from imulab.quantities import RANDOM_WALK, in_si, of_units
 from imulab.recording import Array
 from imulab.units import from_si
 
+NOISE, TURN_ON_SCATTER = "0.3 deg/sqrt(h)", "0.01 deg/s"
+
 
 @dataclass(frozen=True)
 class GyroPlan:
@@ -79,14 +81,25 @@ def hourly(rate: float) -> str:
     return f"{from_si(float(rate), 'deg/h'):.3g}"
 
 
-def noise_and_scatter(noise: float | str, turn_on_scatter: float | str) -> tuple[float, float]:
+def noise_and_scatter(
+    noise: float | str | None, turn_on_scatter: float | str | None, *, asked: bool
+) -> tuple[float, float] | None:
     """Return the angle random walk, rad/sqrt(s), and the scatter of biases between power cycles, rad/s.
+
+    None where gyroscopes are not `asked` for.
 
     Raises
     ------
     OptionError
-        One is out of range.
+        One is out of range, or given where they are not asked for.
     """
+    if not asked:
+        for name, value in (("gyro_noise", noise), ("gyro_turn_on_scatter", turn_on_scatter)):
+            if value is not None:
+                raise OptionError(f"{name}: no gyroscopes are planned; expected --with gyro beside it")
+        return None
+    noise = NOISE if noise is None else noise
+    turn_on_scatter = TURN_ON_SCATTER if turn_on_scatter is None else turn_on_scatter
     walk = of_units(noise, "gyro_noise", RANDOM_WALK)
     tau = in_si(turn_on_scatter, "gyro_turn_on_scatter", "rate", "deg/s")
     if not 0 < walk < 1:

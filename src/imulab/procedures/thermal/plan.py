@@ -40,8 +40,8 @@ def plan_thermal(
     degrees: str | tuple[int, int, int] = DEGREES,
     from_: Data = "sphere",
     with_: str | Sequence[str] = (),
-    gyro_noise: float | str = "0.3 deg/sqrt(h)",
-    gyro_turn_on_scatter: float | str = "0.01 deg/s",
+    gyro_noise: float | str | None = None,
+    gyro_turn_on_scatter: float | str | None = None,
 ) -> ThermalPlan:
     """Choose soaks and attitudes for a calibration over temperature, and predict the corrected force over the range.
 
@@ -69,14 +69,14 @@ def plan_thermal(
     with_
         ``"gyro"``: predict what the same soaks give of the gyroscopes, too.
     gyro_noise
-        Angle random walk of the gyroscopes, rad/sqrt(s), over all of an attitude's time.
+        Angle random walk of the gyroscopes, rad/sqrt(s), over all of an attitude's time; 0.3 deg/sqrt(h) if not given.
     gyro_turn_on_scatter
-        Standard deviation of each of their biases from one power cycle to the next, rad/s.
+        Standard deviation of each of their biases from one power cycle to the next, rad/s; 0.01 deg/s if not given.
 
     Raises
     ------
     OptionError
-        A value is out of range, or the time too short.
+        A value is out of range, the time too short, or one is of gyroscopes that nobody asked for.
     ObservabilityError
         No choice among the attitudes determines the laws.
 
@@ -98,7 +98,7 @@ def plan_thermal(
     tau = in_si(turn_on_scatter, "turn_on_scatter", "acceleration", "mg") / STANDARD_GRAVITY
     if not 0 <= tau < 1:
         raise OptionError(f"turn_on_scatter {turn_on_scatter!r}: expected 0 or more, less than 1 g")
-    further = noise_and_scatter(gyro_noise, gyro_turn_on_scatter) if further_of(with_, "with_") else None
+    further = noise_and_scatter(gyro_noise, gyro_turn_on_scatter, asked=bool(further_of(with_, "with_")))
     given = candidates_of(from_)
     points = sphere_candidates() if given is None else given
     options = _allowed(count, **sizes)

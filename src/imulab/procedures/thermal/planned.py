@@ -116,7 +116,7 @@ class ThermalPlan(Shown):
         back = f" ({again} of them back at one)" if again else ""
         low, high = self.temperature[[0, -1]]
         worst = int(np.argmax(self.deviation))
-        free = 3 * (len(self.soaks) - max(self.degrees) - 1)
+        free = 3 * (len(self.soaks) - self.degrees[0] - 1)  # beside laws of the biases
         return (
             f"{len(self.soaks)} soaks, a power cycle each, at {places} temperatures{back}, {each} attitudes in each "
             f"({sum(counts)} in all), {_hours(self.duration)} of {_hours(self.time)}. For degrees {spoken}, a "
