@@ -137,3 +137,15 @@ def test_six_attitudes_at_each_temperature_leave_no_room_to_step_down():
         factor = [[coverage_factor(found.degrees_of_freedom(row)) for row in each] for each in design]
         held.append(np.abs(error / u) < factor)
     assert np.mean(held) > 0.92
+
+
+def test_scale_factors_told_at_one_temperature_are_said_to_be_taken_as_constant():
+    """44 K from the tumble, 100 ppm/K are 4,400 ppm; a tumble at each of five temperatures tells them."""
+    made = {each.name: each for each in il.simulate_thermal(ramps=4, gyro=True)}
+    ramps = [made[name] for name in ("tumble_25.csv", *(f"ramp_{k}.csv" for k in (1, 2, 3, 4)))]
+    record = il.fit_thermal(ramps, with_="gyro").calibration
+    (said,) = [line for line in record.verdict.reasons if "do not tell whether scale factors follow" in line]
+    off = float(re.search(r"is off by (\d+) ppm at -?\d+ degC", said)[1])
+    assert off == pytest.approx(1e6 * 1e-4 * (25.0 - record.model["range"][0]), rel=0.02)
+    soaks = [each for name, each in made.items() if name.startswith("tumble")]
+    assert not any("do not tell" in line for line in il.fit_thermal(soaks, with_="gyro").calibration.warnings)

@@ -121,6 +121,9 @@ def gravity_findings(gravity: Gravity, recording: Recording) -> list[str]:
     low, high = _ON_EARTH
     if not low <= gravity.value <= high:
         return [f"gravity {gravity.value:g} m/s^2 is found nowhere on Earth ({low} to {high} m/s^2)"]
+    if head is not None and gravity.note and abs(gravity.value - head.value) > _TOLD_APART * head.value:
+        other = f"the head of {recording.name} says {head.value:.6g} m/s^2 (--gravity keeps that)"
+        return [Note(f"{gravity.note}; {other}")]
     return [gravity.note] if gravity.note else []
 
 

@@ -85,7 +85,7 @@ def _apart(holds: Holds, problem: Problem, laws: Laws) -> str:
     left = [_disagreement(_without(problem, problem.recording == number), laws) for number in numbers]
     order = np.argsort(left)
     best, second = (left[int(k)] for k in order[:2])
-    if not best < _APART * second:
+    if not best < min(_APART * second, _MOVES):
         return ""
     return f" Without {holds.recordings[int(numbers[order[0]])].name} the others agree to {1e6 * best:.0f} ug"
 

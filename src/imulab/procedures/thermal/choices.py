@@ -20,6 +20,9 @@ SETTLE = 300.0
 TURNED, FOLLOWED = 9, 3
 """Attitudes of a recording whose turns tell scale factors of gyroscopes; temperatures at which these follow it."""
 
+STRETCHES, TURNS = 1e-4, 1e-5
+"""What scale factors and misalignments of such sensors usually move by, 1/K and rad/K."""
+
 
 def further_of(given: str | Sequence[str], option: str) -> tuple[str, ...]:
     """Return the names of further triads, of which there is one, ``gyro``.

@@ -17,7 +17,7 @@ from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, SegmentError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.rows import leave_out
-from imulab.procedures.thermal.choices import FOLLOWED, TURNED
+from imulab.procedures.thermal.choices import FOLLOWED, STRETCHES, TURNED
 from imulab.procedures.thermal.degrees import clusters_of
 from imulab.procedures.thermal.device import tables_of
 from imulab.procedures.thermal.gyro import Gyroscopes
@@ -236,6 +236,8 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
         matrix = matrix * square / freedom
     common = np.concatenate([coefficients[:size], np.zeros(6)]) * CRYSTAL
     matrix = matrix + np.outer(common, common)
+    if not degree:
+        notes += _constant(float(temperature.mean()), over, float(np.sqrt(np.diag(matrix)[:3].max())))
     middle = coefficients[: size : degree + 1] - 1
     if np.abs(middle).max() > _WORST:
         off = " ".join(f"{100 * value:+.3g}" for value in middle)
@@ -252,6 +254,20 @@ def _laws(found: list[Turned], known: Array, over: Laws, notes: list[str]) -> Sc
             )
         )
     return ScaleLaws(laws, coefficients, matrix, len(found), turns, miss, square, freedom, tuple(notes))
+
+
+def _constant(temperature: float, over: Laws, stated: float) -> list[str]:
+    """Return what scale factors told at about one temperature may be off by elsewhere, if it counts beside `stated`."""
+    end = max(over.low, over.high, key=lambda each: abs(each - temperature))
+    off = STRETCHES * abs(end - temperature)
+    if off < 0.5 * stated:
+        return []
+    return [
+        f"gyro: turns at about {temperature:.0f} degC do not tell whether scale factors follow the temperature, which "
+        f"are taken as constant: one that moves by {1e6 * STRETCHES:.0f} ppm/K, as is usual, is off by "
+        f"{1e6 * off:.0f} ppm at {end:.0f} degC, where its uncertainty is {1e6 * stated:.0f} ppm: turn the unit at "
+        f"{FOLLOWED} temperatures or more"
+    ]
 
 
 def _temperature(holds: Holds, number: int, attitudes: Attitudes) -> Array:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from imulab.procedures.thermal.choices import STRETCHES, TURNS
 from imulab.procedures.thermal.lag import Drift
 from imulab.procedures.thermal.model import GROUPS
 from imulab.procedures.thermal.rows import Problem, whitener
 from imulab.procedures.thermal.solve import Solution
 from imulab.recording import Array
 
-_USUAL = {1: (1e-4, "100 ppm/K"), 2: (1e-5, "10 urad/K")}
-"""Slopes of scale factor and misalignment that sensors of this kind have, 1/K and rad/K."""
+_USUAL = {1: (STRETCHES, f"{1e6 * STRETCHES:.0f} ppm/K"), 2: (TURNS, f"{1e6 * TURNS:.0f} urad/K")}
 _LAG = 5.0
 """s, that a sensor on the thermometer's own board may lag behind it."""
 _PLACES = 33
