@@ -76,6 +76,32 @@ def test_the_table_axis_is_that_of_the_accelerometers(accel):
         assert exact.value(name) == pytest.approx(true, abs=1e-9), name
 
 
+def of_another_unit(accel, bias=0.0, serial="SIM-0001"):
+    """The record of accelerometers whose biases are others, m/s^2."""
+    moved = {n: dataclasses.replace(p, value=p.value + bias) for n, p in accel.parameters.items() if n == "bias_z"}
+    return dataclasses.replace(accel, parameters={**accel.parameters, **moved}, sensor={"serial": serial})
+
+
+def test_a_record_of_another_unit_is_said_to_be(accel):
+    """By its serial number, and by |f|: 14 mg off g, where 2 mg are what a power cycle may do."""
+    made = whole(SIX[::2], arm=np.zeros(3))
+    named = [dataclasses.replace(one, metadata={"serial": "SIM"}) for one in made.recordings]
+    made = dataclasses.replace(made, recordings=tuple(named))
+    (said,) = il.fit_rate(made, accel=of_another_unit(accel), order=1).calibration.verdict.reasons
+    assert said.startswith("accel: the record is of serial SIM-0001, the recordings are of serial SIM")
+    found = il.fit_rate(made, accel=of_another_unit(accel, 14e-3 * G, "SIM"), order=1).calibration
+    (said,) = found.verdict.reasons
+    assert found.verdict.state == "look"
+    assert "|f| is -14 mg off gravity in 2.csv (+z along the table axis), more than its uncertainty" in said
+    for record in (of_another_unit(accel, bias, "SIM") for bias in (0.0, 2e-3 * G)):
+        assert il.fit_rate(made, accel=record, order=1).calibration.verdict.state == "good"
+    other = of_another_unit(accel)
+    stated = dataclasses.replace(made, test=dataclasses.replace(made.test, sensor={"serial": "SIM-0001"}))
+    found = il.fit_rate(stated, accel=other, order=1).calibration
+    assert not any("accel:" in each for each in found.warnings)  # the manifest's is the unit's
+    assert il.fit_rate(made, accel=other, order=1).calibration.sensor["serial"] == "SIM"
+
+
 def swept(largest=200.0, low=0.05, duration=90.0):
     """The rate of a table, rad/s, whose frequency rises to 1 Hz."""
     t = np.arange(int(duration * FREQUENCY)) / FREQUENCY

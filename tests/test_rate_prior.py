@@ -82,6 +82,43 @@ def test_records_that_do_not_agree_are_said_to():
     assert "gyro_scale_factor_y differs by" in said
 
 
+def test_a_prior_that_does_not_agree_is_to_be_looked_at():
+    """The record is judged with what the prior makes of it; it was judged before."""
+    first, second = simulated(11), simulated(12)
+    prior = il.fit_rate(first, order=1).calibration
+    assert il.fit_rate(second, order=1, prior=prior).calibration.verdict.state == "good"
+    scale = prior.parameters["gyro_scale_factor_y"]
+    moved = {"gyro_scale_factor_y": dataclasses.replace(scale, value=scale.value * 1.0003)}
+    other = dataclasses.replace(prior, parameters=prior.parameters | moved)
+    for record in (
+        il.fit_rate(second, order=1, prior=other).calibration,
+        il.fit_turns(turned(), prior=prior, clock="1ppm").calibration,
+    ):
+        assert record.verdict.state == "look"
+        assert any("the prior does not agree (probability" in reason for reason in record.verdict.reasons)
+    # 2.2 sigma of each of nine parameters are no significant one of nine, but all of them together are.
+    alone = il.fit_rate(second, order=1).calibration
+    moved = {
+        n: dataclasses.replace(
+            p,
+            value=alone.value(n) + 2.2 * np.hypot(p.standard_uncertainty, alone.parameters[n].standard_uncertainty),
+        )
+        for n, p in prior.parameters.items()
+        if n.startswith(MODEL)
+    }
+    record = il.fit_rate(second, order=1, prior=dataclasses.replace(prior, parameters=prior.parameters | moved))
+    (said,) = record.calibration.verdict.reasons
+    assert "the prior does not agree (probability" in said
+    assert "no one parameter" in said
+
+
+def test_a_prior_of_another_unit_is_said_to_be():
+    prior = il.fit_rate(simulated(11), order=1).calibration
+    other = dataclasses.replace(prior, sensor={"serial": "SN7"})
+    (said,) = il.fit_rate(simulated(12), order=1, prior=other).calibration.verdict.reasons
+    assert said == "prior: the record is of serial SN7, the recordings are of serial SIM: is it of this unit?"
+
+
 def turned(scale=1.01):
     gyro = np.random.default_rng(1).normal(0, 0.02, (2400, 3))
     gyro[300:900, 2] += 60 * scale

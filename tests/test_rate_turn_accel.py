@@ -1,6 +1,7 @@
 """Whole turns by hand with accelerometers: the axis of each turn, misalignments, and both triads in one record."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import imulab as il
 from imulab.cli import main
 from imulab.procedures.rate.turnaxes import _scattered
 from reference import rate as reference
-from test_rate_accel import ARM, BIAS, SCALE, TURN, accel
+from test_rate_accel import ARM, BIAS, SCALE, TURN, G, accel, of_another_unit
 
 __all__ = ["accel"]
 FREQUENCY = 100.0
@@ -38,6 +39,18 @@ def test_scale_factors_and_misalignments_are_those_of_the_turns(accel):
         for k, b in enumerate("xyz"):
             if i != k:
                 assert found.value(f"gyro_misalignment_{a}{b}") == pytest.approx(TURN[i, k], abs=1e-5)
+
+
+def test_a_record_of_another_unit_is_said_to_be(accel):
+    """By its serial number, and by |f|: 14 mg off g, where 2 mg are what a power cycle may do."""
+    turns = hand(noise=1e-6, axes=np.eye(3)[[2, 0, 1]], arm=np.zeros(3))
+    turns = dataclasses.replace(turns, metadata={"serial": "SIM"})
+    (said,) = il.fit_turns(turns, accel=of_another_unit(accel)).calibration.verdict.reasons
+    assert said.startswith("accel: the record is of serial SIM-0001, the recordings are of serial SIM")
+    (said,) = il.fit_turns(turns, accel=of_another_unit(accel, 14e-3 * G, "SIM")).calibration.verdict.reasons
+    assert re.search(r"\|f\| is -14 mg off gravity in the turn at \d+.\d to \d+.\d s, more than its uncertainty", said)
+    for record in (of_another_unit(accel, bias, "SIM") for bias in (0.0, 2e-3 * G)):
+        assert il.fit_turns(turns, accel=record).calibration.verdict.state == "good"
 
 
 def test_intervals_hold_the_misalignments(accel):

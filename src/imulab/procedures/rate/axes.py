@@ -8,7 +8,7 @@ squares.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,12 +20,14 @@ from imulab.procedures.rate.dwells import Dwells, recorded_rate
 from imulab.procedures.rate.manifest import RateTest
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
-from imulab.units import from_si
+from imulab.units import STANDARD_GRAVITY, from_si
 from imulab.verdict import UNJUDGED, Note
 
 BY_ACCELEROMETERS = "that of the accelerometers"
 """The frame of a record's misalignments."""
 _FACE = np.cos(np.radians(30))
+_SURE, _POWER_CYCLE = 3.0, 3e-3 * STANDARD_GRAVITY
+"""Standard uncertainties, and m/s^2 that biases may move by until they are switched on again, of |f| about g."""
 _PIECE = 0.02  # s
 _BATCHES, _FEWEST = 32, 8
 """Parts of a sweep, and pieces in each."""
@@ -51,6 +53,8 @@ class TableAxes:
         What one standard uncertainty of each of p parameters of the accelerometers does to it, shape (p, m, 3).
     correlation
         Of these parameters, shape (p, p).
+    length_uncertainty
+        Standard uncertainty of the magnitude of a force by both, m/s^2, shape (m,).
     """
 
     direction: Array
@@ -59,6 +63,7 @@ class TableAxes:
     spread: Array
     changes: Array
     correlation: Array
+    length_uncertainty: Array
 
 
 def find_axes(
@@ -88,23 +93,22 @@ def find_axes(
 
     found = axes_by(accel)
     force = np.array([each[0] for each in found])
-    direction = force / np.linalg.norm(force, axis=1)[:, None]
+    length = np.linalg.norm(force, axis=1)
+    direction = force / length[:, None]
     for k, run in enumerate(test.runs):
         if run.sign * direction[k, run.axis] < _FACE:
             raise DataError(f"{test.place(k)}: by the accelerometers {_up(direction[k])} points up: is mounting wrong?")
 
-    def directions(record: Calibration) -> Array:
-        moved = np.array([each[0] for each in axes_by(record)])
-        return np.asarray(moved / np.linalg.norm(moved, axis=1)[:, None])
-
-    changes, correlation = moved_by_parameters(accel, directions)
+    shifts, correlation = moved_by_parameters(accel, lambda record: np.array([each[0] for each in axes_by(record)]))
+    spread = np.array([each[2] for each in found])
     return TableAxes(
         direction=direction,
         force=force,
         arm=np.array([each[1] for each in found]),
-        spread=np.array([each[2] for each in found]) / np.linalg.norm(force, axis=1),
-        changes=changes,
+        spread=spread / length,
+        changes=unit_vectors(force + shifts) - direction,
         correlation=correlation,
+        length_uncertainty=np.hypot(spread, length_uncertainty(force, shifts, correlation)),
     )
 
 
@@ -116,20 +120,31 @@ def corrected_means(record: Calibration, outputs: Array, unit: str) -> Array:
     return np.column_stack([corrected.si(name) for name in _TRIAD])
 
 
-def moved_by_parameters(accel: Calibration, directions: Callable[[Calibration], Array]) -> tuple[Array, Array]:
-    """Return what one standard uncertainty of each of p parameters does to m directions, and the correlation.
+def unit_vectors(vectors: Array) -> Array:
+    """Return vectors (.., 3) divided by their length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def length_uncertainty(force: Array, shifts: Array, correlation: Array) -> Array:
+    """Return the standard uncertainty of |f| of m forces (m, 3) by their record, from `moved_by_parameters`; (m,)."""
+    along = np.sum(shifts * unit_vectors(force), axis=2)
+    return np.sqrt(np.maximum(np.einsum("pm,pq,qm->m", along, correlation, along), 0.0))
+
+
+def moved_by_parameters(accel: Calibration, forces: Callable[[Calibration], Array]) -> tuple[Array, Array]:
+    """Return what one standard uncertainty of each of p parameters does to m forces, and the correlation.
 
     Shapes (p, m, 3) and (p, p).
     """
     names = [name for name in accel.covariance.names if not name.startswith(("gyro_", "mag_", "dip", "k"))]
     matrix = accel.covariance.block(names)
     sigma = np.sqrt(np.diag(matrix))
-    at = directions(accel)
+    at = forces(accel)
     changes = []
     for name, u in zip(names, sigma.tolist(), strict=True):
         one = accel.parameters[name]
         other = replace(accel, parameters={**accel.parameters, name: replace(one, value=one.value + u)})
-        changes.append(directions(other) - at)
+        changes.append(forces(other) - at)
     known = np.maximum(sigma, 1e-300)
     return np.array(changes).reshape(len(names), len(at), 3), matrix / np.outer(known, known)
 
@@ -231,8 +246,34 @@ def faces_said(test: RateTest, recordings: Sequence[Recording], dwells: Sequence
     return said
 
 
-def with_accelerometers(accel: Calibration, record: Calibration) -> Calibration:
-    """Return the accelerometers' record with the gyroscopes of a rate record; those it had are replaced."""
+def other_unit_said(record: Calibration, sensor: Mapping[str, str], option: str) -> list[str]:
+    """Say where the record that an option gave is of another unit than the recordings, by what both state."""
+    return [
+        f"{option}: the record is of {key} {mine}, the recordings are of {key} {its}: is it of this unit?"
+        for key in ("serial", "element")
+        if (mine := record.sensor.get(key)) and (its := sensor.get(key)) and mine != its
+    ]
+
+
+def length_said(accel: Calibration, force: Array, uncertainty: Array, places: Sequence[str]) -> list[str]:
+    """Say where |f| of m forces (m, 3), m/s^2, is not g, by more than the record and a power cycle explain."""
+    off = np.linalg.norm(force, axis=1) - float(accel.model["gravity"]["value"])
+    beyond = np.abs(off) - _SURE * uncertainty - _POWER_CYCLE
+    k = int(np.argmax(beyond))
+    if beyond[k] <= 0:
+        return []
+    return [
+        f"accel: under the record |f| is {from_si(float(off[k]), 'mg'):+.3g} mg off gravity in {places[k]}, more than "
+        f"its uncertainty ({from_si(float(uncertainty[k]), 'mg'):.2g} mg) and a power cycle explain: is it of this "
+        "unit, at this temperature?"
+    ]
+
+
+def with_accelerometers(accel: Calibration, record: Calibration, said: Sequence[str] = ()) -> Calibration:
+    """Return the accelerometers' record with the gyroscopes of a rate record; those it had are replaced.
+
+    What the recordings state of the unit is the unit's, and `said` is what was found of the accelerometers.
+    """
     own = {name: p for name, p in accel.parameters.items() if not name.startswith("gyro_")}
     names = [name for name in accel.covariance.names if not name.startswith("gyro_")]
     size = len(names) + len(record.covariance.names)
@@ -248,8 +289,9 @@ def with_accelerometers(accel: Calibration, record: Calibration) -> Calibration:
         model={**accel.model, **{name: record.model[name] for name in kept if name in record.model}},
         fit={**{name: part for name, part in accel.fit.items() if name != "gyro"}, "rate": dict(record.fit)},
         data={**{name: part for name, part in accel.data.items() if name != "gyro"}, "rate": dict(record.data)},
+        sensor={**accel.sensor, **record.sensor},
         sources=tuple(sources.values()),
-        warnings=(*(w for w in accel.warnings if not w.startswith("gyro")), *record.warnings),
+        warnings=(*(w for w in accel.warnings if not w.startswith("gyro")), *said, *record.warnings),
         verdict=UNJUDGED,
     )
 

@@ -19,8 +19,6 @@ GAINS = ("gyro_bias", "gyro_scale_factor", "gyro_misalignment", "gyro_g_sensitiv
 ORDERS = ("auto", "1", "2", "3", "4", "5")
 RATES = "0,10,50,100,200,300"
 FENCE = "0.5 deg"
-EARTH = 7.292115e-5
-"""Rate of the Earth, rad/s (WGS 84)."""
 
 
 def rates_of(text: str, option: str) -> tuple[float, ...]:

@@ -11,11 +11,12 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.earth import EARTH
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
 from imulab.gravity import checked_latitude
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
-from imulab.procedures.rate.axes import TableAxes, find_axes, with_accelerometers
-from imulab.procedures.rate.choices import AXES, EARTH, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
+from imulab.procedures.rate.axes import TableAxes, find_axes, length_said, other_unit_said, with_accelerometers
+from imulab.procedures.rate.choices import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
 from imulab.procedures.rate.linearity import Linearity, linearity_of
 from imulab.procedures.rate.manifest import RateTest, Run, load_test
@@ -184,8 +185,10 @@ def fit_test(
     record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
     if prior is not None:
         record = with_prior(record, prior_at(prior, recordings), str(record.model["frame"]))
-    if accel is not None:
-        record = with_accelerometers(accel, record)
+    if accel is not None and axes is not None:
+        places = [test.place(k) for k in range(len(test.runs))]
+        said = length_said(accel, axes.force, axes.length_uncertainty, places)
+        record = with_accelerometers(accel, record, [*other_unit_said(accel, record.sensor, "accel"), *said])
     return RateFit(record, tuple(dwells), linearity)
 
 

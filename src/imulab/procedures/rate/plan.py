@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from imulab.atomic_write import write_text
+from imulab.earth import EARTH
 from imulab.errors import ObservabilityError, OptionError, RecordError, listed
 from imulab.gravity import checked_latitude
 from imulab.procedures.inputs import Record, as_record
-from imulab.procedures.rate.choices import EARTH, FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
+from imulab.procedures.rate.choices import FENCE, MOUNTINGS, ORDERS, RATES, part_of_one, rates_of
 from imulab.procedures.rate.engineering import shown as as_read
 from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
 from imulab.procedures.rate.parameters import model_parameters

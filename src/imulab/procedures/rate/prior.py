@@ -14,16 +14,17 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import DataError, RecordError
-from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
+from imulab.procedures.rate.axes import BY_ACCELEROMETERS, other_unit_said, with_accelerometers
 from imulab.procedures.rate.choices import AXES, GAINS
 from imulab.procedures.rate.engineering import shown
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import compared
 from imulab.units import parse_unit
-from imulab.verdict import Note
+from imulab.verdict import UNJUDGED, Note
 
 _TINY = 1e-12
+_CHANCE = 0.01
 _APART = 5.0  # K, beyond which a thermal record counts temperatures as different
 
 
@@ -81,7 +82,12 @@ def with_prior(record: Calibration, prior: Calibration, frame: str | None) -> Ca
         },
         fit={**record.fit, "prior": _beside(prior, record, common, comparison.probability)},
         sources=tuple({source.file: source for source in (*prior.sources, *record.sources)}.values()),
-        warnings=(*record.warnings, _said(comparison.probability, comparison.changes)),
+        warnings=(
+            *record.warnings,
+            *other_unit_said(prior, record.sensor, "prior"),
+            _said(comparison.probability, comparison.changes),
+        ),
+        verdict=UNJUDGED,
     )
     return with_accelerometers(prior, found) if frame is None and "bias_x" in prior.parameters else found
 
@@ -197,6 +203,11 @@ def _beside(prior: Calibration, record: Calibration, names: list[str], probabili
 def _said(probability: float | None, changes: Any) -> str:
     chance = "" if probability is None else f" (probability {probability:.2g})"
     differing = [change for change in changes if change.significant]
+    if not differing and probability is not None and probability < _CHANCE:
+        return (
+            f"the prior does not agree{chance}: all parameters together, no one parameter by itself; both are one fit "
+            "all the same (see show A B)"
+        )
     if not differing:
         return Note(f"the prior agrees{chance}; both are one fit, but for the biases, which are new")
     worst = max(differing, key=lambda change: abs(change.deviations or 0.0))

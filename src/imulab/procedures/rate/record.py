@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from imulab.earth import EARTH
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, TableAxes, faces_said, lean_said
-from imulab.procedures.rate.choices import AXES, EARTH
+from imulab.procedures.rate.choices import AXES
 from imulab.procedures.rate.dwells import Dwells
 from imulab.procedures.rate.linearity import Linearity
 from imulab.procedures.rate.manifest import RateTest

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from imulab.earth import EARTH
 from imulab.errors import OptionError, readable
 from imulab.gravity import checked_latitude
-from imulab.procedures.rate.choices import AXES, EARTH, RATES, rates_of
+from imulab.procedures.rate.choices import AXES, RATES, rates_of
 from imulab.procedures.rate.manifest import RateTest, Run, manifest_text
 from imulab.quantities import fraction, in_si, whole
 from imulab.recording import Array, Recording

@@ -18,8 +18,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.earth import EARTH
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.procedures.rate.choices import EARTH
 from imulab.recording import Array
 
 _CHANCE = 0.01

@@ -15,12 +15,20 @@ import numpy as np
 
 from imulab.errors import DataError, ObservabilityError, RecordError
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.procedures.rate.axes import BY_ACCELEROMETERS, corrected_means, moved_by_parameters
+from imulab.procedures.rate.axes import (
+    BY_ACCELEROMETERS,
+    corrected_means,
+    length_said,
+    length_uncertainty,
+    moved_by_parameters,
+    unit_vectors,
+)
 from imulab.procedures.rate.choices import AXES
 from imulab.procedures.rate.turnrests import Motions
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si
+from imulab.verdict import UNJUDGED
 
 if TYPE_CHECKING:
     from imulab.procedures.rate.turns import AxisTurns
@@ -73,11 +81,18 @@ def with_axes(
     force, spread = np.array([mean for mean, _ in seen]), np.array([u for _, u in seen])
     unit = recording.triad_unit("accel")
 
-    def about(by: Calibration) -> Array:
-        return _axes(corrected_means(by, force, unit), turned, motions, recording.name)
+    def corrected(by: Calibration) -> Array:
+        return corrected_means(by, force, unit)
 
-    direction = about(accel)
-    changes, correlation = moved_by_parameters(accel, about)
+    seen_force = corrected(accel)
+    direction = _axes(seen_force, turned, motions, recording.name)
+    shifts, correlation = moved_by_parameters(accel, corrected)
+    sign = np.sign(np.sum(direction * seen_force, axis=1))[:, None]
+    changes = sign * unit_vectors(seen_force + shifts) - direction
+    of_length = np.linalg.norm(seen_force, axis=1) * np.linalg.norm(spread, axis=1)
+    of_length = np.hypot(of_length, length_uncertainty(seen_force, shifts, correlation))
+    places = [f"the turn at {motions.start[k]:.1f} to {motions.stop[k]:.1f} s" for _, k in turned]
+    said = length_said(accel, seen_force, of_length, places)
     scale = np.array([found[axis].scale for axis in AXES])
     u_scale = np.array([found[axis].scale_uncertainty for axis in AXES])
     across = np.array([motions.angle[k] for _, k in turned]) / _TURN
@@ -99,9 +114,8 @@ def with_axes(
     for j, own in enumerate(groups):
         left = across[own] - count[own][:, None] * (direction[own] @ matrix.T)
         u_crossed[:, j] = _scattered(left, count[own], noise[own])
-    return _extended(
-        record, matrix, _covariance(gains, direction, scale, crossed, u_scale, u_crossed, changes, correlation)
-    )
+    covariance = _covariance(gains, direction, scale, crossed, u_scale, u_crossed, changes, correlation)
+    return replace(_extended(record, matrix, covariance), warnings=(*record.warnings, *said), verdict=UNJUDGED)
 
 
 def _upright(outputs: Array, motions: Motions, k: int, axis: int, count: float) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import numpy as np
 from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
-from imulab.procedures.rate.axes import BY_ACCELEROMETERS, with_accelerometers
+from imulab.procedures.rate.axes import BY_ACCELEROMETERS, other_unit_said, with_accelerometers
 from imulab.procedures.rate.choices import AXES, FENCE, gyros_of, part_of_one
 from imulab.procedures.rate.prior import prior_at, with_prior
 from imulab.procedures.rate.turnaxes import check_accel, with_axes
@@ -181,7 +181,7 @@ def fit_turns(
         frame = None if held is None else BY_ACCELEROMETERS
         record = with_prior(record, prior_at(as_record(prior, "fit_turns: prior"), [recording]), frame)
     if held is not None:
-        record = with_accelerometers(held, record)
+        record = with_accelerometers(held, record, other_unit_said(held, record.sensor, "accel"))
     return TurnsFit(record, found)
 
 
