@@ -42,7 +42,7 @@ def sensitivities(record):
 
 @pytest.mark.parametrize("latitude", PLACES)
 def test_over_temperature_the_g_sensitivity_is_free_of_the_vertical_part(latitude):
-    """Without the latitude it is there in full, since it follows f exactly, whatever the attitudes."""
+    """Without the latitude it is there in full, since it follows f exactly, whatever the attitudes, and u says so."""
     _, gyros, given = recordings(latitude)
     plain, known = (
         il.fit_thermal(given, gravity=G, with_="gyro", gyro_turn_on_scatter=0.0, latitude=place).calibration
@@ -55,11 +55,30 @@ def test_over_temperature_the_g_sensitivity_is_free_of_the_vertical_part(latitud
     assert plain.fit["gyro"]["latitude"] is None
     assert known.fit["gyro"]["latitude"] == pytest.approx(np.radians(latitude))
     assert any("vertical part" in each for each in known.warnings)
-    # Along up nothing of the Earth's rate is unknown, but for axes askew: such gyroscopes gain a lot by it.
+    # Without the latitude the three have one unknown in common, whose variance is a third of the Earth's rate squared.
+    covariance = plain.cov(*(f"gyro_g_sensitivity_{a}{a}" for a in "xyz"))
+    assert np.sqrt(covariance) == pytest.approx(np.full((3, 3), EARTH / np.sqrt(3) / G), rel=0.05)
+    assert (np.abs(without) < 1.96 * np.sqrt(np.diag(covariance))).all()
+    # Along up nothing else of the Earth's rate is unknown, but for axes askew: such gyroscopes gain a lot by it.
     places = np.linspace(-20, 60, 9)
-    (values, u), before = gyro_predicted(known, places), gyro_predicted(plain, places)[1]
-    assert (u < 0.15 * before).all()
-    assert (np.abs(values - gyros.bias_at(places).T) < 3 * u).all()
+    for record in (plain, known):
+        values, u = gyro_predicted(record, places)
+        assert u.max() < 0.03 * EARTH
+        assert (np.abs(values - gyros.bias_at(places).T) < 3 * u).all()
+
+
+@pytest.mark.parametrize("latitude", [*PLACES, 90.0])
+def test_the_vertical_part_is_not_taken_for_a_g_sensitivity(latitude):
+    """Gyroscopes without any: quiet ones show the vertical part as clearly as a sensitivity of 8 to 15 deg/h/g."""
+    rng = np.random.default_rng(8)
+    gyros = reference.Gyros(rng, sensitivity=0.0)
+    _, _, made = reference.chamber(rng, AT, 10, gyros, noise=1e-6, latitude=np.radians(latitude))
+    given = [il.Recording(columns=each, units=UNITS, name=f"soak_{k}.csv") for k, each in enumerate(made)]
+    record = il.fit_thermal(given, gravity=G, with_="gyro", gyro_turn_on_scatter=0.0).calibration
+    assert record.model["gyro"]["g_sensitivity"] is False
+    places = np.linspace(-20, 60, 9)
+    values, u = gyro_predicted(record, places)
+    assert (np.abs(values - gyros.bias_at(places).T) < 3.5 * u).all()
 
 
 def test_at_a_pole_nothing_is_left_unknown():
@@ -82,10 +101,24 @@ def test_turns_at_one_temperature_too(latitude):
     assert np.allclose(sensitivities(known) - sensitivities(plain), -vertical * gyros.matrix, atol=1e-3 * abs(vertical))
     off = [np.abs(np.diag(sensitivities(each) - gyros.sensitivity)).mean() for each in (plain, known)]
     assert off[1] < 0.3 * off[0]
+    common = plain.cov(*(f"gyro_g_sensitivity_{a}{a}" for a in "xyz")) * G**2
+    statistical = known.cov(*(f"gyro_g_sensitivity_{a}{a}" for a in "xyz")) * G**2
+    assert common - statistical == pytest.approx(np.full((3, 3), EARTH**2 / 3), rel=0.02)
+    assert (np.abs(np.diag(sensitivities(plain) - gyros.sensitivity)) * G < 1.96 * np.sqrt(np.diag(common))).all()
     assert known.fit["gyro"]["latitude"] == pytest.approx(np.radians(latitude))
     joint = il.fit_tumble(given, order=1, gravity=G, latitude=f"{latitude} deg", with_="gyro").calibration
     assert joint.fit["gyro"]["latitude"] == pytest.approx(np.radians(latitude))
     assert joint.model["gravity"]["value"] == G
+
+
+@pytest.mark.parametrize("latitude", [*PLACES, 90.0])
+def test_at_one_temperature_the_vertical_part_is_not_taken_for_a_g_sensitivity_either(latitude):
+    rng = np.random.default_rng(8)
+    gyros = reference.Gyros(rng, sensitivity=0.0)
+    _, _, (columns,) = reference.chamber(rng, (25.0034,), 24, gyros, noise=1e-5, latitude=np.radians(latitude))
+    given = il.Recording(columns=columns, units=UNITS, name="t.csv")
+    accel = il.fit_tumble(given, order=1, gravity=G).calibration
+    assert il.fit_gyro(accel, given).calibration.fit["gyro"]["g_sensitivity"] == "none"
 
 
 def test_without_a_g_sensitivity_the_vertical_part_is_no_scatter():

@@ -363,6 +363,19 @@ def test_intervals_of_the_biases_hold_as_many_times_as_they_say(temperatures, co
     assert np.sqrt(np.mean(np.square(errors))) < worst
 
 
+def test_a_degree_stays_where_no_temperature_can_be_left_out():
+    """One tumble, in the middle, tells the g-sensitivity: without it the single holds at both ends tell nothing."""
+    rng = np.random.default_rng(2)
+    gyros = reference.Gyros(rng)
+    gyros.bias[1:] = 0.0
+    given = at_rest(rng, gyros, (-20, 20, 60), 12, 0.0, 10 * HOURLY)
+    first = given.index % 12 == 0
+    few = fit_gyroscopes(given.part(first | (given.recording == 1)), -20.3, 60.3, "auto", 0.0, "unit")
+    assert few.sensitivity
+    assert few.left_out == ()
+    assert few.solution.laws.degrees[0] == 1
+
+
 def test_what_biases_differ_by_between_warming_and_cooling_is_found_and_taken_out():
     rng = np.random.default_rng(8)
     gyros = reference.Gyros(rng)

@@ -241,7 +241,7 @@ def _missed(
     ]
     if not added:
         return None
-    probability = _wald(higher, np.eye(higher.laws.size)[added])
+    probability = wald(higher, np.eye(higher.laws.size)[added])
     return (higher.laws.degrees, probability) if probability < _INSIGNIFICANT else None
 
 
@@ -271,13 +271,12 @@ def _descended(problem: Problem, highest: Laws, cluster: NDArray[np.int64], tau:
     solution, view = _highest(problem, highest, tau, name)
     given = splits(solution, cluster)
     held = left_out(given, np.ones(solution.laws.size, dtype=np.bool_))
-    steps = [Step(solution.laws.degrees, _rms(held), None, knots=len(highest.knots))]
+    steps = [Step(solution.laws.degrees, rms_of(held), None, knots=len(highest.knots))]
     while True:
         free = [group for group in range(3) if solution.laws.degrees[group] and not (group == 0 and highest.knots)]
-        down = [_step(solution, group, given) for group in free]
+        down = [step_down(solution, group, given) for group in free]
         steps += down
-        before = _rms(held)
-        fine = [step for step in down if (step.probability or 0) > _INSIGNIFICANT and _no_worse(step.left_out, before)]
+        fine = [step for step in down if may_be_taken(step, rms_of(held))]
         if not fine:
             return Found(solution, steps, held, view)
         best = max(fine, key=lambda step: step.probability or 0.0)
@@ -313,13 +312,13 @@ def bends(solution: Solution, tau: float | None) -> bool:
     weights = np.zeros((3 * (count - 4), 3 * count))
     for axis, part in enumerate(laws.parts[:3]):
         weights[axis * (count - 4) : (axis + 1) * (count - 4), part] = beside
-    return _wald(solution, weights) < _INSIGNIFICANT
+    return wald(solution, weights) < _INSIGNIFICANT
 
 
 def predicts(bent: Sequence[LeftOut], straight: Sequence[LeftOut]) -> bool:
     """Return whether a spline predicts the temperatures that both could leave out well enough to be taken."""
     both = {each.temperature for each in bent} & {each.temperature for each in straight}
-    errors = [_rms([each for each in given if each.temperature in both]) for given in (bent, straight)]
+    errors = [rms_of([each for each in given if each.temperature in both]) for given in (bent, straight)]
     return errors[0] is not None and errors[1] is not None and errors[0] <= _HANDICAP * errors[1]
 
 
@@ -338,18 +337,19 @@ def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> t
     return solution, view
 
 
-def _step(solution: Solution, group: int, given: Sequence[Split]) -> Step:
+def step_down(solution: Solution, group: int, given: Sequence[Split]) -> Step:
     """Return what is lost where the highest power of one kind is left out: Wald's test, and the prediction."""
     laws, degrees = solution.laws, list(solution.laws.degrees)
     gone = np.array([part.stop - 1 for part in laws.parts[3 * group : 3 * group + 3]])
-    kept = np.ones(laws.size, dtype=np.bool_)
+    size = len(solution.coefficients)
+    kept = np.ones(size, dtype=np.bool_)
     kept[gone] = False
     degrees[group] -= 1
     lower = (degrees[0], degrees[1], degrees[2])
-    return Step(lower, _rms(left_out(given, kept)), _wald(solution, np.eye(laws.size)[gone]), knots=len(laws.knots))
+    return Step(lower, rms_of(left_out(given, kept)), wald(solution, np.eye(size)[gone]), knots=len(laws.knots))
 
 
-def _wald(solution: Solution, weights: Array) -> float:
+def wald(solution: Solution, weights: Array) -> float:
     """Return the probability of such ``weights . coefficients``, (k, first ones), if the true ones were 0."""
     size = weights.shape[1]
     value = weights @ solution.coefficients[:size]
@@ -365,14 +365,19 @@ def tail(square: float, count: int, freedom: float) -> float:
     return float(fdtrc(count, freedom, square) if np.isfinite(freedom) else chdtrc(count, count * square))
 
 
-def _rms(found: Sequence[LeftOut]) -> float | None:
+def rms_of(found: Sequence[LeftOut]) -> float | None:
+    """Return the rms over all holds of the temperatures left out; None where there are none."""
     total = sum(each.holds for each in found)
     return float(np.sqrt(sum(each.holds * each.rms**2 for each in found) / total)) if total else None
 
 
-def _no_worse(error: float | None, before: float | None) -> bool:
-    """Return whether temperatures left out are known to be predicted no worse: an F-test alone may lack all power."""
-    return error is not None and before is not None and error <= _NO_WORSE * before
+def may_be_taken(step: Step, before: float | None) -> bool:
+    """Return whether a step down is insignificant, and temperatures left out are known to be predicted no worse.
+
+    `before` is their rms without the step: an F-test alone may lack all power.
+    """
+    told = step.left_out is not None and before is not None and step.left_out <= _NO_WORSE * before
+    return told and (step.probability or 0) > _INSIGNIFICANT
 
 
 def _at(found: Sequence[LeftOut], problem: Problem, cluster: NDArray[np.int64]) -> list[LeftOut]:

@@ -2,9 +2,8 @@
 
     M / S = b(T) + G f + W + offset of the power cycle,   b(T) as in `imulab.procedures.thermal.model`
 
-W is the Earth's rate, of which only the size is known: in each attitude it is taken as random, its three parts as
-independent. Where the latitude is known, so is its vertical part, and the level part alone is random. Errors of the
-temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise are those of
+W is the Earth's rate: what is known of it, and what counts as random, is in `imulab.procedures.thermal.gyroearth`.
+Errors of the temperature, offsets between power cycles (tau) and what holds scatter by beyond their noise are those of
 `imulab.procedures.thermal.solve`. The g-sensitivity G, the same at all temperatures, is fitted where it is significant
 at 1 % (F).
 """
@@ -28,28 +27,29 @@ from imulab.procedures.thermal.degrees import (
     clusters_of,
     knots_at,
     left_out,
+    may_be_taken,
     predicts,
+    rms_of,
     splits,
-    tail,
+    step_down,
+    wald,
 )
+from imulab.procedures.thermal.gyroearth import earth_at_rest
 from imulab.procedures.thermal.gyroholds import RatesAtRest
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import ALL, Drift, tested, untold
 from imulab.procedures.thermal.model import Laws
-from imulab.procedures.thermal.rows import Rows, whitener
+from imulab.procedures.thermal.rows import Rows, one_hot, whitener
 from imulab.procedures.thermal.solve import Scatter, Solution, between, concluded, excess_of
 from imulab.recording import Array
 
 _PASSES = 4
 _SIGNIFICANT = 0.01
-_NO_WORSE = 1.0
 _FAR = 8.0
 """Standard deviations beyond which a hold differs from the others of its recording by a turn."""
 _TELL = 4
 """Holds of a recording that tell which of them differs."""
 _RANK = 1e-7
-_ASKEW = 0.03
-"""Part of the Earth's rate that is sensed across itself: gyroscopes are askew, or their scale factors off, by that."""
 
 
 @dataclass(frozen=True)
@@ -201,8 +201,7 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
     whole = solve(held, laws, tau, sensitivity=True)
     probability = None
     if whole is not None:
-        gone = np.arange(len(whole.coefficients) - 9, len(whole.coefficients))
-        probability = wald(whole, gone)
+        probability = wald(whole, np.eye(len(whole.coefficients))[-9:])
         if probability < _SIGNIFICANT:
             return _Solved(whole, True, probability)
     plain = solve(held, laws, tau, sensitivity=False)
@@ -211,33 +210,12 @@ def _solved(held: RatesAtRest, laws: Laws, tau: float | None) -> _Solved:
     return _Solved(plain, False, probability)
 
 
-def wald(solution: Solution, which: NDArray[np.intp]) -> float:
-    """Return the probability of coefficients as large as these if they were zero."""
-    value = solution.coefficients[which]
-    square = float(value @ np.linalg.solve(solution.covariance[np.ix_(which, which)], value)) / len(value)
-    freedom = min(solution.degrees_of_freedom(row) for row in np.eye(len(solution.coefficients))[which])
-    return tail(square, len(value), freedom)
-
-
 def _lower(solution: Solution, cluster: NDArray[np.int64]) -> Laws | None:
-    """Return laws of a degree less, or None where that step is significant or temperatures left out are told worse."""
-    laws, degree = solution.laws, solution.laws.degrees[0]
-    top = np.arange(3) * (degree + 1) + degree
-    kept = np.ones(len(solution.coefficients), dtype=np.bool_)
-    if not wald(solution, top) > _SIGNIFICANT:
-        return None
+    """Return laws of a degree less, or None where that step may not be taken."""
     given = splits(solution, cluster)
-    before = _rms(left_out(given, kept))
-    kept[top] = False
-    after = _rms(left_out(given, kept))
-    if before is not None and after is not None and after > _NO_WORSE * before:
-        return None
-    return replace(laws, degrees=(degree - 1, 0, 0))
-
-
-def _rms(found: list[LeftOut]) -> float | None:
-    total = sum(each.holds for each in found)
-    return float(np.sqrt(sum(each.holds * each.rms**2 for each in found) / total)) if total else None
+    before = rms_of(left_out(given, np.ones(len(solution.coefficients), dtype=np.bool_)))
+    step = step_down(solution, 0, given)
+    return replace(solution.laws, degrees=step.degrees) if may_be_taken(step, before) else None
 
 
 def _drift(held: RatesAtRest, solution: Solution, sensitivity: bool, tau: float | None) -> Drift:
@@ -300,7 +278,7 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
     noise[range(n), :, range(n), :] = held.covariance
     number = np.where(held.shared, held.recording, int(held.recording.max()) + 1 + np.arange(n))
     heat = _spread(number) * (slope * held.step[:, None]).ravel()[:, None]
-    known, earth = _earth(held)
+    known, earth = earth_at_rest(held.force, held.attitude, held.earth)
     return Rows(
         residual=jacobian @ coefficients + known - held.mean.ravel(),
         jacobian=jacobian,
@@ -313,32 +291,14 @@ def rows_of(held: RatesAtRest, laws: Laws, coefficients: Array, free: tuple[int,
     )
 
 
-def _earth(held: RatesAtRest) -> tuple[Array, Array]:
-    """Return what is known of the Earth's rate, (3 n,), and columns of unit variance for what is not, (3 n, 3 k)."""
-    if held.earth is None:
-        return np.zeros(3 * len(held)), EARTH / np.sqrt(3) * _by_axis(held.attitude)
-    up = held.force / np.linalg.norm(held.force, axis=1, keepdims=True)
-    along = up[:, :, None] * up[:, None, :]
-    unknown = held.earth.level / np.sqrt(2) * (np.eye(3) - along) + _ASKEW * EARTH * along
-    columns = np.einsum("nk,nij->nikj", _one_hot(held.attitude), unknown)
-    return (held.earth.vertical * up).ravel(), columns.reshape(3 * len(held), -1)
-
-
-def _one_hot(number: NDArray[np.int64]) -> Array:
-    which, index = np.unique(number, return_inverse=True)
-    found = np.zeros((len(number), len(which)))
-    found[np.arange(len(number)), index] = 1.0
-    return found
-
-
 def _by_axis(number: NDArray[np.int64]) -> Array:
     """Return a column for each axis of each number, shape (3 n, 3 k)."""
-    found: Array = np.asarray(np.kron(_one_hot(number), np.eye(3)), dtype=np.float64)
+    found: Array = np.asarray(np.kron(one_hot(number), np.eye(3)), dtype=np.float64)
     return found
 
 
 def _spread(number: NDArray[np.int64]) -> Array:
-    return np.repeat(_one_hot(number), 3, axis=0)
+    return np.repeat(one_hot(number), 3, axis=0)
 
 
 def without_turns(held: RatesAtRest, laws: Laws) -> tuple[RatesAtRest, NDArray[np.int64]]:

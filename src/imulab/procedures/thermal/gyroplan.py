@@ -1,7 +1,8 @@
 """What a schedule over temperature gives of the gyroscopes: rates at rest, and the turns that scale factors take.
 
-Each axis by itself, as `imulab.procedures.thermal.gyro` fits it: the law of its bias, its g-sensitivity and an offset
-of each power cycle, from means at rest whose noise is that of the angle random walk and of the Earth's rate.
+As `imulab.procedures.thermal.gyro` fits them: the laws of the biases, the g-sensitivities and offsets of each power
+cycle, from means at rest whose noise is that of the angle random walk and of the Earth's rate, whose vertical part the
+g-sensitivities take up.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.earth import EARTH
 from imulab.errors import OptionError
 from imulab.procedures.thermal.choices import FOLLOWED, TURNED
+from imulab.procedures.thermal.gyroearth import VERTICAL, new_in_each
 from imulab.procedures.thermal.model import Laws
 from imulab.quantities import RANDOM_WALK, in_si, of_units
 from imulab.recording import Array
@@ -127,22 +128,26 @@ def plan_gyroscopes(
     walk, tau
         As of `noise_and_scatter`.
     """
-    size = laws.degrees[0] + 1
-    variance = walk**2 / times[1] + EARTH**2 / 3
-    information = np.zeros((size + 3, size + 3))
+    size, walked = laws.degrees[0] + 1, walk**2 / times[1] * np.eye(3)
+    information = np.zeros((3 * (size + 3), 3 * (size + 3)))
     for temperature, up in soaks:
         law = np.tile(laws.design(np.array([temperature]))[0, 0, :size], (len(up), 1))
-        rows = np.hstack([law, up])
-        common = rows.sum(axis=0)
-        share = tau**2 / (variance + len(up) * tau**2)
-        information += (rows.T @ rows - share * np.outer(common, common)) / variance
-    covariance = np.linalg.inv(information)
+        rows = np.einsum("nc,ij->nijc", np.hstack([law, up]), np.eye(3)).reshape(len(up), 3, -1)
+        own = new_in_each(up, None)
+        weight = np.linalg.inv(walked + own @ np.swapaxes(own, 1, 2))
+        common = np.einsum("nij,njc->ic", weight, rows)  # by an offset of the power cycle
+        share = tau**2 * np.linalg.inv(np.eye(3) + tau**2 * weight.sum(axis=0))
+        information += np.einsum("nia,nij,njb->ab", rows, weight, rows) - common.T @ share @ common
+    blocks = np.linalg.inv(information).reshape(3, size + 3, 3, size + 3)
+    covariance = np.einsum("iaib->ab", blocks) / 3
     functions = laws.design(places)[:, 0, :size]
     at_rest = np.einsum("ma,ab,mb->m", functions, covariance[:size, :size], functions)
+    # Each of the three g-sensitivities along its own axis holds the vertical part of the Earth's rate.
+    felt = (np.trace(covariance[size:, size:]) + VERTICAL**2) / 3
     counts = [len(up) for _, up in soaks]
     enough = [(temperature, count) for (temperature, _), count in zip(soaks, counts, strict=True) if count >= TURNED]
     return GyroPlan(
-        deviation=np.sqrt(at_rest + np.trace(covariance[size:, size:]) / 3),
+        deviation=np.sqrt(at_rest + felt),
         noise=walk,
         turn_on_scatter=tau,
         turns=sum(count - 1 for _, count in enough),

@@ -144,10 +144,15 @@ def _per_recording(felt: Array, recording: NDArray[np.int64], count: int) -> Arr
 def _errors(heat: Array, owner: NDArray[np.int64], problem: Problem, count: int) -> Array:
     """Loadings of the temperature's errors: one for a recording, or for each hold of one that drifts."""
     number = np.where(problem.shared, problem.recording, count + np.arange(len(problem.recording)))[owner]
+    return one_hot(number) * heat[:, None]
+
+
+def one_hot(number: NDArray[np.int64]) -> Array:
+    """Return a column for each of the numbers (n,), 1 where it stands and 0 elsewhere, shape (n, k)."""
     which, index = np.unique(number, return_inverse=True)
-    loadings = np.zeros((len(heat), len(which)))
-    loadings[np.arange(len(heat)), index] = heat
-    return loadings
+    found = np.zeros((len(number), len(which)))
+    found[np.arange(len(number)), index] = 1.0
+    return found
 
 
 def _with_prior(rows: Rows, known: tuple[float, Array, Array], laws: Laws, coefficients: Array, step: float) -> Rows:

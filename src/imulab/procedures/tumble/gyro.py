@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.columns import triad
-from imulab.earth import EarthRate
+from imulab.earth import EARTH, EarthRate
 from imulab.errors import DataError, ObservabilityError, OptionError, RecordError, SegmentError, listed
 from imulab.estimation.least_squares import Observability, observability
 from imulab.estimation.rows import LeftOut, leave_out
@@ -61,8 +61,8 @@ class GyroFit:
         G, rad/s per m/s^2; None where it was not fitted.
     covariance
         Of scale factors, the six misalignments and the biases, shape (12, 12).
-    sensitivity_uncertainty
-        Standard uncertainties of the sensitivities.
+    sensitivity_covariance
+        Of the sensitivities row by row, shape (9, 9).
     residuals
         Angle by which each turn misses, rad, shape (m,).
     start, stop
@@ -90,7 +90,7 @@ class GyroFit:
     bias: Array
     sensitivity: Array | None
     covariance: Array
-    sensitivity_uncertainty: Array | None
+    sensitivity_covariance: Array | None
     residuals: Array
     start: Array
     stop: Array
@@ -173,16 +173,31 @@ def fit_gyro(
     linearity = test_linearity(segments, found.scale, found.theta, jacobian, residual, shared, variance)
     if linearity is not None:
         notes += linearity.notes()
-    return replace(_result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes)), earth=earth)
+    return _on_earth(_result(found, matrix, miss, unit, fit_bias, seen, known, linearity, tuple(notes)), case, earth)
+
+
+def _on_earth(fit: GyroFit, case: Case, earth: EarthRate | None) -> GyroFit:
+    """Return the fit with the Earth's rate; where nobody knows its vertical part v, T v / g is in all sensitivities.
+
+    The variance of v is EARTH^2 / 3 then, the mean over all directions of the Earth's axis.
+    """
+    if earth is not None or fit.sensitivity_covariance is None:
+        return replace(fit, earth=earth)
+    gravity = np.linalg.norm(case.force, axis=1).mean()
+    common = EARTH / np.sqrt(3) / gravity * fit.misalignment.ravel()
+    return replace(fit, sensitivity_covariance=fit.sensitivity_covariance + np.outer(common, common))
 
 
 def _begun(case: Case, time: Array, sensitivity: str, earth: EarthRate | None) -> tuple[Case, Solved]:
-    """Return the case, with what is known of the Earth's rate, as output, and the solution."""
+    """Return the case, with what is known of the Earth's rate, as output, or how large it may be, and the solution."""
     found = solve_turns(case, time, sensitivity)
-    if earth is None:
-        return case, found
     up = case.force / np.linalg.norm(case.force, axis=1, keepdims=True)
-    case = replace(case, earth=found.output_of(earth.vertical * up))
+    if earth is not None:
+        case = replace(case, earth=found.output_of(earth.vertical * up))
+    elif sensitivity == "auto" and found.rest.slope is not None:
+        case = replace(case, vertical=found.output_of(EARTH * up))
+    else:
+        return case, found
     return case, solve_turns(case, time, sensitivity)
 
 
@@ -308,8 +323,10 @@ def _result(
         bias=bias,
         sensitivity=None if rest.slope is None else rest.slope / scale_factor[:, None],
         covariance=derivative @ everything @ derivative.T + np.outer(common, common),
-        sensitivity_uncertainty=(
-            None if rest.slope_uncertainty is None else rest.slope_uncertainty / scale_factor[:, None]
+        sensitivity_covariance=(
+            None
+            if rest.slope_uncertainty is None
+            else np.diag((rest.slope_uncertainty / scale_factor[:, None]).ravel() ** 2)
         ),
         residuals=miss,
         start=found.segments.start,

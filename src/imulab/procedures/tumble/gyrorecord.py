@@ -117,11 +117,10 @@ def _parameters(fit: GyroFit) -> dict[str, Parameter]:
         )
         for k, p in enumerate(PAIRS)
     }
-    if fit.sensitivity is not None and fit.sensitivity_uncertainty is not None:
+    if fit.sensitivity is not None and fit.sensitivity_covariance is not None:
+        own = np.sqrt(np.diag(fit.sensitivity_covariance)).reshape(3, 3)
         found |= {
-            f"gyro_g_sensitivity_{a}{b}": Parameter(
-                float(fit.sensitivity[i, j]), float(fit.sensitivity_uncertainty[i, j]), "rad/s/(m/s^2)"
-            )
+            f"gyro_g_sensitivity_{a}{b}": Parameter(float(fit.sensitivity[i, j]), float(own[i, j]), "rad/s/(m/s^2)")
             for i, a in enumerate(_AXES)
             for j, b in enumerate(_AXES)
         }
@@ -134,10 +133,10 @@ def _covariance_names(fit: GyroFit) -> list[str]:
 
 
 def _covariance(fit: GyroFit) -> Array:
-    """Covariance of all gyroscope parameters; the sensitivities, from rest, are taken as independent."""
-    if fit.sensitivity_uncertainty is None:
+    """Covariance of all gyroscope parameters; the sensitivities, from rest, are taken as independent of the others."""
+    if fit.sensitivity_covariance is None:
         return fit.covariance
-    return _diagonal_blocks(fit.covariance, np.diag(fit.sensitivity_uncertainty.ravel() ** 2))
+    return _diagonal_blocks(fit.covariance, fit.sensitivity_covariance)
 
 
 def _diagonal_blocks(first: Array, second: Array) -> Array:

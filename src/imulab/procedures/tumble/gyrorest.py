@@ -125,11 +125,19 @@ def beyond_range(output: Array) -> NDArray[np.bool_]:
     return clipped
 
 
-def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str, earth: Array | float = 0.0) -> Rest:
+def at_rest(
+    holds: Holds,
+    output: Array,
+    force: Array,
+    sensitivity: str,
+    earth: Array | float = 0.0,
+    vertical: Array | None = None,
+) -> Rest:
     """Zero and g-sensitivity from the mean still outputs of each quiet hold, least squares over the holds.
 
-    `earth` is what is known of the Earth's rate in each, as output, (n, 3), which is taken off. Quiet is a hold that
-    is still for three quarters of its samples; where fewer than half are, that half.
+    `earth` is what is known of the Earth's rate in each, as output, (n, 3), which is taken off. Where that is nothing,
+    `vertical` is the output by all of it along up: what a part of that explains shows no g-sensitivity. Quiet is a hold
+    that is still for three quarters of its samples; where fewer than half are, that half.
     """
     edges = np.column_stack([holds.start, holds.stop]).ravel()
     kept = np.where(holds.still[:, None], np.column_stack([output, np.ones(len(output))]), 0.0)
@@ -143,9 +151,12 @@ def at_rest(holds: Holds, output: Array, force: Array, sensitivity: str, earth: 
     flat = mean - mean.mean(axis=0)
     # A zero that drifts goes with some direction of f by chance: held against, and found beside, a slope in time.
     drift, whole = np.column_stack([np.ones(n), when]), np.column_stack([np.ones(n), force, when])
-    left = _residuals(whole, mean)
-    costs = float((_residuals(drift, mean) ** 2).sum()), float((left**2).sum())
-    shown = n > 7 and f_test(costs[0], 6, costs[1], 15, 3 * n) < _SIGNIFICANT
+    left, plain, known = _residuals(whole, mean), _residuals(drift, mean), 6
+    if vertical is not None:
+        along, known = _residuals(drift, vertical[quiet]), 7
+        part = float((along * plain).sum()) / max(float((along**2).sum()), 1e-300)
+        plain = plain - np.clip(part, -1, 1) * along
+    shown = n > 7 and f_test(float((plain**2).sum()), known, float((left**2).sum()), 15, 3 * n) < _SIGNIFICANT
     if sensitivity == "no" or (sensitivity == "auto" and not shown):
         scatter: Array = np.sqrt((flat**2).sum(axis=0) / max(n - 1, 1) / n)
         return Rest(mean.mean(axis=0), None, scatter, None)

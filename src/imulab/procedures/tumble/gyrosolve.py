@@ -41,6 +41,8 @@ class Case:
     """Attitudes that the accelerometers' record set aside, shape (n,)."""
     earth: Array | float = 0.0
     """Output by what is known of the Earth's rate in each attitude, shape (n, 3)."""
+    vertical: Array | None = None
+    """Output by the Earth's whole rate along up in each, shape (n, 3), where nobody knows which part of it is there."""
 
     def force_at(self, time: Array) -> Array:
         """Specific force at the gyroscopes' sample times, m/s^2, shape (n, 3)."""
@@ -93,7 +95,7 @@ def solve_turns(case: Case, time: Array, sensitivity: str) -> Solved:
     holds = find_holds(case.attitudes, time, case.output, case.name)
 
     def solved(wanted: str) -> Solved:
-        rest = at_rest(holds, case.output, case.force, wanted, case.earth)
+        rest = at_rest(holds, case.output, case.force, wanted, case.earth, case.vertical)
         moving = None if rest.slope is None else case.force_at(time)
         segments, notes = find_turns(holds, time, case.output, case.force, rest, moving, case.name)
         beside = case.knocked[segments.attitude] | case.knocked[segments.attitude + 1]
