@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import legendre
 
-from imulab.procedures.thermal.model import AXES, Laws, forces
+from imulab.procedures.thermal.model import SHARES, Laws, forces
 from imulab.recording import Array
 
 _PLACES = 41
@@ -82,8 +82,7 @@ class Design:
         Over all directions: that of the bias, and a third of those of scale factor and misalignment.
         """
         design = self.laws.design(self.places)
-        weighted = design * np.repeat([1.0, 1 / 3, 1 / 3], len(AXES))[:, None] / len(AXES)
-        found: Array = np.einsum("tpa,tpb->tab", weighted, design)
+        found: Array = np.einsum("p,tpa,tpb->tab", SHARES, design, design)
         return found
 
     @cached_property

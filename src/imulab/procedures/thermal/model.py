@@ -29,6 +29,8 @@ SENSITIVITIES = tuple(f"gyro_g_sensitivity_{a}{b}" for a in AXES for b in AXES)
 """Of gyroscopes, in the order of their parameters."""
 GROUPS = (("bias", AXES), ("scale_factor", AXES), ("misalignment", ("yx", "zx", "zy")))
 """Kinds of parameters, three each, in the order of the parameter vector."""
+SHARES = np.repeat([1.0, 1 / 3, 1 / 3], len(AXES)) / len(AXES)
+"""Of their variances in that of a component of the corrected force, in g: the mean over components and directions."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from imulab.procedures.thermal.calibrations import Own, own_calibrations
 from imulab.procedures.thermal.degrees import Found, clusters_of, spoken_degrees
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.lag import Drift, entries, findings
-from imulab.procedures.thermal.model import AXES, GROUPS, Laws
+from imulab.procedures.thermal.model import AXES, GROUPS, SHARES, Laws
 from imulab.procedures.thermal.rows import Problem, together
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.procedures.thermal.solve import Scatter, Solution
@@ -312,6 +312,5 @@ def deviation_of_force(record: Calibration, temperature: Array) -> Array:
     values, spread = predicted(record, temperature)
     g = thermal_of(record).model.gravity.value
     relative = np.concatenate([spread[:3] / g, spread[3:6] / np.abs(values[3:6]), spread[6:]])
-    weights = np.repeat([1.0, 1 / 3, 1 / 3], len(AXES)) / len(AXES)
-    found: Array = g * np.sqrt(weights @ relative**2)
+    found: Array = g * np.sqrt(SHARES @ relative**2)
     return found
