@@ -123,12 +123,12 @@ def test_loop_and_delay_of_a_noisy_sweep_err_by_what_is_stated():
         for made in (clean, still):
             noisy = made.with_columns({"gyro_z": made.column("gyro_z") + noise}, {"gyro_z": "deg/s"})
             found = il.fit_rate(noisy, order=1).calibration
-            p = {n: found.parameters[f"gyro_{n}_z"] for n in ("hysteresis", "delay")}
-            loops.append(found.fit["axes"]["z"]["loop"])
+            of, delay = found.fit["axes"]["z"], found.parameters["gyro_delay_z"]
+            loops.append(of["loop"])
             if made is clean:
-                true = {"hysteresis": 1e-3, "delay": TRUE_DELAY}
-                scores.append([(p[n].value - true[n]) / p[n].standard_uncertainty for n in true])
-                assert p["hysteresis"].standard_uncertainty < 1e-4
+                off = (of["fitted_loop"] - 1e-3) / of["fitted_loop_uncertainty"]
+                scores.append([off, (delay.value - TRUE_DELAY) / delay.standard_uncertainty])
+                assert of["fitted_loop_uncertainty"] < 1e-4
     squares = np.square(scores).mean(axis=0)  # 12 scatter by 0.41 about 1
     assert (squares > 0.1).all()
     assert (squares < 1 + 3 * 0.41).all()

@@ -71,7 +71,8 @@ def exhibits_of_joined(record: Calibration) -> Exhibits:
 def _parameters(record: Calibration) -> ReportTable:
     rows = []
     for row in engineering_rows(record):
-        value, u = format_uncertain(row.value, row.standard_uncertainty)
+        of = row.standard_uncertainty
+        value, u = (plain_number(row.value, 3), "–") if of is None else format_uncertain(row.value, of)
         rows.append([row.name, value, u, row.unit])
     return ReportTable(
         "Parameters",
@@ -118,7 +119,7 @@ def _of_line(record: Calibration, found: Rate) -> ReportTable:
         ]
         rows.append(
             [name, ppm(sizes[0]), ppm(of.by_noise), f"{of.probability:.3f}", *_of_powers(record, of, name),
-             ppm(sizes[1]), ppm(sizes[2]),
+             ppm(sizes[1]), ppm(sizes[2]), *_of_loop(record, of, name),
              "–" if of.loop is None else f"{of.loop:.3f}", ppm(of.repeatability), ppm(of.repeatability_by_noise)]
         )  # fmt: skip
     return ReportTable(
@@ -126,7 +127,8 @@ def _of_line(record: Calibration, found: Rate) -> ReportTable:
         "Nonlinearity: largest residual of a rate over the largest rate; noise alone stays below the next column with "
         "95 %, and leaves as much as was found with probability p. Order: highest power of the rate in the model; "
         "what its powers leave is the largest residual beside them. Asymmetry: slope of positive less slope of "
-        "negative rates. Hysteresis: largest rising less falling; p of loop is the probability that noise makes it. "
+        "negative rates. Hysteresis: largest rising less falling, of which noise alone makes some; loop: the same at "
+        "rate 0 by all rates, with its u; p of loop is the probability that noise makes it. "
         "Repeatability: standard deviation of the scale factor over runs, and that which noise makes.",
         [
             "gyro",
@@ -137,12 +139,21 @@ def _of_line(record: Calibration, found: Rate) -> ReportTable:
             "powers leave",
             "asymmetry",
             "hysteresis",
+            "loop",
+            "u",
             "p of loop",
             "repeatability",
             "by noise",
         ],
         rows,
     )
+
+
+def _of_loop(record: Calibration, of: OfAxis, name: str) -> tuple[str, str]:
+    """Return the fitted loop and its uncertainty, ppm; records of before have none."""
+    if "fitted_loop" not in record.fit["axes"][name] or of.fitted_loop is None:
+        return "–", "–"
+    return format_uncertain(of.fitted_loop * _PPM, (of.fitted_loop_uncertainty or 0.0) * _PPM)
 
 
 def _of_powers(record: Calibration, of: OfAxis, name: str) -> tuple[str, str]:

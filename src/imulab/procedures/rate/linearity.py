@@ -36,7 +36,9 @@ class Linearity:
         Of each dwell about its axis: rad/s, and what is left of the line, a fraction of the largest rate, shape (n,).
     direction
         1 where the rate was rising, -1 where it was falling, 0 at turning points, shape (n,).
-    nonlinearity, asymmetry, hysteresis
+    nonlinearity, hysteresis
+        Largest of several, and the standard uncertainty of that one; the largest itself is never 0, nor normal.
+    asymmetry
         Value and standard uncertainty.
     probability
         That noise alone leaves as much of the line.
@@ -45,6 +47,8 @@ class Linearity:
     loop
         Probability that noise alone makes the loop between rising and falling rates; None where no rate was visited
         both ways.
+    fitted_loop
+        Rising less falling at rate 0 by all rates, the loop as ``1 - (w/w_max)^2``, and its standard uncertainty.
     repeatability
         Standard deviation of the scale factor over runs, and what noise makes of it; None with one run.
     threshold
@@ -66,6 +70,7 @@ class Linearity:
     probability: float
     by_noise: float
     loop: float | None
+    fitted_loop: tuple[float, float] | None
     repeatability: tuple[float, float] | None
     threshold: tuple[float, float] | None
     by_polynomial: float
@@ -101,7 +106,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
     rest = _fitted(powers, values, variance)[0]
     beyond = _beyond_noise(key, direction, zeros, values, variance)
     error = np.zeros(len(rate)) if problem.loop_error is None else problem.loop_error[own]
-    loop, hysteresis = _hysteresis(
+    loop, fitted_loop, hysteresis = _hysteresis(
         left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
     )
     return Linearity(
@@ -115,6 +120,7 @@ def linearity_of(problem: Problem, gyro: int, scale: float, order: int) -> Linea
         probability=probability,
         by_noise=reach * float(spread.max()) / largest,
         loop=loop,
+        fitted_loop=fitted_loop,
         repeatability=_repeatability(rate, values, variance, runs),
         threshold=_threshold(rate, problem.table[own], left, variance, key),
         by_polynomial=max(abs(float(rest[key == k].mean())) for k in np.unique(key)) / largest,
@@ -190,8 +196,8 @@ def _hysteresis(
     rate: Array,
     error: Array,
     beyond: tuple[float, int] | None,
-) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the probability of a loop by noise, and the largest rising less falling, all over the largest rate.
+) -> tuple[float | None, tuple[float, float] | None, tuple[float, float] | None]:
+    """Return the probability of a loop by noise, that loop, and the largest rising less falling, over the largest rate.
 
     `error` is what not knowing the delay of a sweep adds to a loop at rate 0, infinite where it tells no loop.
     """
@@ -209,24 +215,26 @@ def _hysteresis(
             means = np.array(pairs).mean(axis=0)
             rows.append((float(rate[key == k].mean()), means[0], *(means[1:] / len(pairs))))
     if not rows:
-        return None, None
+        return None, None, None
     table = np.array(rows)
     worst = int(np.argmax(np.abs(table[:, 1])))
     loop = 1 - table[:, 0] ** 2
     size = float(table[worst, 1]), float(np.sqrt(table[worst, 2] + table[worst, 3] * loop[worst] ** 2))
     spread = float(np.sum(loop**2 / table[:, 2]))
     if len(rows) < 2 or spread <= 0:
-        return None, size
+        return None, None, size
     slope = float(np.sum(loop * table[:, 1] / table[:, 2])) / spread
     chi_square = float(np.sum((table[:, 1] - slope * loop) ** 2 / table[:, 2]))
     t = float(abs(slope) / np.sqrt(1 / spread + table[:, 3].max()))
     found = [2 * float(stdtr(_BY_PARTS, -t) if table[:, 3].any() else ndtr(-t))]
-    freedom = len(rows) - 1
+    freedom, wide = len(rows) - 1, [1.0]
     if chi_square_probability(chi_square, freedom) < _CHANCE:  # the loop has another shape, or dwells scatter more
-        found.append(2 * float(stdtr(freedom, -t / np.sqrt(chi_square / freedom))))
+        wide.append(chi_square / freedom)
+        found.append(2 * float(stdtr(freedom, -t / np.sqrt(wide[-1]))))
     if beyond:
-        found.append(2 * float(stdtr(beyond[1], -t / np.sqrt(beyond[0] / beyond[1]))))
-    return max(found), size
+        wide.append(beyond[0] / beyond[1])
+        found.append(2 * float(stdtr(beyond[1], -t / np.sqrt(wide[-1]))))
+    return max(found), (slope, float(np.sqrt(max(wide) / spread + table[:, 3].max()))), size
 
 
 def _repeatability(rate: Array, values: Array, variance: Array, runs: NDArray[np.int64]) -> tuple[float, float] | None:

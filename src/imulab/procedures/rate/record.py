@@ -26,6 +26,7 @@ from imulab.verdict import Bad, Note
 _CHANCE = 0.01
 _OFF = 0.1
 _MATTERS = 3.0
+_LARGEST = ("nonlinearity", "hysteresis")
 
 
 def make_record(
@@ -50,9 +51,10 @@ def make_record(
         parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
     figures = _figures(linearity) | dynamics_of(test, dwells)
     figures |= temperature_slopes(recordings, dwells, problem, solution)
-    joined = np.zeros((len(matrix) + len(figures),) * 2)
+    known = {name: u for name, p in figures.items() if (u := p.standard_uncertainty) is not None}
+    joined = np.zeros((len(matrix) + len(known),) * 2)
     joined[: len(matrix), : len(matrix)] = matrix
-    joined[len(matrix) :, len(matrix) :] = np.diag([(p.standard_uncertainty or 0.0) ** 2 for p in figures.values()])
+    joined[len(matrix) :, len(matrix) :] = np.diag([u**2 for u in known.values()])
     heads = [recording.metadata for recording in recordings]
     sensor = {key: text for head in heads for key in ("serial", "model", "element") if (text := head.get(key))}
     temperatures = [t for recording in recordings if (t := recording.mean_temperature()) is not None]
@@ -69,7 +71,7 @@ def make_record(
     return Calibration(
         procedure="rate",
         parameters=parameters | figures,
-        covariance=Covariance((*names, *figures), tuple(map(tuple, joined.tolist()))),
+        covariance=Covariance((*names, *known), tuple(map(tuple, joined.tolist()))),
         model=model,
         fit=_fit(test, problem, solution, linearity, dwells) | swept(test, dwells),
         options={"order": order if order == "auto" else int(order)},
@@ -105,12 +107,13 @@ def _of_cycles(
 
 
 def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
+    """Return the figures of each axis; noise alone lifts the largest of several, which no uncertainty describes."""
     found = {}
     for kind, unit in (("nonlinearity", "1"), ("asymmetry", "1"), ("hysteresis", "1"), ("threshold", "rad/s")):
         for axis, of in linearity.items():
             pair = getattr(of, kind)
             if pair is not None:
-                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], unit)
+                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], None if kind in _LARGEST else pair[1], unit)
     return found
 
 
@@ -138,6 +141,8 @@ def _fit(
                 "probability": found.probability,
                 "by_noise": found.by_noise,
                 "loop": found.loop,
+                "fitted_loop": None if found.fitted_loop is None else found.fitted_loop[0],
+                "fitted_loop_uncertainty": None if found.fitted_loop is None else found.fitted_loop[1],
                 "repeatability": None if found.repeatability is None else found.repeatability[0],
                 "repeatability_by_noise": None if found.repeatability is None else found.repeatability[1],
                 "by_polynomial": found.by_polynomial,

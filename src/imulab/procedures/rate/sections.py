@@ -36,6 +36,8 @@ class OfAxis(Part):
     probability: Size
     by_noise: Size
     loop: Size | None
+    fitted_loop: float | None
+    fitted_loop_uncertainty: Size | None
     repeatability: Size | None
     repeatability_by_noise: Size | None
     order: int
