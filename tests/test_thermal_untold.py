@@ -85,6 +85,13 @@ def test_a_lag_that_fast_ramps_do_not_tell_is_said_with_what_it_costs():
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.4)
 
 
+def test_ramps_without_a_tumble_are_refused_with_what_is_missing():
+    ramps = [each for each in il.simulate_thermal(ramps=4) if each.name.startswith("ramp")]
+    with pytest.raises(il.ImulabError, match=r"a tumble beside the rest ramps.*would help") as refused:
+        il.fit_thermal(ramps)
+    assert "--degrees" not in str(refused.value)
+
+
 @pytest.fixture(scope="module")
 def chamber():
     return list(il.simulate_thermal(attitudes=12))

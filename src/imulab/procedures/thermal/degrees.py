@@ -29,6 +29,8 @@ _NO_WORSE = 1.0
 _HANDICAP = 1.1
 """Error at temperatures left out, over that of polynomials, up to which a spline is taken."""
 _TOLD = 2000.0
+_TUMBLE = 9
+"""Attitudes that tell the parameters at one temperature."""
 
 
 @dataclass(frozen=True)
@@ -331,10 +333,17 @@ def _observable(problem: Problem, laws: Laws, tau: float | None, name: str) -> t
         confused = ", ".join(view.confused(names)[:6])
         raise ObservabilityError(
             f"{name}: {len(problem.reading)} holds determine {view.rank} of the {size} unknowns of degrees "
-            f"{laws.spelled}; they cannot separate {confused}; more attitudes at each temperature, "
-            "or lower --degrees, would help"
+            f"{laws.spelled}; they cannot separate {confused}; {_help(problem, laws)} would help"
         )
     return solution, view
+
+
+def _help(problem: Problem, laws: Laws) -> str:
+    """Return what would tell the coefficients that these holds do not."""
+    if np.count_nonzero(problem.group < 0) < _TUMBLE and problem.known is None:
+        return "a tumble beside the rest ramps, the unit turned through a dozen attitudes at one temperature,"
+    more = "more attitudes at each temperature"
+    return f"{more}, or lower --degrees," if max(laws.degrees) else more
 
 
 def step_down(solution: Solution, group: int, given: Sequence[Split]) -> Step:
