@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -392,7 +393,7 @@ def _written(folder, faces=("+x", "+y", "+z"), **head):
     [
         (
             lambda t: t.replace('"+y.csv"', '"+x.csv"').replace('= "+y"', '= "+x"'),
-            "the same recording as +x.csv, which",
+            "+x.csv (+x along the table axis): run 2 is the same recording as run 1 (+x.csv), which",
         ),
         (
             lambda t: t.replace('mounting = "+z"', 'mounting = "-z"'),
@@ -422,6 +423,47 @@ def test_runs_of_two_units_are_refused_and_one_of_another_than_the_manifest_says
     assert "+x.csv is of serial SN1, the manifest of SN7" in capsys.readouterr().err
 
 
+def test_a_folder_with_a_manifest_is_named_by_it(tmp_path, monkeypatch, capsys):
+    """It was said to name test/*.csv, which is refused."""
+    monkeypatch.chdir(tmp_path)
+    Path("test").mkdir()
+    _written(tmp_path / "test")
+    ran("rate", "fit", "test", "-o", "r.json", status=2)
+    assert capsys.readouterr().err.endswith(f"name its manifest: {Path('test') / 't.toml'}\n")
+    with pytest.raises(il.ImulabError, match="expected a manifest or one recording, found a folder"):
+        il.fit_rate("test")
+    ran("rate", "fit", "test/t.toml", "-o", "r.json")
+
+
+def test_misalignments_of_a_mounting_that_nobody_stated_are_to_be_looked_at():
+    """They are stated to micro-radians, which leaves out what the faces are known to."""
+    said = "the uncertainty of the mounting was not stated"
+    for stated in (None, 0.0, 3e-4):
+        verdict = il.fit_rate(whole(test={"mounting_uncertainty": stated, "latitude": 0.0})).calibration.verdict
+        assert any(said in reason for reason in verdict.reasons) == (stated is None)
+        assert (verdict.state == "look") == (stated is None)
+    one = il.fit_rate(recording("+z"), axis="+z", latitude=0.0).calibration  # which has no misalignment
+    assert not any(said in each for each in one.warnings)
+
+
+def test_the_manifest_of_the_page_is_one(tmp_path):
+    page = Path(__file__).parent.parent / "docs" / "rate.md"
+    (text,) = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    (tmp_path / "t.toml").write_text(text, encoding="utf-8")
+    test = load_test(tmp_path / "t.toml")
+    assert (test.relative_uncertainty, test.proportional_uncertainty, test.mounting_uncertainty) == (1e-4, 2e-5, 3e-4)
+
+
+def test_a_simulated_test_has_its_truth_beside_it(tmp_path):
+    made = il.simulate_rate(hold="3 s", noise="0", rate="50 Hz", latitude="0 deg")
+    made.save(tmp_path)
+    truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
+    assert truth == made.truth
+    record = il.fit_rate(tmp_path / "test.toml", order=1).calibration
+    for name in ("gyro_scale_factor_x", "gyro_misalignment_yz"):
+        assert record.value(name) == pytest.approx(truth[name], abs=1e-3 if "scale" in name else 1e-5)
+
+
 def test_a_record_is_not_written_over_a_run_of_the_manifest(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     _written(tmp_path)
@@ -431,11 +473,19 @@ def test_a_record_is_not_written_over_a_run_of_the_manifest(tmp_path, monkeypatc
     assert Path("+y.csv").read_bytes() == before
 
 
+_DWELL = (
+    r"gyro_z is at (-?[\d.]+) deg/s by its nominal scale factor, none of the listed rates .*is a listed rate missing"
+)
+
+
 def test_a_rate_that_the_list_lacks_is_not_taken_for_its_neighbour():
     """10 and -10 deg/s next to 0, between listed rates that are 50 deg/s apart; S would be off by 8000 ppm or so."""
     kept = [rate for rate in RATES if abs(rate) != 10 * DEGREE]
-    with pytest.raises(il.ImulabError, match=r"is at -?10 deg/s, none of the listed rates .*is a listed rate missing"):
+    with pytest.raises(il.ImulabError, match=_DWELL) as refused:
         il.fit_rate(recording(column=False), rates=kept)
+    # 10 deg/s with the bias and scale factor of the gyroscope; by a line through rates that it lacks it would be off
+    seen = float(re.search(_DWELL, str(refused.value))[1])
+    assert abs(seen) == pytest.approx(10, abs=1)
     assert il.fit_rate(recording(column=False), rates=RATES).calibration.value("gyro_scale_factor_z") > 0
 
 

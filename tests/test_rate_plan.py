@@ -1,6 +1,7 @@
 """Plans of a rate test: what they predict against simulated tests, the manifest, and every refusal."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,28 @@ def simulated(plan, seed):
         units = {name: "s" if name == "time" else "rad/s" for name in columns}
         made.append(il.Recording(columns, units, {}, name=run.file))
     return RateRecordings(plan.test, tuple(made), {})
+
+
+def test_what_a_plan_does_not_know_is_to_be_filled_in(tmp_path):
+    """It wrote neither key, and a fit stated misalignments to 0.001 mrad."""
+    plan = il.plan_rate("0,100,300", arw=WALK, uncertainty="10 ppm", cycles=1)
+    plan.save(tmp_path / "t.toml")
+    text = (tmp_path / "t.toml").read_text(encoding="utf-8")
+    empty = load_test(tmp_path / "t.toml")
+    assert (empty.relative_uncertainty, empty.mounting_uncertainty, empty.latitude) == (None, None, None)
+    filled = re.sub(r"^# (rates\.|mounting|latitude)", r"\1", text, flags=re.M)
+    (tmp_path / "t.toml").write_text(filled, encoding="utf-8")
+    test = load_test(tmp_path / "t.toml")
+    assert test.relative_uncertainty == 1e-4
+    assert test.mounting_uncertainty == pytest.approx(3e-4)
+    assert test.latitude == pytest.approx(np.radians(48.1))
+    head = plan.shown()[0]
+    assert head.endswith(
+        "on top come what all rates of the table have in common (--table-uncertainty) and the mounting, "
+        "in every misalignment"
+    )
+    known = il.plan_rate("0,100,300", arw=WALK, uncertainty="10 ppm", faces="+z", table_uncertainty=1e-5)
+    assert "on top" not in known.shown()[0]
 
 
 @pytest.mark.parametrize("order", [1, 3])

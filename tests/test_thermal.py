@@ -152,6 +152,18 @@ def made():
     return list(il.simulate_thermal([-20, 0, 25, 45, 60], attitudes=10))
 
 
+def test_simulated_recordings_have_their_truth_beside_them(tmp_path):
+    """At the set points; without noise the biases of a tumble at one are those."""
+    il.simulate_thermal([-20, 60], attitudes=20, noise=1e-9, turn_on=0, gyro=True).save(tmp_path)
+    truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
+    assert truth["temperature"] == [-20.0, 60.0]
+    assert len(truth["gyro_g_sensitivity_xy"]) == 2
+    for k, name in enumerate(("tumble_-20.csv", "tumble_60.csv")):
+        found = il.fit_tumble(tmp_path / name, order=1, gravity=G).calibration
+        for axis in "xyz":  # the chamber is up to 0.3 K off its set point
+            assert found.value(f"bias_{axis}") == pytest.approx(truth[f"bias_{axis}"][k], abs=1e-3 * G)
+
+
 def test_scale_factors_are_drawn_from_a_temperature_that_is_named(made):
     figure = il.fit_thermal(made, gravity=9.80665).plot("scale factor").figure
     assert figure.layout["yaxis"]["title"]["text"] == "scale factor, ppm"

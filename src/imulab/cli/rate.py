@@ -115,7 +115,7 @@ def simulate(
     lag: Annotated[str, typer.Option(help="Time constant of the gyroscopes, s.")] = "0 s",
     seed: Annotated[str, typer.Option(help="Of the random numbers.")] = "1",
 ) -> None:
-    """Simulate a unit on a rate table, a file for each face and cycle, with their manifest test.toml, into a folder."""
+    """Simulate a unit on a rate table: a file for each face and cycle, their manifest test.toml, and the truth."""
     from imulab.procedures.rate.simulate import simulate_rate
 
     made = call(
@@ -123,7 +123,7 @@ def simulate(
         latitude=latitude, table=table, sweep=sweep, lag=lag, seed=seed,
     )  # fmt: skip
     made.save(output)
-    print(f"{output}: test.toml and {len(made.recordings)} recordings")
+    print(f"{output}: test.toml, {len(made.recordings)} recordings, truth in truth.json")
 
 
 @with_options(OPTIONS)

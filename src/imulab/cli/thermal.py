@@ -173,7 +173,7 @@ def simulate(
         seed=seed,
     )  # fmt: skip
     made.save(output)
-    print(f"{output}: {len(made)} recordings, law {law}")
+    print(f"{output}: {len(made)} recordings, law {law}, truth in truth.json")
 
 
 @with_options(OPTIONS)

@@ -308,11 +308,13 @@ def _listed_rates(
         worst, gap = int(np.argmax(off)), max(_ALIKE * np.abs(listed).max(), _OUT * float(np.median(off))) / _NEXT_TO
     if off[worst] > _NEXT_TO * gap:
         a, b = stretches[worst]
-        seen_rate = (reading[worst] - zero) / scale
+        seen_rate, by = (reading[worst] - zero) / scale, "by the line through the listed rates"
+        if nominal.quantity == "rate":
+            seen_rate, by = to_si(float(reading[worst]), nominal.symbol), "by its nominal scale factor"
         raise SegmentError(
-            f"{place}: the dwell at {time[a]:.1f} to {time[b - 1]:.1f} s is at {_degrees(seen_rate)} deg/s, none of "
-            f"the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, is a listed rate missing "
-            "or wrong, or the mounting's sign?"
+            f"{place}: in the dwell at {time[a]:.1f} to {time[b - 1]:.1f} s {main} is at {_degrees(seen_rate)} deg/s "
+            f"{by}, none of the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, is a listed "
+            "rate missing or wrong, or the mounting's sign?"
         )
     order, found = ([rate for rate, _ in groupby(each)] for each in (rates, nearest.tolist()))
     if order == [-rate for rate in found] != found:

@@ -19,7 +19,7 @@ from imulab.procedures.rate.axes import TableAxes, find_axes, length_said, other
 from imulab.procedures.rate.choices import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
 from imulab.procedures.rate.linearity import Linearity, linearity_of
-from imulab.procedures.rate.manifest import RateTest, Run, load_test
+from imulab.procedures.rate.manifest import RateTest, Run, load_test, refuse_folder
 from imulab.procedures.rate.orders import choose_orders
 from imulab.procedures.rate.parameters import g_sensitivity
 from imulab.procedures.rate.prior import prior_at, with_prior
@@ -137,6 +137,8 @@ def fit_rate(
     else:
         if axis not in MOUNTINGS:
             raise OptionError(f"axis {axis!r}: expected one of {listed(MOUNTINGS, axis)}")
+        if isinstance(data, str | os.PathLike):
+            refuse_folder(Path(os.fspath(data)), os.fspath(data))
         recordings = [as_recording(data, reading, fit_rate, gyros_of)]
         given = rates_of(rates, "rates") if isinstance(rates, str) else None if rates is None else tuple(rates)
         test = RateTest((Run(recordings[0].name, axis, given),), name=recordings[0].name)
@@ -215,7 +217,7 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
     if not first:
         recordings[0].column("gyro_x")
     unit = recordings[0].units[first[0]]
-    seen: dict[str, str] = {}
+    seen: dict[str, int] = {}
     for index, recording in enumerate(recordings):
         for key in ("serial", "element"):
             mine, its = recordings[0].metadata.get(key), recording.metadata.get(key)
@@ -226,8 +228,11 @@ def _alike(test: RateTest, recordings: Sequence[Recording]) -> tuple[list[str], 
                 )
         of = "" if recording.source is None else recording.source.sha256
         if of in seen:
-            raise DataError(f"{test.place(index)}: the same recording as {seen[of]}, which would count twice")
-        seen |= {of: test.runs[index].file} if of else {}
+            raise DataError(
+                f"{test.place(index)}: run {index + 1} is the same recording as run {seen[of] + 1} "
+                f"({test.runs[seen[of]].file}), which would count twice"
+            )
+        seen |= {of: index} if of else {}
         if gyro_columns(recording) != first:
             raise DataError(
                 f"{test.place(index)}: columns {' '.join(gyro_columns(recording)) or 'without gyroscopes'}, but "

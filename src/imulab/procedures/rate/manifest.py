@@ -22,6 +22,13 @@ from imulab.units import from_si, to_si
 
 _KEYS = ("rates", "mounting", "latitude", "sensor", "run")
 _RATES = 'rates = { unit = "deg/s", relative_standard_uncertainty = 1e-4 }'
+_FILL_IN = {
+    "relative_uncertainty": "# rates.relative_standard_uncertainty = 1e-4  # fill in: of the table, common to all "
+    "rates, such as 1e-5 to 1e-4",
+    "mounting_uncertainty": '# mounting = { standard_uncertainty = 0.3, unit = "mrad" }  # fill in: of the table axis '
+    "across each face, such as 0.1 to 1 mrad; not used with --accel",
+    "latitude": '# latitude = { value = 48.1, unit = "deg" }  # fill in: else the Earth\'s rate stays in the bias',
+}
 _MOUNTING = 'mounting = { standard_uncertainty = 0.3, unit = "mrad" }'
 
 
@@ -128,6 +135,22 @@ def load_test(path: str | Path, name: str | None = None) -> RateTest:
     )
 
 
+def refuse_folder(path: Path, name: str) -> None:
+    """Refuse a folder that holds a manifest, which says what its recordings are.
+
+    Raises
+    ------
+    ReadError
+        See above; the message names the manifest.
+    """
+    found = sorted(path.glob("*.toml")) if path.is_dir() else []
+    if found:
+        raise ReadError(
+            f"{name}: expected a manifest or one recording, found a folder; name its manifest: "
+            f"{' or '.join(str(Path(name) / one.name) for one in found)}"
+        )
+
+
 def _size(value: Any, place: str) -> float:
     found = number_of(value, place)
     if found < 0:
@@ -174,8 +197,11 @@ def _run(entry: Mapping[str, Any], place: str, unit: str) -> Run:
     return Run(file, str(mounting), numbers)
 
 
-def manifest_text(test: RateTest, comments: Sequence[str] = ()) -> str:
-    """Return the manifest of a test as TOML, rates in deg/s, under lines of comment."""
+def manifest_text(test: RateTest, comments: Sequence[str] = (), to_fill_in: bool = False) -> str:
+    """Return the manifest of a test as TOML, rates in deg/s, under lines of comment.
+
+    What the test does not state is left out, or `to_fill_in` behind a ``#``, with a usual size.
+    """
     parts = ['unit = "deg/s"']
     if test.relative_uncertainty is not None:
         parts.append(f"relative_standard_uncertainty = {test.relative_uncertainty!r}")
@@ -183,11 +209,18 @@ def manifest_text(test: RateTest, comments: Sequence[str] = ()) -> str:
         parts.append(f"standard_uncertainty = {from_si(test.rate_uncertainty, 'deg/s'):.9g}")
     if test.proportional_uncertainty:
         parts.append(f"proportional_standard_uncertainty = {test.proportional_uncertainty!r}")
-    lines = [*(f"# {comment}" for comment in comments), f"rates = {{ {', '.join(parts)} }}"]
+    # a key a line, since TOML lets no inline table go over several, and one can be filled in alone
+    lines = [*(f"# {comment}" for comment in comments), *(f"rates.{part}" for part in parts)]
+    if to_fill_in and test.relative_uncertainty is None:
+        lines.append(_FILL_IN["relative_uncertainty"])
     if test.mounting_uncertainty is not None:
         lines.append(f'mounting = {{ standard_uncertainty = {1e3 * test.mounting_uncertainty:.9g}, unit = "mrad" }}')
+    elif to_fill_in:
+        lines.append(_FILL_IN["mounting_uncertainty"])
     if test.latitude is not None:
         lines.append(f'latitude = {{ value = {from_si(test.latitude, "deg"):.9g}, unit = "deg" }}')
+    elif to_fill_in:
+        lines.append(_FILL_IN["latitude"])
     for run in test.runs:
         lines += ["", "[[run]]", f'file = "{run.file}"', f'mounting = "{run.mounting}"']
         if run.rates is not None:

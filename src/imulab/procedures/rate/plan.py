@@ -122,7 +122,10 @@ class RatePlan(Shown):
             if most is not None:
                 factor = 1e6 if stem == "gyro_scale_factor" else as_read(stem, "")[0]
                 said.append(words_.format(plain_number(most * factor, 2)))
-        return ", ".join(said)
+        table = "what all rates of the table have in common (--table-uncertainty)"
+        beside = [table] if self.test.relative_uncertainty is None else []
+        beside += ["the mounting, in every misalignment"] * any("misalignment" in name for name in self.predicted)
+        return ", ".join(said) + (f"; on top come {' and '.join(beside)}" if beside else "")
 
     def save(self, path: str | Path) -> None:
         """Write the list of stays, run by run, where the name ends in .csv, else the manifest.
@@ -136,7 +139,7 @@ class RatePlan(Shown):
         if not str(path).lower().endswith(".csv"):
             stays = ", ".join(f"{from_si(rate, 'deg/s'):.6g}: {time:.1f} s" for rate, time in stay.items())
             comments = [f"Stay at each rate, deg/s, either way round: {stays}.", f"Predicted: {self._predicted()}."]
-            write_text(path, manifest_text(self.test, comments))
+            write_text(path, manifest_text(self.test, comments, to_fill_in=True))
             return
         lines = ["run,file,mounting,rate [deg/s],stay [s]"]
         for number, run in enumerate(self.test.runs, 1):

@@ -197,7 +197,12 @@ def _of_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool
         )
     triad = any(name.startswith("gyro_misalignment") for name in parameters)
     if test.mounting_uncertainty is None and triad and not by_axes:
-        found.append(Note("the uncertainty of the mounting was not stated, and is in no uncertainty of a misalignment"))
+        most = max(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_misalignment"))
+        found.append(
+            "the uncertainty of the mounting was not stated, and is in no uncertainty of a misalignment, of "
+            f"{1e3 * most:.2g} mrad at most: state it (mounting in the manifest; 0.3 mrad across a face is usual), or "
+            "take the table axis from accelerometers (--accel)"
+        )
     least = min(p.standard_uncertainty or 0.0 for n, p in parameters.items() if n.startswith("gyro_bias"))
     if test.latitude is None and _MATTERS * least < EARTH:
         hourly = from_si(EARTH, "deg/h")

@@ -5,12 +5,14 @@ The forward model is written here on its own, apart from the fit.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from imulab.atomic_write import write_text
 from imulab.earth import EARTH
 from imulab.errors import OptionError, readable
 from imulab.gravity import checked_latitude
@@ -47,13 +49,15 @@ class RateRecordings(Shown):
     truth: dict[str, float]
 
     def save(self, folder: str | Path) -> None:
-        """Write the recordings and ``test.toml`` into a folder, which is made."""
+        """Write the recordings, ``test.toml`` and ``truth.json`` into a folder, which is made."""
         where = Path(folder)
         with readable(folder):
             where.mkdir(parents=True, exist_ok=True)
         for run, recording in zip(self.test.runs, self.recordings, strict=True):
             write_csv(recording, where / run.file)
-        (where / "test.toml").write_text(manifest_text(self.test), encoding="utf-8")
+        write_text(where / "truth.json", json.dumps(self.truth, indent=1) + "\n")
+        note = "simulated; the truth is in truth.json, in the units of the record"
+        write_text(where / "test.toml", manifest_text(self.test, [note]))
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
         """Return the headline and a table of the runs."""

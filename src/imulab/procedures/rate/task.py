@@ -48,12 +48,13 @@ def _fit(
     files: Sequence[str], values: Mapping[str, Any], access: Files, progress: Callable[[int], None]
 ) -> Calibration:
     from imulab.procedures.rate.fit import fit_rate, fit_test
-    from imulab.procedures.rate.manifest import load_test
+    from imulab.procedures.rate.manifest import load_test, refuse_folder
 
     (name,) = files
     part = part_of(values)
     accel, prior = (None if values[key] is None else access.record(values[key]) for key in ("accel", "prior"))
     if not name.lower().endswith(".toml"):
+        refuse_folder(access.path(name), name)
         recording = access.recording(name, values["layout"], **part)
         chosen = {key: values[key] for key in ("rates", "axis", "order", "latitude", "table_uncertainty")}
         return fit_rate(recording, accel=accel, prior=prior, **chosen).calibration

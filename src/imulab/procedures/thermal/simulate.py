@@ -5,6 +5,7 @@ The forward model is written here on its own, apart from the inverse that `imula
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import overload
 
 import numpy as np
 
+from imulab.atomic_write import write_text
 from imulab.errors import OptionError, listed
 from imulab.procedures.thermal.choices import LAWS, TEMPERATURES
 from imulab.quantities import in_si, temperature_list, whole
@@ -158,7 +160,7 @@ class ThermalRecordings(Shown, Sequence[Recording]):
         return f"{len(self)} simulated recordings, law {self.law}", ["file", "samples"], rows
 
     def save(self, folder: str | Path) -> None:
-        """Write the recordings into a folder, a file each.
+        """Write the recordings into a folder, a file each, and the truth at the set points, SI, as truth.json.
 
         Raises
         ------
@@ -172,6 +174,10 @@ class ThermalRecordings(Shown, Sequence[Recording]):
             raise OptionError(f"{folder}: cannot be made: {error.strerror}") from None
         for recording in self:
             write_csv(recording, place / recording.name)
+        at = np.unique(self.temperatures)
+        truth = {"temperature": at} | thermal_truth(at, self.law, self.seed)
+        truth |= thermal_gyro_truth(at, self.seed) if self.gyro else {}
+        write_text(place / "truth.json", json.dumps({n: v.tolist() for n, v in truth.items()}, indent=1) + "\n")
 
 
 def thermal_truth(temperature: Array, law: str = "cubic", seed: int = 1) -> dict[str, Array]:
