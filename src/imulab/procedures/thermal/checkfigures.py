@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from imulab._version import VERSION
-from imulab.procedures.thermal.gyrofigures import own_points
+from imulab.procedures.thermal.lawfigures import own_points
 from imulab.procedures.thermal.model import AXES
 from imulab.records.calibration import Calibration
 from imulab.report import render_page

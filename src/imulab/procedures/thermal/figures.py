@@ -8,16 +8,22 @@ import numpy as np
 
 from imulab.procedures.thermal.degrees import spoken_degrees
 from imulab.procedures.thermal.engineering import rows as engineering_rows
-from imulab.procedures.thermal.gyrofigures import COLOURS, gyro_exhibits, own_points
+from imulab.procedures.thermal.gyrofigures import gyro_exhibits
+from imulab.procedures.thermal.lag import moved
+from imulab.procedures.thermal.lawfigures import Alone, Curves, law_figure, power_cycles, values_at_middle
 from imulab.procedures.thermal.model import AXES, GROUPS
 from imulab.procedures.thermal.record import deviation_of_force, predicted
-from imulab.procedures.thermal.sections import Own, Thermal, thermal_of
+from imulab.procedures.thermal.sections import Thermal, thermal_of
+from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.report.elements import GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
-from imulab.report.traces import DASHES, axis, band, rounded, scatter
+from imulab.report.elements import BAD, GOOD, INK, LEGEND, Exhibits, Figure, ReportTable, format_uncertain, plain_number
+from imulab.report.traces import axis, rounded, scatter
 from imulab.units import STANDARD_GRAVITY
 
 _POINTS = 81
+_MANY, _PARTS, _FEWEST = 60, 9, 3
+"""Holds whose bars hide one another; the parts that they are averaged in, an odd number, since a soak in the middle is
+not to be parted; and the fewest of one."""
 _READ = (
     ("bias", 1e3 / STANDARD_GRAVITY, "mg"),
     ("scale factor", 1e6, "ppm"),
@@ -31,7 +37,7 @@ def exhibits(record: Calibration) -> Exhibits:
     found = thermal_of(record)
     low, high = found.model.range
     temperature = np.linspace(low, high, _POINTS)
-    values, spread = predicted(record, temperature)
+    _, spread = predicted(record, temperature)
     fit = found.fit
     worst = float(spread[:3].max()) * _MICRO_G
     laws, rms = found.model.laws, plain_number(fit.rms.value * _MICRO_G, 3)
@@ -57,7 +63,7 @@ def exhibits(record: Calibration) -> Exhibits:
     ]
     items: list[Figure | ReportTable] = [
         _coefficients(record),
-        *(_over_temperature(k, temperature, values, spread, found.data.calibrations) for k in range(3)),
+        *(_over_temperature(k, record, temperature) for k in range(3)),
         _of_force(record, found, temperature),
         _residuals(found),
     ]
@@ -117,37 +123,26 @@ def _coefficients(record: Calibration) -> ReportTable:
     )
 
 
-def _over_temperature(group: int, temperature: Any, values: Any, spread: Any, alone: Own | None) -> Figure:
+def _over_temperature(group: int, record: Calibration, temperature: Array) -> Figure:
     name, factor, unit = _READ[group]
-    traces: list[dict[str, Any]] = []
-    for k in range(3):
-        row, label = 3 * group + k, GROUPS[group][1][k]
-        middle = values[row][len(temperature) // 2]
-
-        def read(each: Any, zero: float = 0.0, middle: float = middle) -> Any:
-            return (each / middle - zero if group == 1 else each) * factor
-
-        own, u = read(values[row], 1.0), 2 * np.abs(read(spread[row]))
-        traces += [
-            band(temperature, own - u, own + u, COLOURS[k], showlegend=False),
-            scatter(rounded(temperature), rounded(own), "lines", name=label,
-                    line={"color": COLOURS[k], "dash": DASHES[k]}),
-        ]  # fmt: skip
-        if alone is not None:
-            point, reach = np.array(alone.values)[:, row], np.array(alone.standard_uncertainty)[:, row]
-            traces.append(own_points(np.array(alone.temperature), read(point, 1.0), 2 * read(reach), k, label))
-    return Figure(
-        title=f"{name.capitalize()} over temperature",
-        caption="Bands: two standard uncertainties, all that power cycles differ by included."
-        + (" Points: what each recording at a steady temperature gives alone, bars two of its own." if alone else "")
-        + (f" Change from the value at {temperature[len(temperature) // 2]:.3g} degC." if group == 1 else ""),
-        traces=traces,
-        layout={
-            "xaxis": axis("temperature, degC"),
-            "yaxis": axis(f"{name}, {unit}", exponentformat="none"),
-            "legend": LEGEND,
-        },
-    )
+    kind, axes = GROUPS[group]
+    part = slice(3 * group, 3 * group + 3)
+    found = thermal_of(record)
+    values, u = (each[part] for each in predicted(record, temperature))
+    # Scale factors are read relative to those in the middle of the range.
+    factors = factor / np.abs(values[:, [len(temperature) // 2]]) if group == 1 else np.full((3, 1), factor)
+    own, alone = found.data.calibrations, None
+    if own is not None:
+        at = np.array(own.temperature)
+        each, reach = (factors * np.array(of).T[part] for of in (own.values, own.standard_uncertainty))
+        alone = Alone(at, each, factors * predicted(record, at)[0][part], reach)
+    read = power_cycles(found.fit.between_recordings.from_)
+    if alone is not None:
+        read += " Points: what each recording at a steady temperature gives alone, bars two of its own."
+    at_middle = values_at_middle(record, [f"{kind}_{axis}" for axis in axes]) if group else ""
+    curves = Curves(axes, temperature, factors * values, factors * u)
+    title = f"{name.capitalize()} over temperature"
+    return law_figure(title, name, unit, curves, alone, read=read, at_middle=at_middle)
 
 
 def _of_force(record: Calibration, found: Thermal, temperature: Any) -> Figure:
@@ -182,30 +177,54 @@ def _of_force(record: Calibration, found: Thermal, temperature: Any) -> Figure:
 
 def _residuals(found: Thermal) -> Figure:
     held = found.data.holds
-    rate = np.array(held.rate)
+    temperature, residual, u = (np.array(each) for each in (held.temperature, held.residual, held.standard_uncertainty))
+    rate = moved(np.array(held.recording), temperature, np.array(held.rate))
+    many, edges = len(residual) > _MANY, np.linspace(temperature.min(), temperature.max(), _PARTS + 1)
     traces = []
     for label, which, symbol, colour in (
-        ("warming", rate > 0, "triangle-up", "#c8553d"),
+        ("warming", rate > 0, "triangle-up", BAD),
         ("cooling", rate < 0, "triangle-down", GOOD),
         ("steady", rate == 0, "circle", INK),
     ):
         if which.any():
-            traces.append(
-                scatter(
-                    rounded(np.array(held.temperature)[which]), rounded(np.array(held.residual)[which] * _MICRO_G, 4),
-                    "markers", name=label, marker={"symbol": symbol, "color": colour, "size": 7},
-                    error_y={"type": "data", "array": rounded(np.array(held.standard_uncertainty)[which] * _MICRO_G, 3),
-                             "thickness": 1},
-                )
-            )  # fmt: skip
+            at, left = temperature[which], residual[which] * _MICRO_G
+            marker = {"symbol": symbol, "color": colour, "size": 5 if many else 7, "opacity": 0.5 if many else 1}
+            bars = {"type": "data", "array": rounded(u[which] * _MICRO_G, 3), "thickness": 1, "visible": not many}
+            points = scatter(rounded(at), rounded(left, 4), "markers", name=label, marker=marker, error_y=bars)
+            traces += [points, *([_means(at, left, edges, label, marker)] if many else [])]
     return Figure(
         title="Residual |f| - g of each hold over temperature",
-        caption="Bars: the hold's own standard uncertainty. Warming and cooling apart: where they differ, the unit "
-        "lags behind its thermometer, or does not come back; a lag or loop that is significant is taken out here, "
-        "while corrected outputs keep it.",
+        caption=(
+            "Large marks: means of holds in a ninth of the range, bars two standard uncertainties by their scatter. "
+            if many
+            else "Bars: the hold's own standard uncertainty. "
+        )
+        + "Where warming and cooling differ, the unit lags behind its thermometer, or does not come back; a lag or "
+        "loop that is significant is taken out here, while corrected outputs keep it.",
         traces=traces,
-        layout={"xaxis": axis("temperature, degC"), "yaxis": axis("|f| - g, µg"), "legend": LEGEND},
+        layout={
+            "xaxis": axis("temperature, degC"),
+            "yaxis": axis("|f| - g, µg"),
+            "legend": LEGEND,
+            "showlegend": True,
+        },
     )
+
+
+def _means(temperature: Array, values: Array, edges: Array, label: str, marker: dict[str, Any]) -> dict[str, Any]:
+    """Return the means of points between edges, with twice their standard uncertainty by the scatter."""
+    number = np.searchsorted(edges[1:-1], temperature)
+    count = np.bincount(number, minlength=_PARTS)
+    told = count >= _FEWEST
+    at, mean, square = (
+        np.bincount(number, weights=each, minlength=_PARTS)[told] / count[told]
+        for each in (temperature, values, values**2)
+    )
+    u = np.sqrt(np.maximum(square - mean**2, 0) / (count[told] - 1))
+    bars = {"type": "data", "array": rounded(2 * u, 3), "thickness": 2}
+    marker = marker | {"size": 11, "opacity": 1}
+    name = f"{label}, means"
+    return scatter(rounded(at), rounded(mean, 4), "markers", name=name, marker=marker, error_y=bars)
 
 
 def _predicted(found: Thermal) -> ReportTable:
@@ -232,16 +251,17 @@ def _compared(found: Thermal) -> ReportTable:
                     [f"spline with {row.knots} knots" if row.knots else str(row.degrees[0]), *map(str, row.degrees[1:])]
                 ),
                 "–" if row.left_out is None else plain_number(row.left_out * _MICRO_G, 3),
-                "–" if row.probability is None else f"{row.probability:.3f}",
+                "–" if row.probability is None else "< 0.001" if row.probability < 0.001 else f"{row.probability:.3f}",
             ]
         )
     return ReportTable(
         "Degrees compared",
-        f"Of {', '.join(kind.replace('_', ' ') for kind, _ in GROUPS)} on axes {' '.join(AXES)}. A lower degree is "
-        "taken where its step is insignificant (probability above 0.01) and left-out temperatures are predicted "
+        f"Of {', '.join(kind.replace('_', ' ') for kind, _ in GROUPS)} on axes {' '.join(AXES)}. A step leaves "
+        "the highest power of one kind out, and is "
+        "taken where that power is insignificant (probability above 0.01) and left-out temperatures are predicted "
         "no worse; a spline of the bias where it is no cubic (the same test, as far as recordings tell) and predicts "
         "them at most a tenth worse, since it then lacks a knot.",
-        ["degrees", "left out, µg", "probability"],
+        ["degrees", "error at temperatures left out, µg", "probability that the power left out is chance"],
         rows,
         highlight=chosen,
     )

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imulab.procedures.thermal.choices import APART
 from imulab.procedures.thermal.degrees import tail
@@ -55,10 +56,15 @@ class Drift:
 
 def moving(holds: Holds) -> Array:
     """Return the change of the temperature in each hold, K/s; 0 in soaks, and where it hardly moves."""
-    rate = holds.rate.copy()
-    for number in np.unique(holds.recording):
-        own = holds.recording == number
-        soak = np.ptp(holds.temperature[own]) < APART
+    return moved(holds.recording, holds.temperature, holds.rate)
+
+
+def moved(recording: NDArray[Any], temperature: Array, rate: Array) -> Array:
+    """Return `moving` of holds by the recording, temperature, degC, and its change, K/s, of each."""
+    rate = rate.copy()
+    for each in np.unique(recording):
+        own = recording == each
+        soak = np.ptp(temperature[own]) < APART
         rate[own & (np.abs(rate) < (np.inf if soak else _STILL * np.abs(rate[own]).max()))] = 0.0
     return rate
 
