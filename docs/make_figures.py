@@ -93,7 +93,7 @@ def one_figure(folder: Path, record: str, picture: str, words: str = "") -> None
     card = Card(figure.title, "", [], replace(figure, title="", message="" if words else figure.message))
     page = folder / f"one_{picture}.html"
     page.write_text(render_index(heading, "", [card]))
-    screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 310)
+    screenshot(page, FIGURES / f"{picture}.png", 1080, figure.height + 320)
 
 
 def guides(folder: Path) -> None:
@@ -105,8 +105,8 @@ def guides(folder: Path) -> None:
         f"tumble fit {recording} --gravity 9.81362 --with gyro,mag --field 48.2uT -o {folder}/nine.json",
         f"rate simulate -o {table}",
         f"rate fit {table}/test.toml -o {folder}/rate.json",
-        f"thermal simulate -o {ramps} --ramps 3",
-        f"thermal fit {ramps}/tumble_25.csv {ramps}/ramp_1.csv {ramps}/ramp_2.csv {ramps}/ramp_3.csv "
+        f"thermal simulate -o {ramps} --ramps 4",
+        f"thermal fit {ramps}/tumble_25.csv {' '.join(f'{ramps}/ramp_{k}.csv' for k in range(1, 5))} "
         f"-o {folder}/thermal.json",
     ):
         commands(words.split())
@@ -121,7 +121,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         run(folder, commands)
-        screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 930)
+        screenshot(folder / "tumble.html", FIGURES / "tumble.png", 1080, 1000)
         screenshot(folder / "fleet.html", FIGURES / "fleet.png", 1080, 1075)
         one_figure(folder, "array.json", "gyro_array")
         one_figure(folder, "warmup.json", "warmup")
