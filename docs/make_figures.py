@@ -45,7 +45,7 @@ def centrifuge(folder: Path) -> None:
     )  # fmt: skip
     fit = il.fit_centrifuge(test, il.simulate_centrifuge(test, rate=20.0, duration=900.0, static_duration=20.0))
     il.write_report(fit.calibration, folder / "centrifuge.html")
-    screenshot(folder / "centrifuge.html", FIGURES / "centrifuge.png", 1080, 818)
+    screenshot(folder / "centrifuge.html", FIGURES / "centrifuge.png", 1080, 890)
 
     K = math.radians(3.3 / 3600) / 9.80665
     tilted = RigTruth(tilt=math.radians(10 / 3600), tilt_phase=2.4, earth_rate=5.6e-5)
@@ -80,9 +80,10 @@ def centrifuge(folder: Path) -> None:
         render(
             replace(fit.calibration, warnings=(), sensor={"serial": "10 arcsec of tilt, simulated"}),
             Exhibits(headline, [], [figure]),
+            "Centrifuge test",
         )
     )
-    screenshot(page, FIGURES / "centrifuge_tilt.png", 1080, 690)
+    screenshot(page, FIGURES / "centrifuge_tilt.png", 1080, 760)
 
 
 def one_figure(folder: Path, record: str, picture: str, words: str = "") -> None:
