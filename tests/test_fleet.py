@@ -424,6 +424,42 @@ def test_status_as_json(tmp_path, capsys):
     ]  # fmt: skip
 
 
+def test_a_record_to_look_at_first_is_said_with_its_reason(imulab, tmp_path):
+    manifest = make_fleet(tmp_path / "in", 3)
+    knocked = attitudes(2)
+    knocked[5] *= 1.01
+    write_attitudes(tmp_path / "in" / "u2.csv", knocked)
+    write_attitudes(tmp_path / "in" / "u1.csv", attitudes(1), "# serial: OTHER\n")  # worth knowing, and no more
+    ran = imulab("fleet", "run", "in/manifest.csv", "-o", "out", "--workers", 1)
+    status = imulab("fleet", "status", "out")
+    assert (ran.returncode, status.returncode) == (0, 0)
+    assert "verdicts: 2 good, 1 look: SN002 row 6 (line 7) set aside" in ran.stdout
+    assert "3 done, 0 failed, 0 missing; 2 good, 1 look: SN002 row 6 (line 7) set aside" in status.stdout
+    with (tmp_path / "out" / "parameters.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["verdict"] for row in rows] == ["good", "good", "look"]
+    assert [row["reason"][:5] for row in rows] == ["", "", "row 6"]
+    assert "OTHER" in rows[1]["warnings"]
+    assert imulab("fleet", "report", "out", "-o", "r.html").returncode == 0
+    page = (tmp_path / "r.html").read_text()
+    assert "3 of 3 units have their record: 2 good, 1 look (SN002); too few units (3 of 8) to tell which" in page
+    assert "none stands out" not in page
+    found = page[page.index("The verdict of each unit") :]
+    assert (
+        '<td>SN002</td><td class="text">tumble</td><td class="text">look</td><td class="text">row 6 (line 7)' in found
+    )
+    assert found.index("SN002") < found.index("SN000")
+    found = json.loads(imulab("fleet", "status", "out", "--json").stdout)
+    assert found["verdicts"] == {"good": 2, "look": 1, "bad": 0}
+    ((serial, verdict, reasons),) = (each.values() for each in found["doubtful"])
+    assert (serial, verdict) == ("SN002", "look")
+    assert reasons[0].startswith("row 6")
+    write_manifest(manifest, [{"serial": f"N{i}", "procedure": "tumble", "file": f"u{i}.csv"} for i in range(2)])
+    alike = run(manifest, tmp_path / "alike").judged
+    assert alike.startswith("2 look: N0, N1 no local gravity was given")
+    assert alike.count("no local gravity") == 1
+
+
 def test_without_sqlalchemy_there_is_no_history_and_one_line_says_so(tmp_path):
     manifest = make_fleet(tmp_path / "in", 1, order=1)
     code = (

@@ -82,6 +82,19 @@ def test_few_units_of_a_procedure_have_a_table_and_no_distribution():
     assert found == ["Figure", "ReportTable", "Figure"]
 
 
+@pytest.mark.parametrize(
+    ("count", "said"), [(7, "too few units (7 of 8) to tell which stands out"), (8, "none stands")]
+)
+def test_nobody_is_said_to_stand_out_or_not_where_there_are_too_few_units(count, said):
+    items = line_statistics([summary(str(i), float(i)) for i in range(count)], {})
+    exhibits = fleet_exhibits(FleetState("d", FleetManifest("m.csv", ".", ()), ()), items, [])
+    assert said in exhibits.headline
+    assert (exhibits.figures[0].message == "No unit stands out.") == (count == 8)
+    assert dict(exhibits.facts)["units that stand out"] == ("0" if count == 8 else "–")
+    (table,) = (item for item in exhibits.items if not hasattr(item, "traces"))
+    assert table.rows[0][table.columns.index("stand out")] == ("0" if count == 8 else "–")
+
+
 def test_one_unit_is_shown_to_its_uncertainty_and_has_no_spread():
     table = summary_table("Tumble", line_statistics([summary("A", 9.80665e-3 * 1.23456, u=9.80665e-6)], {}))
     row = dict(zip(table.columns, table.rows[0], strict=True))

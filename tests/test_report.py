@@ -182,12 +182,12 @@ def test_nothing_overflows_sideways(record, chromium, tmp_path, widths, dark):
     frame = tmp_path / "frame.html"
     frame.write_text(
         "".join(f"<iframe src=r.html style='border:0;width:{width}px;height:900px'></iframe>" for width in widths)
-        + "<p id=found></p><script>setTimeout(() => {"
+        + "<p id=found></p><script>addEventListener('load', () => setTimeout(() => {"
         "found.textContent = [...document.querySelectorAll('iframe')].map(frame => {"
         "const page = frame.contentDocument;"
         "const plots = [...page.querySelectorAll('svg.main-svg')].map(plot => plot.getBoundingClientRect().right);"
         "return [page.documentElement.scrollWidth, Math.max(...plots), getComputedStyle(page.body).backgroundColor]"
-        ".join(' ') }).join(';') }, 4000)</script>"
+        ".join(' ') }).join(';') }, 4000))</script>"
     )
     options = ["--allow-file-access-from-files", *(["--blink-settings=preferredColorScheme=0"] if dark else [])]
     said = re.search(r'id="found">([^<]+)<', browse(chromium, tmp_path, frame, "--dump-dom", *options))[1].split(";")
@@ -213,6 +213,23 @@ def test_panels_side_by_side_go_beneath_one_another_on_a_phone():
     assert second["title"] == {"text": "mg"}
     assert found["layout"]["annotations"][0]["y"] == second["domain"][1]
     assert narrow(Figure("", "", [], {"xaxis": {}, "yaxis": {}})) is None
+
+
+def test_a_table_wider_than_its_card_says_that_it_scrolls(record, chromium, tmp_path):
+    wide = ReportTable("Wide", "", [f"title {n}" for n in range(7)], [["0.123456789"] * 7])
+    small = ReportTable("Small", "", ["a", "b"], [["1", "2"]])
+    page = render_page("T", "S", replace(exhibits_of(record), items=[wide, small]))
+    (tmp_path / "r.html").write_text(page, encoding="utf-8")
+    frame = tmp_path / "frame.html"
+    frame.write_text(
+        "".join(f"<iframe src=r.html style='border:0;width:{width}px;height:900px'></iframe>" for width in (390, 1280))
+        + "<p id=found></p><script>addEventListener('load', () => setTimeout(() => {"
+        "found.textContent = [...document.querySelectorAll('iframe')].map(frame => "
+        "[...frame.contentDocument.querySelectorAll('.sideways')].map(hint => getComputedStyle(hint).display).join(' ')"
+        ").join(';') }, 2000))</script>"
+    )
+    found = browse(chromium, tmp_path, frame, "--dump-dom", "--allow-file-access-from-files")
+    assert re.search(r'id="found">([^<]+)<', found)[1] == "block none;none none"
 
 
 def test_a_print_hides_buttons_and_is_a4(record, chromium, tmp_path):

@@ -13,6 +13,7 @@ from imulab.cli.fit_options import one_of
 from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
 from imulab.errors import OptionError
 from imulab.fleet import ENGINES
+from imulab.verdict import SENTENCES
 
 if TYPE_CHECKING:
     from imulab.fleet.run import FleetState
@@ -84,10 +85,9 @@ def run(
         kept = f", {state.kept} were there already" if state.kept else ""
         units = "1 unit" if len(state.rows) == 1 else f"{len(state.rows)} units"
         print(f"{units}: {made} done{kept}, {state.count('failed')} failed, {state.seconds:.1f} s")
+        if state.judged:
+            print(f"verdicts: {state.judged}")
         print("\n".join([*_failures(state), f"records: {output}", f"table: {table or f'{output}/parameters.csv'}"]))
-        warned = sum(bool(row.summary and row.summary.warnings) for row in state.rows)
-        if warned:
-            print(f"warnings: in {warned} record{'s' if warned > 1 else ''}; the table has them")
     return _verdict(state)
 
 
@@ -163,11 +163,17 @@ def _as_json(state: FleetState) -> str:
         {
             "units": len(state.rows),
             **{name: state.count(name) for name in ("done", "failed", "missing")},
+            "verdicts": {name: sum(row.verdict == name for row in state.rows) for name in SENTENCES},
             "kept": state.kept,
             "at_work": state.at_work,
             "failures": [
                 {"serial": row.unit.serial, "files": list(row.unit.files), "reason": row.reason}
                 for row in state.failures
+            ],
+            "doubtful": [
+                {"serial": row.unit.serial, "verdict": row.verdict, "reasons": list(row.summary.verdict.reasons)}
+                for row in state.doubtful
+                if row.summary is not None
             ],
         },
         indent=1,

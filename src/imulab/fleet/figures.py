@@ -13,7 +13,7 @@ from imulab.errors import first_of
 from imulab.fleet import panels as small
 from imulab.fleet.display import Display, display_of
 from imulab.fleet.reporttables import number
-from imulab.fleet.statistics import Drift, FleetChange, ParameterStatistics, change_limit
+from imulab.fleet.statistics import FEWEST_FOR_OUTLIERS, Drift, FleetChange, ParameterStatistics, change_limit
 from imulab.recording import Array
 from imulab.report import panels as grid
 from imulab.report.bulk import bulk, edge_marks, edge_note
@@ -102,7 +102,9 @@ def _distributions(title: str, panels: Sequence[ParameterStatistics], lead: str)
         height=grid.height(len(panels)),
         message=f"{'Stands' if len(standing) == 1 else 'Stand'} out: {first_of(standing, 6)}."
         if standing
-        else "No unit stands out.",
+        else "No unit stands out."
+        if any(item.enough for item in panels)
+        else f"Fewer than {FEWEST_FOR_OUTLIERS} units: too few to tell which stands out.",
     )
 
 

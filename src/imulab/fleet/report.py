@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from os import PathLike
 from pathlib import Path
@@ -16,11 +16,13 @@ from imulab.fleet.history import History, open_history
 from imulab.fleet.limits import load_limits
 from imulab.fleet.run import HISTORY, FleetState, default_history, fleet_status, own_files, read_by, refuse_overwriting
 from imulab.fleet.statistics import (
+    FEWEST_FOR_OUTLIERS,
     FleetChange,
     ParameterStatistics,
     change_limit,
     changes_since,
     line_statistics,
+    not_compared,
     parameter_units,
 )
 from imulab.fleet.store import Store
@@ -116,14 +118,16 @@ def fleet_exhibits(
     facts = [
         ("units done", f"{state.count('done')} of {len(state.rows)}"),
         ("failed", str(state.count("failed"))),
-        ("units that stand out", str(len(out))),
+        ("records to look at first", str(len(state.doubtful))),
+        ("units that stand out", str(len(out)) if any(item.enough for item in statistics) else "–"),
         ("parameters that drift", str(len(drifting))),
     ]
     phrases = [f"{state.count('done')} of {len(state.rows)} units have their record"]
+    doubtful = first_of([row.unit.serial for row in state.doubtful], _NAMED)
+    phrases[0] += (state.verdicts and f": {state.verdicts}") + (doubtful and f" ({doubtful})")
     if state.failures:
         phrases.append(f"{len(state.failures)} failed")
-    standing = f"{first_of(sorted(out), _NAMED)} {'stands' if len(out) == 1 else 'stand'} out"
-    phrases.append(standing if out else "none stands out")
+    phrases += _standing(statistics, out)
     if drifting:
         phrases.append(f"{first_of(drifting, _NAMED)} {'drifts' if len(drifting) == 1 else 'drift'} over the date")
     if capable:
@@ -136,6 +140,8 @@ def fleet_exhibits(
     if moved:
         phrases.append(f"{first_of(sorted(moved), _NAMED)} changed since the last calibration")
     items: list[Figure | ReportTable | None] = [reporttables.failure_table(state.failures)]
+    verdicts = reporttables.verdict_table(state)
+    items += [verdicts] if state.doubtful else []
     for procedure in dict.fromkeys(item.procedure for item in statistics):
         title = PROCEDURES[procedure].line_title
         mine = [item for item in statistics if item.procedure == procedure]
@@ -147,7 +153,22 @@ def fleet_exhibits(
             figures.change_figure(title, [change for change in changes if change.procedure == procedure]),
         ]
     items += [reporttables.outlier_table(statistics), reporttables.change_table(changes)]
+    items += [] if state.doubtful else [verdicts]
     return Exhibits("; ".join(phrases) + ".", facts, [item for item in items if item is not None])
+
+
+def _standing(statistics: Sequence[ParameterStatistics], out: set[str]) -> Iterator[str]:
+    """Say which units stand out, and of which procedures there are too few units to tell."""
+    if any(item.enough for item in statistics):
+        named = f"{first_of(sorted(out), _NAMED)} {'stands' if len(out) == 1 else 'stand'} out"
+        yield named if out else "none stands out"
+    most: dict[str, int] = {}
+    for item in statistics:
+        most[item.procedure] = max(most.get(item.procedure, 0), len(item.values))
+    for procedure, count in most.items():
+        if count < FEWEST_FOR_OUTLIERS:
+            of = f" of {PROCEDURES[procedure].line_title}" if len(most) > 1 else ""
+            yield f"too few units{of} ({count} of {FEWEST_FOR_OUTLIERS}) to tell which stands out"
 
 
 def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
@@ -160,8 +181,25 @@ def _history(folder: str, url: str | None, stack: ExitStack) -> History | None:
     return stack.enter_context(open_history(url, there=True))
 
 
+def _differing(found: Sequence[Summary]) -> Iterator[str]:
+    """Say which parameters the units are not compared by, and what takes their place."""
+    reasons = {procedure: why for (procedure, _), why in not_compared(found).items()}
+    for procedure, why in reasons.items():
+        mine = [summary for summary in found if summary.procedure == procedure and summary.on_line is not None]
+        title = PROCEDURES[procedure].line_title
+        bare = [summary.serial for summary in mine if summary.on_line and not summary.on_line.parameters]
+        yield (
+            f"{title}: the units have a {why}, so their coefficients mean different things: they are not compared, and "
+            "no limit of them is applied. What is compared is named with its temperature, as in 'bias_x at 20.0 degC', "
+            "for the units that were measured there."
+        )
+        if bare:
+            yield f"{title}: {first_of(bare, _NAMED)} took in no such temperature and cannot be compared."
+
+
 def _warnings(state: FleetState) -> list[str]:
-    notes = []
+    found = [row.summary for row in state.rows if row.summary is not None]
+    notes = list(_differing(found))
     if state.at_work:
         notes.append(
             f"A run is at work on the folder ({state.at_work}): this is what was there when the report was made."

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from imulab.fleet.display import display_of
+from imulab.fleet.run import FleetState
 from imulab.fleet.statistics import FleetChange, ParameterStatistics, change_limit
 from imulab.fleet.table import Row
 from imulab.report.elements import ReportTable, format_uncertain, plain_number
@@ -49,7 +50,7 @@ def summary_table(title: str, statistics: Sequence[ParameterStatistics]) -> Repo
                 number(robust, 3) if several else "–",
                 number(item.deviation * factor, 3) if several else "–",
                 number(typical, 3) if stated.size else "–",
-                str(int(item.outliers.sum())),
+                str(int(item.outliers.sum())) if item.enough else "–",
                 drift,
                 capable,
                 beyond,
@@ -126,6 +127,23 @@ def change_table(changes: Sequence[FleetChange]) -> ReportTable | None:
         + (" Values of the same files fitted again share their noise: no uncertainty applies." if again else ""),
         ["serial", "parameter", "change", "u", "unit", "deviations", "last calibration", "remark"],
         rows,
+    )
+
+
+def verdict_table(state: FleetState) -> ReportTable | None:
+    """List the verdict of every unit that has a record, the gravest first."""
+    good = [row for row in state.rows if row.verdict == "good"]
+    rows = [*state.doubtful, *good]
+    if not rows:
+        return None
+    more = f" The first {_MOST_ROWS} of {len(rows)}; parameters.csv has all." if len(rows) > _MOST_ROWS else ""
+    return ReportTable(
+        "The verdict of each unit",
+        "Look: understand the reason before you use the record. Bad: do not use it as it is. "
+        "imulab show SERIAL.json has all that a record says." + more,
+        ["serial", "procedure", "verdict", "reason"],
+        [[row.unit.serial, row.unit.procedure, row.verdict, row.first_reason or "–"] for row in rows[:_MOST_ROWS]],
+        message=f"{len(good)} of {len(rows)} are good.",
     )
 
 

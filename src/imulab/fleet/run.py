@@ -26,10 +26,12 @@ from imulab.fleet.work import DONE, FAILED, KEPT, LEFT, Job, Outcome, Summary, s
 from imulab.procedures.registry import PROCEDURES
 from imulab.quantities import whole
 from imulab.shown import Shown
+from imulab.verdict import SENTENCES
 
 _FRUITLESS = 5
 """Losses of workers in a row, without a unit done between them, before giving up."""
 _FLUSH = 2.0
+_NAMED = 3
 TABLE, HISTORY = "parameters.csv", "history.sqlite"
 
 
@@ -62,14 +64,35 @@ class FleetState(Shown):
     notes: tuple[str, ...] = ()
 
     def shown(self) -> tuple[str, list[str], list[list[str]]]:
-        """Return how many units are done, failed and missing, and which failed."""
+        """Return how many units are done, failed and missing, what their records are worth, and which failed."""
         counts = ", ".join(f"{self.count(name)} {name}" for name in ("done", "failed", "missing"))
         rows = [[row.unit.serial, "; ".join(row.unit.files), row.reason or ""] for row in self.failures]
-        return f"{len(self.rows)} units of {self.manifest.name}: {counts}", ["failed", "files", "reason"], rows
+        headline = f"{len(self.rows)} units of {self.manifest.name}: {counts}" + (self.judged and f"; {self.judged}")
+        return headline, ["failed", "files", "reason"], rows
 
     def count(self, status: str) -> int:
         """Return the number of units with this status."""
         return sum(row.status == status for row in self.rows)
+
+    @property
+    def doubtful(self) -> list[Row]:
+        """The units whose record is not ``good``, the ``bad`` ones first."""
+        return [row for state in ("bad", "look") for row in self.rows if row.verdict == state]
+
+    @property
+    def judged(self) -> str:
+        """How many records are good, and which are not and why, as ``2 good, 1 look: SN2 ...``; empty without any."""
+        same: dict[str, list[str]] = {}
+        for row in self.doubtful:
+            same.setdefault(row.first_reason, []).append(row.unit.serial)
+        named = [f"{first_of(serials, _NAMED)} {reason}" for reason, serials in same.items()]
+        return self.verdicts + (": " + first_of(named, _NAMED, "; ") if named else "")
+
+    @property
+    def verdicts(self) -> str:
+        """How many records are good, to be looked at, and bad, as ``2 good, 1 look``; empty without any."""
+        found = {state: sum(row.verdict == state for row in self.rows) for state in SENTENCES}
+        return ", ".join(f"{count} {state}" for state, count in found.items() if count)
 
     @property
     def failures(self) -> tuple[Row, ...]:

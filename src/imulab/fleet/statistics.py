@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,13 @@ from numpy.typing import NDArray
 from imulab.fleet.history import Past, sources_of
 from imulab.fleet.limits import Limits
 from imulab.fleet.work import Summary
+from imulab.procedures.procedure import OnLine
 from imulab.recording import Array
 from imulab.records.calibration import Parameter
 
 _MAD_TO_SIGMA = 1.482602218505602  # unrounded, as these numbers are shown in full
 _MEAN_TO_SIGMA = 1.2533141373155001
-_FEWEST_FOR_OUTLIERS = 8
+FEWEST_FOR_OUTLIERS = 8
 _SIZES = (8, 10, 12, 15, 20, 30, 50, 100, 300, 1000, 10000)
 _BEYOND = (7.90, 6.90, 6.29, 5.92, 5.24, 4.80, 4.46, 4.31, 4.34, 4.52, 4.84)
 """Largest robust z of so many normal values: passed by one sample in a hundred (simulated, 400 to 200 000 samples)."""
@@ -92,6 +94,11 @@ class ParameterStatistics:
     capability: Capability | None
 
     @property
+    def enough(self) -> bool:
+        """Whether there are enough units to tell which stand out."""
+        return math.isfinite(self.outlier_limit)
+
+    @property
     def outliers(self) -> NDArray[np.bool_]:
         """Which units stand out, shape (n,)."""
         return np.abs(self.z) > self.outlier_limit
@@ -137,7 +144,7 @@ def days_of(text: str) -> float | None:
 
 def outlier_limit(count: int) -> float:
     """Return the robust z beyond which a healthy line of this size shows a unit in one of a hundred cases."""
-    if count < _FEWEST_FOR_OUTLIERS:
+    if count < FEWEST_FOR_OUTLIERS:
         return math.inf
     return float(np.interp(math.log(count), np.log(_SIZES), _BEYOND))
 
@@ -151,12 +158,35 @@ def parameter_units(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
     return {key: count.most_common(1)[0][0] for key, count in found.items()}
 
 
+def not_compared(summaries: Sequence[Summary]) -> dict[tuple[str, str], str]:
+    """Return which parameters the units are not compared by, since they are about different numbers, and why."""
+    found: dict[tuple[str, str], str] = {}
+    for procedure in dict.fromkeys(summary.procedure for summary in summaries):
+        lines = [s.on_line for s in summaries if s.procedure == procedure and s.on_line is not None]
+        if not all(_mean_the_same(lines[0], line) for line in lines):
+            name, unit = lines[0].about
+            values = [line.means[0] for line in lines]
+            why = f"{name.replace('_', ' ')} from {min(values):z.1f} to {max(values):z.1f} {unit}"
+            if max(values) - min(values) <= lines[0].tolerance:
+                why = "model of different forms"
+            found |= {(procedure, own): why for line in lines for own in line.own}
+    return found
+
+
+def _mean_the_same(one: OnLine, other: OnLine) -> bool:
+    pairs = zip_longest(one.means, other.means, fillvalue=math.inf)
+    return all(abs(a - b) <= one.tolerance for a, b in pairs)
+
+
 def line_statistics(
     summaries: Sequence[Summary], limits: Mapping[tuple[str, str], Limits]
 ) -> list[ParameterStatistics]:
-    """Return the statistics of every parameter of every procedure, in the order of the records."""
+    """Return the statistics of every parameter that units can be compared by, in the order of the records."""
     found = []
+    left_out = not_compared(summaries)
     for (procedure, name), unit in parameter_units(summaries).items():
+        if (procedure, name) in left_out:
+            continue
         mine = [
             (summary, parameter)
             for summary in summaries
@@ -277,7 +307,9 @@ def changes_since(summaries: Sequence[Summary], past: Mapping[str, Sequence[Past
         same = last.sources == sources_of(summary)
         for name, new in summary.parameters.items():
             old = last.parameters.get(name)
-            if old is None or old.unit != new.unit:
+            # A history does not say what a calibration's own coefficients are about.
+            own = summary.on_line is not None and name in summary.on_line.own
+            if old is None or old.unit != new.unit or own:
                 continue
             u, z = _compared(new, summary.freedom, old, last.freedom)
             changes.append(

@@ -15,7 +15,10 @@ from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.work import Summary
 from imulab.writers import check_writable
 
-HEAD = ("serial", "procedure", "status", "reason", "warnings", "date", "created", "software", "files", "content_sha256")
+HEAD = (
+    "serial", "procedure", "status", "verdict", "reason", "warnings", "date", "created", "software", "files",
+    "content_sha256",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,9 +30,24 @@ class Row:
     reason: str
     summary: Summary | None
 
+    @property
+    def verdict(self) -> str:
+        """``good``, ``look`` or ``bad``, as its record says; empty without one."""
+        return "" if self.summary is None else self.summary.verdict.state
+
+    @property
+    def first_reason(self) -> str:
+        """The gravest reason of a verdict that is not good, and how many more there are."""
+        reasons = () if self.summary is None else self.summary.verdict.reasons
+        more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+        return reasons[0] + more if reasons else ""
+
 
 def columns_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
-    """Return the table by columns: the head, then ``name [unit]`` and ``std_name [unit]`` of every parameter."""
+    """Return the table by columns: the head, then ``name [unit]`` and ``std_name [unit]`` of every parameter.
+
+    ``reason`` is why a unit failed, or why its verdict is not good; ``warnings`` all that its record says.
+    """
     columns: dict[str, list[Any]] = {name: [] for name in HEAD}
     for number, row in enumerate(rows):
         found = row.summary
@@ -37,7 +55,8 @@ def columns_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
             row.unit.serial,
             row.unit.procedure,
             row.status,
-            row.reason,
+            row.verdict,
+            row.reason if found is None else " | ".join(found.verdict.reasons),
             "" if found is None else " | ".join(found.warnings),
             "" if found is None else found.date or "",
             "" if found is None else found.created,
@@ -47,6 +66,9 @@ def columns_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
         )
         for name, value in zip(HEAD, head, strict=True):
             columns[name].append(value)
+        if found is not None and found.on_line is not None:
+            title = "{} [{}]".format(*found.on_line.about)
+            columns.setdefault(title, [None] * len(rows))[number] = found.on_line.means[0]
         for name, parameter in {} if found is None else found.parameters.items():
             for title, number_found in (
                 (f"{name} [{parameter.unit}]", parameter.value),

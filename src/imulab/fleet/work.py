@@ -12,8 +12,11 @@ from imulab.errors import ImulabError
 from imulab.fleet.manifest import FleetUnit
 from imulab.fleet.sources import UnitFiles
 from imulab.fleet.store import MOST_ATTEMPTS, Store, request_of
+from imulab.procedures.procedure import OnLine
+from imulab.procedures.registry import PROCEDURES
 from imulab.procedures.run import run_task
 from imulab.records.calibration import Calibration, Parameter
+from imulab.verdict import UNJUDGED, Note, Verdict
 
 DONE, KEPT, FAILED, LEFT = "done", "kept", "failed", "left"
 """Made now; there already; refused, with a reason; not touched, because another run has taken over."""
@@ -36,7 +39,7 @@ class Summary:
     """What a run, its table and its history need to know of a record.
 
     `inputs` are the hashes of its files; `freedom` the degrees of freedom of its uncertainties, None where the noise
-    was known.
+    was known; `on_line` is what its own parameters are about, where that differs from record to record.
     """
 
     serial: str
@@ -49,6 +52,8 @@ class Summary:
     parameters: Mapping[str, Parameter]
     warnings: tuple[str, ...]
     freedom: float | None
+    verdict: Verdict = UNJUDGED
+    on_line: OnLine | None = None
 
     @property
     def when(self) -> str:
@@ -114,7 +119,8 @@ def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
     record = run_task(unit.procedure, unit.files, unit.options, files, label="column {}")
     others = [serial for serial in files.serials if serial != unit.serial]
     says = [
-        f"the file states serial {serial!r}, the manifest {unit.serial!r}: the manifest's is used" for serial in others
+        Note(f"the file states serial {serial!r}, the manifest {unit.serial!r}: the manifest's is used")
+        for serial in others
     ]
     made = {
         **request_of(unit),
@@ -132,6 +138,8 @@ def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
 def summarise(record: Calibration, content_sha256: str) -> Summary:
     """Return what table and history need of a record that `make_record` has made."""
     made = record.sections["fleet"]
+    hook = PROCEDURES[made["procedure"]].on_line
+    on_line = None if hook is None else hook(record)
     return Summary(
         serial=record.sensor["serial"],
         procedure=made["procedure"],
@@ -140,9 +148,11 @@ def summarise(record: Calibration, content_sha256: str) -> Summary:
         software=record.software,
         content_sha256=content_sha256,
         inputs=tuple(item["sha256"] for item in made["inputs"]),
-        parameters=dict(record.parameters),
+        parameters={**record.parameters, **({} if on_line is None else on_line.parameters)},
         warnings=record.warnings,
-        freedom=_freedom(record),
+        freedom=_freedom(record) if on_line is None else on_line.freedom,
+        verdict=record.verdict,
+        on_line=on_line,
     )
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from imulab.device.tables import DeviceTable
     from imulab.device.unit import DeviceUnit
     from imulab.recording import Recording, Source
-    from imulab.records.calibration import Calibration
+    from imulab.records.calibration import Calibration, Parameter
     from imulab.records.comparison import Change
     from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, LinearFit, Triads
     from imulab.report.elements import Exhibits
@@ -130,6 +130,33 @@ class Row:
 
 
 @dataclass(frozen=True)
+class OnLine:
+    """What units of a line are compared by, where a record's parameters mean what only that record says.
+
+    Attributes
+    ----------
+    parameters
+        Further parameters, which mean the same in every record that has them.
+    about
+        What the record's own parameters are about, and its unit: ``reference_temperature``.
+    means, tolerance
+        That number, and further ones that say what these parameters mean, as the knots of splines; records are compared
+        by them where all these agree within the tolerance.
+    own
+        The names of these parameters.
+    freedom
+        The fewest degrees of freedom of an uncertainty among `parameters`; None where all are known well.
+    """
+
+    parameters: Mapping[str, Parameter]
+    about: tuple[str, str]
+    means: tuple[float, ...]
+    tolerance: float
+    own: frozenset[str]
+    freedom: float | None
+
+
+@dataclass(frozen=True)
 class Procedure:
     """A procedure's entry in the registry.
 
@@ -184,6 +211,8 @@ class Procedure:
     comparable
         Two records to the same two with parameters that mean the same in both, None where theirs do; raises RecordError
         where there are none.
+    on_line
+        Record to what units of a line are compared by; None where a parameter means the same in all records.
     heading
         Record to what adds magnetic heading and dip to a recording that it corrected; raises RecordError where it holds
         no magnetometers. None where no record of the procedure does.
@@ -218,6 +247,7 @@ class Procedure:
     change_unit: Callable[[Change, Calibration], tuple[float, str]] | None = None
     same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
     comparable: Callable[[Calibration, Calibration], tuple[Calibration, Calibration]] | None = None
+    on_line: Callable[[Calibration], OnLine] | None = None
     heading: Callable[[Calibration], Callable[[Recording], Recording]] | None = None
     beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None
     beyond_message: Callable[[Calibration, int, float], str] | None = None

@@ -1,4 +1,4 @@
-// Draws `plots`: again where the window becomes a phone's, night falls, or the page goes to paper.
+// Draws `plots`: again where the window becomes a phone's, night falls, or the page goes to paper. Marks tables that scroll.
 const source = JSON.stringify(plots);
 const night = {
   "#ffffff": "#1a2228", "#22303a": "#dce5ea", "#e6eaed": "#35414a", "#d5dbdf": "#4a5761", "#9aa5ad": "#8997a1",
@@ -33,4 +33,7 @@ dark.addEventListener("change", () => draw(false));
 slim.addEventListener("change", () => draw(false));
 addEventListener("beforeprint", () => draw(true));
 addEventListener("afterprint", () => draw(false));
+const mark = new ResizeObserver(boxes => boxes.forEach(({ target }) =>
+  target.parentElement.classList.toggle("wider", target.scrollWidth > target.clientWidth + 1)));
+document.querySelectorAll(".scroll").forEach(box => mark.observe(box));
 document.documentElement.dataset.drawn = plots.filter(Boolean).length;

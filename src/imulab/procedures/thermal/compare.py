@@ -7,12 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from imulab.errors import RecordError
+from imulab.procedures.procedure import OnLine
 from imulab.procedures.thermal.model import AXES, GROUPS, Laws
 from imulab.procedures.thermal.sections import Model, thermal_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
+ON_LINE = np.arange(-60.0, 161.0, 20.0)
+"""Temperatures at which the units of a line are compared, degC: 20 degC is among them, where most are measured."""
+_SAME = 0.05  # K between reference temperatures, half of what temperatures are written to
 _LEAST = 1.0  # K that two ranges share, so that temperatures written to 0.1 degC differ
+Kind = tuple[str, tuple[str, ...], Laws, int]
+"""Of parameters: name, axes, laws, and which of these are its own."""
 
 
 def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Calibration, Calibration]:
@@ -29,23 +35,48 @@ def at_common_temperatures(first: Calibration, second: Calibration) -> tuple[Cal
         ranges = " and ".join(f"{model.range[0]:.1f} to {model.range[1]:.1f} degC" for model in models)
         raise RecordError(f"cannot compare laws over {ranges}; expected ranges that share {_LEAST:g} K or more")
     both = all(model.gyro is not None for model in models)
-    terms = [[laws.terms[group] for _, _, laws, group in _laws(model, both)] for model in models]
+    kinds = [_laws(model, both) for model in models]
+    terms = [[laws.terms[group] for _, _, laws, group in each] for each in kinds]
     counts = [max(of) for of in zip(*terms, strict=True)]
     low, high = np.ceil(10 * low) / 10, np.floor(10 * high) / 10
     nodes = [np.linspace(low, high, count) if count > 1 else np.array([0.5 * (low + high)]) for count in counts]
     nodes = [np.round(places, 1) for places in nodes]
-    return _at(first, nodes, both), _at(second, nodes, both)
+    return _at(first, kinds[0], nodes), _at(second, kinds[1], nodes)
 
 
-def _laws(model: Model, gyroscopes: bool) -> list[tuple[str, tuple[str, ...], Laws, int]]:
+def on_line(record: Calibration) -> OnLine:
+    """Return the values of a record's laws at those of the temperatures `ON_LINE` that lie in its range."""
+    model = thermal_of(record).model
+    about, laws = model.reference_temperature, _laws(model, model.gyro is not None)
+    if model.gyro is not None and model.gyro.scale == "turns":
+        laws.append(("gyro_scale_factor", AXES, model.gyro_laws, 1))
+    low, high = model.range
+    nodes = ON_LINE[(low <= ON_LINE) & (high >= ON_LINE)]
+    values = _at(record, laws, [nodes] * len(laws)) if nodes.size else replace(record, parameters={}, fit={})
+    freedom = [each for each in values.fit.get("degrees_of_freedom", {}).values() if each]
+    named = tuple(f"{kind}_{axis}" for kind, axes, _, _ in laws for axis in axes)
+    begun = tuple(f"{name}_" for name in named)  # powers, knots, and what a spline's value and slopes are at T0
+    own = frozenset(name for name in record.parameters if name in named or name.startswith(begun))
+    knots = *(model.knots or ()), *((model.gyro and model.gyro.knots) or ())
+    return OnLine(
+        values.parameters,
+        ("reference_temperature", about.unit),
+        (about.value, *knots),
+        _SAME,
+        own,
+        min(freedom, default=None),
+    )
+
+
+def _laws(model: Model, gyroscopes: bool) -> list[Kind]:
     """Return the kinds of parameters that follow the temperature: name, axes, laws, and which of these are its own."""
-    found: list[tuple[str, tuple[str, ...], Laws, int]] = []
+    found: list[Kind] = []
     found += [(kind, axes, model.laws, group) for group, (kind, axes) in enumerate(GROUPS)]
     return [*found, ("gyro_bias", AXES, model.gyro_laws, 0)] if gyroscopes else found
 
 
-def _at(record: Calibration, nodes: list[Array], gyroscopes: bool) -> Calibration:
-    """Return a record with the values of its laws at the temperatures of each kind, degC, in place of coefficients."""
+def _at(record: Calibration, laws: list[Kind], nodes: list[Array]) -> Calibration:
+    """Return a record with the values of these laws at temperatures of each, degC, in place of coefficients."""
     sections, names = thermal_of(record), record.covariance.names
     fit, turn_on, freedom = sections.fit, sections.fit.between_recordings, record.fit.get("degrees_of_freedom")
     scatters = {"bias": (turn_on.bias, turn_on.rank), "scale_factor": (turn_on.scale_factor, turn_on.rank)}
@@ -54,10 +85,10 @@ def _at(record: Calibration, nodes: list[Array], gyroscopes: bool) -> Calibratio
     rows, values, labels, units = [], [], [], []
     known: dict[str, float | None] = {}
     about = sections.model.reference_temperature.value
-    for (kind, axes, laws, group), own in zip(_laws(sections.model, gyroscopes), nodes, strict=True):
-        functions = laws.recorded(group, own, about)
+    for (kind, axes, law, group), own in zip(laws, nodes, strict=True):
+        functions = law.recorded(group, own, about)
         for axis in axes:
-            used = laws.named(group, f"{kind}_{axis}")
+            used = law.named(group, f"{kind}_{axis}")
             row = np.zeros((len(own), len(names)))
             row[:, [names.index(name) for name in used]] = functions
             rows.append(row)

@@ -38,4 +38,5 @@ ENTRY = Procedure(
     rows=deferred(f"{_HERE}.engineering:rows"),
     change_unit=deferred(f"{_HERE}.engineering:change_unit"),
     comparable=deferred(f"{_HERE}.compare:at_common_temperatures"),
+    on_line=deferred(f"{_HERE}.compare:on_line"),
 )
