@@ -128,7 +128,7 @@ def unit_vectors(vectors: Array) -> Array:
 def length_uncertainty(force: Array, shifts: Array, correlation: Array) -> Array:
     """Return the standard uncertainty of |f| of m forces (m, 3) by their record, from `moved_by_parameters`; (m,)."""
     along = np.sum(shifts * unit_vectors(force), axis=2)
-    return np.sqrt(np.maximum(np.einsum("pm,pq,qm->m", along, correlation, along), 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("pm,pq,qm->m", along, correlation, along), 0.0)))
 
 
 def moved_by_parameters(accel: Calibration, forces: Callable[[Calibration], Array]) -> tuple[Array, Array]:
