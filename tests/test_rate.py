@@ -156,11 +156,10 @@ def test_hysteresis_is_seldom_found_where_there_is_none():
     found = [il.fit_rate(il.simulate_rate(hold="2 s", seed=seed, rate="50 Hz")).calibration for seed in range(8)]
     axes = [axis for record in found for axis in record.fit["axes"].values()]
     assert sum(axis["loop"] < 0.01 for axis in axes) <= 2  # 24 tests at 1 %: more than 2 happens once in 500
-    # The fitted loop has an uncertainty. The largest of 11 differences has none: it was 1.1 to 2.6 times that of one.
+    # The largest of 11 differences is 1.1 to 2.6 times the uncertainty of one: the fitted loop is what is judged.
     squares = [(axis["fitted_loop"] / axis["fitted_loop_uncertainty"]) ** 2 for axis in axes]
     assert 0.3 < np.mean(squares) < 2.0  # 24 scatter by 0.29 about 1
     names = [f"gyro_{kind}_{axis}" for kind in ("nonlinearity", "hysteresis") for axis in "xyz"]
-    assert all(record.parameters[name].standard_uncertainty is None for record in found for name in names)
     assert not set(names) & set(found[0].covariance.names)
     changes = {each.name: each for each in il.compare_records(*found[:2]).changes}
     assert all(changes[name].deviations is None and not changes[name].significant for name in names)

@@ -65,7 +65,8 @@ def compared(
     """Compare two records of one unit by one procedure, in units of their combined uncertainty.
 
     A change counts as significant where it exceeds what chance gives one of all the parameters in twenty comparisons
-    (Bonferroni), by Student's t where a noise was estimated. A parameter without an uncertainty is shown, not judged.
+    (Bonferroni), by Student's t where a noise was estimated. A parameter without an uncertainty, or one that the
+    record keeps out of its covariance (the largest of several residuals), is shown, not judged.
     `same_meaning` says whether a parameter means the same in both, where its name does not.
 
     Raises
@@ -136,9 +137,11 @@ def _quantity_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -
 
 
 def _uncertainty(name: str, first: Calibration, second: Calibration) -> float | None:
-    """Return the uncertainty of a difference; None where one of the two is not stated."""
+    """Return the uncertainty of a difference; None where one is not stated, or is no part of the covariance."""
     a, b = (record.parameters[name].standard_uncertainty for record in (first, second))
     if a is None or b is None:
+        return None
+    if any(record.covariance.names and name not in record.covariance.names for record in (first, second)):
         return None
     return float(np.sqrt(max(a**2 + b**2 - _shared(first, second, [name])[0, 0], 0.0))) or None
 

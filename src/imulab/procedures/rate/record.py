@@ -51,10 +51,7 @@ def make_record(
         parameters[name] = Parameter(value, u, of, interval_95=None if wide is None else (value - wide, value + wide))
     figures = _figures(linearity) | dynamics_of(test, dwells)
     figures |= temperature_slopes(recordings, dwells, problem, solution)
-    known = {name: u for name, p in figures.items() if (u := p.standard_uncertainty) is not None}
-    joined = np.zeros((len(matrix) + len(known),) * 2)
-    joined[: len(matrix), : len(matrix)] = matrix
-    joined[len(matrix) :, len(matrix) :] = np.diag([u**2 for u in known.values()])
+    joint = _with_figures(names, matrix, figures)
     heads = [recording.metadata for recording in recordings]
     sensor = {key: text for head in heads for key in ("serial", "model", "element") if (text := head.get(key))}
     temperatures = [t for recording in recordings if (t := recording.mean_temperature()) is not None]
@@ -71,7 +68,7 @@ def make_record(
     return Calibration(
         procedure="rate",
         parameters=parameters | figures,
-        covariance=Covariance((*names, *known), tuple(map(tuple, joined.tolist()))),
+        covariance=joint,
         model=model,
         fit=_fit(test, problem, solution, linearity, dwells) | swept(test, dwells),
         options={"order": order if order == "auto" else int(order)},
@@ -88,6 +85,21 @@ def make_record(
             *of_sweeps(test, dwells),
         ),
     )
+
+
+def _with_figures(names: Sequence[str], matrix: Array, figures: Mapping[str, Parameter]) -> Covariance:
+    """Return the covariance of parameters and figures, as if these depended on nothing.
+
+    Noise lifts the largest of several: outside the covariance it is shown by comparisons, and not judged.
+    """
+    known = {
+        name: u
+        for name, p in figures.items()
+        if (u := p.standard_uncertainty) is not None and not any(f"_{kind}_" in name for kind in _LARGEST)
+    }
+    joined = np.diag(np.append(np.zeros(len(matrix)), np.square(list(known.values()))))
+    joined[: len(matrix), : len(matrix)] = matrix
+    return Covariance((*names, *known), tuple(map(tuple, joined.tolist())))
 
 
 def _largest(problem: Problem) -> float:
@@ -107,13 +119,13 @@ def _of_cycles(
 
 
 def _figures(linearity: Mapping[str, Linearity]) -> dict[str, Parameter]:
-    """Return the figures of each axis; noise alone lifts the largest of several, which no uncertainty describes."""
+    """Return the figures of each axis; the uncertainty of the largest of several is that of the one that is largest."""
     found = {}
     for kind, unit in (("nonlinearity", "1"), ("asymmetry", "1"), ("hysteresis", "1"), ("threshold", "rad/s")):
         for axis, of in linearity.items():
             pair = getattr(of, kind)
             if pair is not None:
-                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], None if kind in _LARGEST else pair[1], unit)
+                found[f"gyro_{kind}_{axis}"] = Parameter(pair[0], pair[1], unit)
     return found
 
 
