@@ -18,7 +18,7 @@ from imulab.procedures.rate.parameters import model_parameters
 from imulab.procedures.rate.solve import Problem, Solution
 from imulab.procedures.rate.sweeprecord import dynamics_of, motion_of, of_sweeps, swept
 from imulab.procedures.rate.temperature import temperature_slopes
-from imulab.recording import Recording
+from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.units import from_si, parse_unit
 from imulab.verdict import Bad, Note
