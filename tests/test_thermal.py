@@ -138,7 +138,7 @@ def test_a_tumble_record_is_a_prior():
 def test_the_record_goes_all_the_way(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["thermal", "simulate", "-o", "rec", "--attitudes", "10"], project=False) == 0
-    files = [str(path) for path in sorted((tmp_path / "rec").iterdir())]
+    files = [str(path) for path in sorted((tmp_path / "rec").glob("*.csv"))]
     assert main(["thermal", "fit", *files, "-o", "one.json", "--report", "one.html"], project=False) == 0
     assert main(["show", "one.json"], project=False) == 0
     said = capsys.readouterr().out

@@ -97,7 +97,7 @@ def test_a_simulation_without_a_recording_is_refused(tmp_path, capsys):
 
 def test_a_simulated_unit_comes_back_to_temperatures_in_files_of_their_own(tmp_path):
     assert main(["thermal", "simulate", "--temperatures=0,20,0", "--attitudes", "3", "-o", str(tmp_path)]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["tumble_0.csv", "tumble_0_2.csv", "tumble_20.csv"]
+    assert sorted(path.name for path in tmp_path.glob("*.csv")) == ["tumble_0.csv", "tumble_0_2.csv", "tumble_20.csv"]
 
 
 EIGHT = (-20.0, 0.0, 20.0, 40.0, 60.0, -20.3, 20.3, 60.3)
