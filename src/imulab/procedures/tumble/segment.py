@@ -282,8 +282,8 @@ def _drifts(recording: Recording) -> bool:
     if "temperature" not in recording:
         return False
     read = recording.column("temperature")
-    ends = np.quantile(read[np.isfinite(read)], [0.05, 0.95]) if np.isfinite(read).any() else np.zeros(2)
-    return bool(ends[1] - ends[0] > _DRIFT)
+    read = read[np.isfinite(read)]
+    return bool(read.size) and quantile(read, 0.95) - quantile(read, 0.05) > _DRIFT
 
 
 def _choose(candidates: list[_Pieces], *, drifting: bool = False) -> int:
