@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.procedures.thermal.choices import DEGREES
-from imulab.procedures.thermal.degrees import _part, clusters_of, tail
+from imulab.procedures.thermal.degrees import clusters_of, rows_where, tail
 from imulab.procedures.thermal.holds import Holds
 from imulab.procedures.thermal.model import Laws
 from imulab.procedures.thermal.rows import Problem, whitener
-from imulab.procedures.thermal.solve import Solution, _modes, between, excess_of, solve
+from imulab.procedures.thermal.solve import Solution, between, excess_of, offset_modes, solve
 
 _MOVES = 0.002
 """What biases hardly move by from one power cycle to the next, g."""
@@ -106,20 +106,20 @@ def _off(holds: Holds, problem: Problem, solution: Solution) -> list[str]:
     for number in numbers[attitudes >= _ATTITUDES].tolist():
         if not problem.shared[problem.recording == number].all():
             continue
-        others = _part(rows, whose != number)
+        others = rows_where(rows, whose != number)
         excess, freedom = excess_of(others, solution.excess**2)
         scatter, white = between(others, excess), whitener(others, excess, np.zeros(2))
         own = np.s_[3 * number : 3 * number + 3]
         stretch, told = max(float(scatter.tau[1]), _USUAL), freedom
         if stretch > _USUAL:  # few recordings told it
             bias, scale = (white(given) for given in others.offsets)
-            told = float(len(_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
+            told = float(len(offset_modes(np.hstack([white(others.jacobian), bias]), scale, white(others.residual))[0]))
         tests = [(1, np.array([_BENDS, stretch]), told, _OFF_SCALE)]
         if scatter.rank:
             tests.append((0, scatter.tau, float(scatter.rank), _OFF_BIAS))
         for kind, tau, told, least in tests:
             white = whitener(rows, excess, tau)
-            s, force = _modes(white(rows.jacobian), white(rows.offsets[kind][:, own]), white(rows.residual))
+            s, force = offset_modes(white(rows.jacobian), white(rows.offsets[kind][:, own]), white(rows.residual))
             if not len(s):
                 continue
             size = float(np.sqrt(np.sum((force / s) ** 2) / 3))

@@ -116,8 +116,8 @@ def splits(solution: Solution, cluster: NDArray[np.int64]) -> list[Split]:
     for number in range(1, int(cluster.max(initial=0))):
         jacobian, untold = _without_knot(rows.jacobian, solution.laws, number)
         train, test = at != number, (at == number) & rows.magnitude
-        white = whitener(_part(rows, train), solution.excess**2, solution.scatter.tau)
-        own = together(_part(rows, test), solution.excess**2, solution.scatter.tau)
+        white = whitener(rows_where(rows, train), solution.excess**2, solution.scatter.tau)
+        own = together(rows_where(rows, test), solution.excess**2, solution.scatter.tau)
         rest = white(jacobian[train]), white(target[train])
         found.append(Split(number, jacobian[test], target[test], own, *rest, untold))
     return found
@@ -159,7 +159,8 @@ def left_out(given: Sequence[Split], kept: NDArray[np.bool_]) -> list[LeftOut]:
     return found
 
 
-def _part(rows: Rows, which: NDArray[np.bool_]) -> Rows:
+def rows_where(rows: Rows, which: NDArray[np.bool_]) -> Rows:
+    """Return some of the rows, with every column."""
     return replace(
         rows,
         residual=rows.residual[which],

@@ -186,7 +186,7 @@ def between(rows: Rows, excess: float) -> Scatter:
     white = whitener(rows, excess, np.zeros(2))
     residual, laws = white(rows.residual), white(rows.jacobian)
     bias, scale = (white(given) for given in rows.offsets)
-    s, force = _modes(np.hstack([laws, bias]), scale, residual)
+    s, force = offset_modes(np.hstack([laws, bias]), scale, residual)
     second, probability = 0.0, None
     if len(s):
         probability = chi_square_probability(float((force**2).sum()), len(s))
@@ -194,7 +194,7 @@ def between(rows: Rows, excess: float) -> Scatter:
             second = _moments(s, force)
             white = whitener(rows, excess, np.array([0.0, second]))
             residual, laws, bias = white(rows.residual), white(rows.jacobian), white(rows.offsets[0])
-    s, force = _modes(laws, bias, residual)
+    s, force = offset_modes(laws, bias, residual)
     if not len(s):
         return Scatter(np.array([0.0, second]), 0, np.zeros(2), probability)
     tau = _moments(s, force)
@@ -202,7 +202,7 @@ def between(rows: Rows, excess: float) -> Scatter:
     return Scatter(np.array([tau, second]), len(s), np.array([tau**2 + typical, 0.0]), probability)
 
 
-def _modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, Array]:
+def offset_modes(laws: Array, offsets: Array, residual: Array) -> tuple[Array, Array]:
     """Return the singular values of the offsets beside the laws, and what the residual has along each."""
     columns = laws / np.maximum(np.linalg.norm(laws, axis=0), 1e-300)
     u, values, _ = np.linalg.svd(columns, full_matrices=False)
