@@ -15,9 +15,6 @@ ROOMS = [
 ]
 """From above (design.md); everything else lies in the root, below them all."""
 PROCEDURES = {path.parent.name for path in (SOURCE / "imulab" / "procedures").glob("*/entry.py")}
-FRONT = "imulab.procedures.front"
-"""What recordings and records show of themselves and are used for: only their own methods import it, when called."""
-BEHIND = {"imulab.recording", "imulab.records.calibration"}
 KNOWN_NAMES = {
     "imulab.device.blob",
     "imulab.device.tables",
@@ -40,26 +37,21 @@ MODULES = _modules()
 
 
 def _imported(node: ast.AST) -> set[str]:
-    """What a module imports anywhere, in functions too, but for what only type checkers see; C modules left out."""
-    if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-        return set().union(*map(_imported, node.orelse))
+    """What a module imports anywhere: in functions, for type checkers and by a name in a string; C modules left out."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("imulab."):
-        return {node.value.partition(":")[0]} & MODULES.keys()  # deferred("imulab.module:name")
+        return {node.value.partition(":")[0]} & MODULES.keys()
     if isinstance(node, ast.Import):
         return {each.name for each in node.names if each.name in MODULES}
     if isinstance(node, ast.ImportFrom):
         assert not node.level, "relative imports hide from where a name comes"
-        full = {each.name: f"{node.module}.{each.name}" for each in node.names}
-        found = {path for path in full.values() if path in MODULES}
-        values = [name for name, path in full.items() if path not in MODULES and not name.startswith("_")]
-        return found | ({node.module} & MODULES.keys() if values else set())
+        paths = {f"{node.module}.{each.name}" for each in node.names}
+        modules = paths & MODULES.keys()
+        return modules | ({node.module or ""} & MODULES.keys() if len(modules) < len(paths) else set())
     return set().union(*map(_imported, ast.iter_child_nodes(node)))
 
 
-ARROWS = {name: _imported(tree) - {name} for name, tree in MODULES.items()}
-TO_FRONT = {name for name in ARROWS if FRONT in ARROWS[name]}
-for module in TO_FRONT & BEHIND:
-    ARROWS[module] = ARROWS[module] - {FRONT}
+ARROWS = {name: _imported(tree) - {name} for name, tree in MODULES.items() if name != "imulab"}
+"""The face of the package hands names on, and is in nobody's way."""
 
 
 def _room(name: str) -> str:
@@ -81,14 +73,8 @@ def test_the_graph_is_that_of_the_package():
     assert "imulab.procedures.tumble.fit" in ARROWS["imulab.procedures.tumble.task"]  # within a function
 
 
-def test_only_methods_of_recordings_and_records_reach_up_to_the_front():
-    assert TO_FRONT == BEHIND
-    inside = [node for name in BEHIND for node in MODULES[name].body]
-    assert not any(FRONT in _imported(node) for node in inside if not isinstance(node, ast.ClassDef))
-
-
 def test_arrows_go_down_only():
-    above = {(a, b) for a in ARROWS for b in ARROWS[a] if a != "imulab" and _height(a) < _height(b)}
+    above = {(a, b) for a in ARROWS for b in ARROWS[a] if _height(a) < _height(b)}
     assert not above
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from imulab.errors import ReadError
 from imulab.readers import read, read_blocks
-from imulab.readers.layout import Layout, LayoutColumn
+from imulab.reading import Layout, LayoutColumn
 
 
 @pytest.fixture

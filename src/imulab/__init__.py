@@ -26,6 +26,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from imulab._version import VERSION as __version__  # noqa: N811
+from imulab.views import Views, hand_down
 
 if TYPE_CHECKING:
     from imulab.errors import ImulabError as ImulabError
@@ -43,8 +44,8 @@ if TYPE_CHECKING:
     from imulab.procedures.changes import compare_records as compare_records
     from imulab.procedures.exporting import export as export
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
-    from imulab.procedures.gyro_array.fuse import Fused as Fused
     from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
+    from imulab.procedures.gyro_array.fused import Fused as Fused
     from imulab.procedures.gyro_array.public import calibrate_array as calibrate_array
     from imulab.procedures.gyro_array.public import compare_methods as compare_methods
     from imulab.procedures.gyro_array.public import fuse as fuse
@@ -97,7 +98,7 @@ if TYPE_CHECKING:
 _HOME = {
     "ArrayFit": "procedures.gyro_array.fit",
     "FuseOptions": "procedures.gyro_array.fuse",
-    "Fused": "procedures.gyro_array.fuse",
+    "Fused": "procedures.gyro_array.fused",
     "allan_deviation": "procedures.allan",
     "calibrate_array": "procedures.gyro_array.public",
     "check_noise": "procedures.noise.check",
@@ -163,6 +164,16 @@ _HOME = {
 }
 
 __all__ = ["__version__", *_HOME]
+
+
+def _views() -> Views:
+    """Return what shows, applies and exports recordings and records, whose methods ask for it."""
+    from imulab.procedures import views
+
+    return views
+
+
+hand_down(_views)
 
 
 def __getattr__(name: str) -> Any:

@@ -15,12 +15,12 @@ from imulab.errors import DataError, UnitError
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.printable import has_hidden, printable
 from imulab.units import parse_unit, to_si
+from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
     import pandas
     import polars
 
-    from imulab.report.plots import Plot, Plots
 
 Array = NDArray[np.float64]
 
@@ -105,16 +105,14 @@ class Recording:
         return f"Recording({self.name}: {len(self)} samples of {titles})"
 
     def _repr_html_(self) -> str:
-        from imulab.procedures import front
-
-        return front.recording_html(self)
+        return views().recording_html(self)
 
     @overload
-    def plot(self, name: None = None) -> Plots: ...
+    def plot(self, name: None = None) -> AnyPlots: ...
     @overload
-    def plot(self, name: str | int) -> Plot: ...
+    def plot(self, name: str | int) -> AnyPlot: ...
     @checked
-    def plot(self, name: str | int | None = None) -> Plots | Plot:
+    def plot(self, name: str | int | None = None) -> AnyPlots | AnyPlot:
         """Return the columns over time, a figure for each sensor, or that of one sensor, such as ``"accel"``.
 
         Raises
@@ -122,9 +120,7 @@ class Recording:
         OptionError
             There is no such figure; the message lists them.
         """
-        from imulab.procedures import front
-
-        return front.recording_plots(self, name)
+        return views().recording_plots(self, name)
 
     def __len__(self) -> int:
         for column in self.columns.values():

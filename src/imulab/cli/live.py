@@ -19,7 +19,7 @@ from imulab.procedures.tumble.task import GRAVITY, ORDER, TASK
 
 if TYPE_CHECKING:
     from imulab.live.runner import Runner
-    from imulab.readers.layout import Layout
+    from imulab.reading import Layout
     from imulab.records.calibration import Calibration
 
 _WAIT = 0.05

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.device import _runtime
+import imulab.device._runtime as _runtime
 from imulab.device.array_settings import ArraySettings, array_table
 from imulab.device.tables import DeviceTable, pack
 from imulab.errors import DataError, OptionError, RecordError

@@ -13,7 +13,7 @@ from imulab.live.lines import LayoutDecoder, MotionCal, Native, XImu3, is_titles
 from imulab.live.packets import Mavlink, Msp, looks_like_mavlink, looks_like_msp
 from imulab.live.stamps import ArrivalClock, Counts, DeviceClock
 from imulab.printable import printable
-from imulab.readers.layout import Layout
+from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
 FIRST = 2.0

@@ -15,7 +15,7 @@ import numpy as np
 from imulab.columns import parse_column_title, triad
 from imulab.errors import OptionError, ReadError, UnitError, quoted
 from imulab.live.stamps import Counts
-from imulab.readers.layout import Layout
+from imulab.reading import Layout
 from imulab.recording import Array
 
 Rows = list[list[float]]

@@ -10,7 +10,7 @@ from imulab.live.further import FurtherFits, further_of
 from imulab.live.recorder import Recorder
 from imulab.live.session import Event, Session
 from imulab.live.sources import Source
-from imulab.readers.layout import Layout
+from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
 _SILENT = 3.0

@@ -16,8 +16,9 @@ from imulab.estimation.column_noise import FEWEST, curves_and_noise, noise_colum
 from imulab.estimation.noise_coefficients import NoiseCoefficients, coefficients_dict
 from imulab.estimation.sampling import sampling_rate
 from imulab.frames import is_frame, unmasked
-from imulab.procedures.inputs import Data, Part, Window, as_blocks, as_recording
+from imulab.procedures.inputs import as_blocks, as_recording
 from imulab.procedures.result import Drawn
+from imulab.reading import Data, Part, Window
 from imulab.recording import Array, Recording, check_finite
 from imulab.report.elements import Exhibits, Figure, ReportTable, format_uncertain
 from imulab.units import si_unit

@@ -8,63 +8,23 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias, TypedDict, get_type_hints
+from typing import Any, TypeAlias, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imulab.arguments import check, described
 from imulab.errors import DataError, OptionError, listed
-from imulab.frames import Frame, columns_of_arrays, is_frame, unmasked
+from imulab.frames import columns_of_arrays, is_frame, unmasked
 from imulab.procedures.result import Result
-from imulab.readers import Layout, read, read_blocks
+from imulab.readers import read, read_blocks
 from imulab.readers.selection import Selection
-from imulab.readers.selection import Window as Window
+from imulab.reading import Data, Reading, Sampling, Window
 from imulab.recording import Recording, Source
 from imulab.records.calibration import Calibration
 
-Data: TypeAlias = str | os.PathLike[str] | Recording | Frame | ArrayLike | Mapping[str, ArrayLike]
-"""A file, a recording, a data frame of pandas or polars, an array of samples, or arrays by name."""
 Record: TypeAlias = Calibration | Result | str | os.PathLike[str]
 """A record, a fit that holds it, or its file."""
-
-
-class Part(TypedDict, total=False):
-    """How data are to be understood: arrays and data frames by `time` to `units`, files by `layout` to `instance`.
-
-    Attributes
-    ----------
-    time
-        Times of an array, s, shape (n,).
-    unit
-        Unit of the sensors whose quantity it measures.
-    units
-        Units by sensor or column.
-    layout, topic, instance
-        As for `imulab.read`.
-    element
-        One IMU of several, from 1.
-    """
-
-    time: ArrayLike | None
-    unit: str | None
-    units: Mapping[str, str] | None
-    layout: str | os.PathLike[str] | Layout | None
-    topic: str | None
-    instance: int | None
-    element: int | None
-
-
-class Sampling(Part, total=False):
-    """The same, and `rate`: samples per second, Hz, of arrays without `time`."""
-
-    rate: float | None
-
-
-class Reading(Sampling, total=False):
-    """The same, and which part of them: `window`, first and last time, s, as ``(10, 60)`` or ``"10:60"``."""
-
-    window: Window | None
 
 
 _HINTS = get_type_hints(Reading, include_extras=True)

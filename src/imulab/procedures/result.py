@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     import pandas
     import polars
 
-    from imulab.procedures.inputs import Data, Reading
+    from imulab.reading import Data, Reading
     from imulab.recording import Array, Recording
     from imulab.report.plots import Plot, Plots
+    from imulab.views import AnyPlot, AnyPlots
 
 
 class Result:
@@ -43,11 +44,11 @@ class Result:
         self.calibration.report(path)
 
     @overload
-    def plot(self, name: None = None) -> Plots: ...
+    def plot(self, name: None = None) -> AnyPlots: ...
     @overload
-    def plot(self, name: str | int) -> Plot: ...
+    def plot(self, name: str | int) -> AnyPlot: ...
     @checked
-    def plot(self, name: str | int | None = None) -> Plots | Plot:
+    def plot(self, name: str | int | None = None) -> AnyPlots | AnyPlot:
         """Return the report's figures, or one of them; see `Calibration.plot`."""
         return self.calibration.plot(name)
 

@@ -19,9 +19,10 @@ from numpy.lib.stride_tricks import as_strided
 from imulab.columns import kind_of
 from imulab.errors import ImulabError, ReadError, UnitError, file_name
 from imulab.readers.formats import FORMATS, TEXT, recognised
-from imulab.readers.layout import IfNeeded, Layout, load_layout
-from imulab.readers.selection import Selection, Window
+from imulab.readers.layout import IfNeeded, load_layout
+from imulab.readers.selection import Selection
 from imulab.readers.text import TextFile
+from imulab.reading import Layout, Window
 from imulab.recording import Array, Recording, Source
 from imulab.verdict import Note
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import ReadError
-from imulab.readers.layout import Layout
 from imulab.readers.readings import Readings
+from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
 ROWS = 1 << 16

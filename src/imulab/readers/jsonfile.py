@@ -14,11 +14,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+import imulab.readers._text as _text
 from imulab.errors import ReadError, meant
-from imulab.readers import _text
 from imulab.readers.arrays import origins, recordings
-from imulab.readers.layout import Layout
 from imulab.readers.text import _DATE
+from imulab.reading import Layout
 from imulab.recording import Array, Recording
 from imulab.records.calibration import FORMAT
 from imulab.verdict import Note

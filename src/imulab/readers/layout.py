@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from imulab.columns import check_unit, expected_quantities
 from imulab.errors import ReadError, UnitError, listed, quoted
 from imulab.quantity_entries import check_keys, number_of, scale_factor_of, unit_of, value_and_unit
-from imulab.recording import Array
+from imulab.reading import Layout, LayoutColumn
 from imulab.toml import load_toml
 from imulab.units import Unit, conversion_factor, parse_unit, to_si
 
@@ -65,81 +61,6 @@ _BY_COLUMN = {
     "scale_factor": '{ value = 0.02, unit = "V/(deg/s)" }',
     "zero": '{ value = 2.5, unit = "V" }',
 }
-
-
-@dataclass(frozen=True, slots=True)
-class LayoutColumn:
-    """Where a column comes from (0-based number, or name in the header), and how it becomes a reading.
-
-    A reading in `unit` is (what was read x `scale` - `zero`) / `scale_factor`. Dates become seconds since the first.
-    """
-
-    origin: int | str
-    unit: str
-    scale: float = 1.0
-    zero: float = 0.0
-    scale_factor: float = 1.0
-    date: bool = False
-
-    def convert(self, values: Array) -> None:
-        """Turn what was read into readings, in place; a number that no reading can be becomes infinite."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            if self.scale != 1.0:
-                values *= self.scale
-            if self.zero != 0.0:
-                values -= self.zero
-            if self.scale_factor != 1.0:
-                values /= self.scale_factor
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where the columns of a foreign file are.
-
-    ``delimiter`` is one character, a blank meaning any run of blanks; ``decimal`` a point or a comma; ``sample_rate``
-    in Hz or None; ``encoding`` that of the header's names; ``prefix`` the first field of the lines that count (what
-    that field begins with, where the prefix ends with a colon), or nothing; ``text`` says that the file is delimited
-    text whatever it looks like (it names a delimiter); ``if_needed`` that it is left out where a file says itself what
-    its columns are.
-    """
-
-    columns: Mapping[str, LayoutColumn]
-    delimiter: str = " "
-    header: bool = False
-    skip_lines: int = 0
-    sample_rate: float | None = None
-    metadata: Mapping[str, str] | None = None
-    name: str = "layout"
-    text: bool = False
-    decimal: str = "."
-    encoding: str = "utf-8"
-    prefix: str = ""
-    skip_incomplete: bool = False
-    if_needed: bool = False
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Name to unit of the columns as `Readings` makes them."""
-        known = {name: column.unit for name, column in self.columns.items()}
-        return (
-            known if self.sample_rate is None else {**({} if "time" in known else {"time": "s"}), **known, "time": "s"}
-        )
-
-    def behind_prefix(self, fields: list[str]) -> list[str] | None:
-        """Return the fields of a line behind the prefix, None where it does not begin with it."""
-        first = fields[0].strip()
-        if not self.prefix:
-            return fields
-        if first == self.prefix:
-            return fields[1:]
-        glued = self.prefix.endswith(":") and first.startswith(self.prefix)
-        return [first.removeprefix(self.prefix), *fields[1:]] if glued else None
-
-    def skipped(self, count: int, *, so_far: bool = False) -> str:
-        """Say how many rows were skipped by ``skip_incomplete``."""
-        what, lack = ("rows were", "lack") if count > 1 else ("row was", "lacks")
-        columns, far = " ".join(self.columns), " so far" if so_far else ""
-        return f"{count} {what}{far} skipped that {lack} a reading of {columns} (skip_incomplete in {self.name})"
 
 
 class IfNeeded(str):

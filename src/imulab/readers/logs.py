@@ -10,8 +10,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+import imulab.readers._logs as _logs
 from imulab.errors import ReadError
-from imulab.readers import _logs
 
 ULOG, DATAFLASH, MCAP, ROSBAG = range(4)
 MORE, FULL, DAMAGED = range(3)

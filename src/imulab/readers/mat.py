@@ -19,8 +19,8 @@ import numpy as np
 
 from imulab.errors import ReadError
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
-from imulab.readers.layout import Layout
 from imulab.readers.unpacking import Budget, unpack
+from imulab.reading import Layout
 from imulab.recording import Array, Recording
 
 _HEAD = 128

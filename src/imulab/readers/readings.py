@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from imulab.errors import ReadError
-from imulab.readers.layout import Layout
+from imulab.reading import Layout
 from imulab.recording import Array
 
 _COUNTERS = [2.0**8, 2.0**16, 2.0**32]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, TypeAlias
 
 import numpy as np
 
@@ -12,11 +11,8 @@ from imulab.arguments import check_fields
 from imulab.columns import element_number
 from imulab.errors import OptionError
 from imulab.quantities import span
+from imulab.reading import Ends, Window
 from imulab.recording import Recording
-
-Ends: TypeAlias = tuple[float | None, float | None]
-Window: TypeAlias = Annotated[str | Ends, "(FROM, TO) in s, such as (10, 60) or '10:60'"]
-"""First and last time to read, s, each None for no bound; the bounds belong to the window."""
 
 
 @dataclass(frozen=True, slots=True)

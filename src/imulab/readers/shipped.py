@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from imulab.readers.layout import Layout, load_layout, shipped_file, shipped_names
+from imulab.readers.layout import load_layout, shipped_file, shipped_names
 from imulab.readers.text import titles_of
+from imulab.reading import Layout
 
 _MOST_LINES = 200
 

@@ -15,12 +15,12 @@ from typing import BinaryIO
 
 import numpy as np
 
+import imulab.readers._text as _text
 from imulab.columns import parse_column_title
 from imulab.errors import ReadError, several
-from imulab.readers import _text
-from imulab.readers.layout import Layout
 from imulab.readers.lines import LONGEST_LINE, WORTH_SHARING, Lines, ParserThreads
 from imulab.readers.readings import BackwardsError, Readings
+from imulab.reading import Layout
 from imulab.recording import CORRECTED_BY, Recording
 from imulab.verdict import Note
 from imulab.writers.powers_of_ten import powers_of_five

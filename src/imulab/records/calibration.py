@@ -27,6 +27,7 @@ from imulab.recording import Source
 from imulab.records.json_text import content_sha256, sealed_text
 from imulab.records.json_text import json_text as json_text
 from imulab.verdict import UNJUDGED, Verdict, verdict_of
+from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -34,9 +35,8 @@ if TYPE_CHECKING:
     import pandas
     import polars
 
-    from imulab.procedures.inputs import Data, Reading
+    from imulab.reading import Data, Reading
     from imulab.recording import Recording
-    from imulab.report.plots import Plot, Plots
 
 FORMAT = "imulab.calibration"
 SCHEMA_VERSION = 1
@@ -226,23 +226,20 @@ class Calibration:
     @checked
     def load(cls, path: str | PathLike[str]) -> Calibration:
         """Read a record; see `imulab.load`."""
-        from imulab.procedures import front
-
-        return front.load(Path(path))
+        record: Calibration = views().load(Path(path))
+        return record
 
     @checked
     def report(self, path: str | Path) -> None:
         """Write the report as one HTML file; see `imulab.write_report`."""
-        from imulab.procedures import front
-
-        front.write_report(self, path)
+        views().write_report(self, path)
 
     @overload
-    def plot(self, name: None = None) -> Plots: ...
+    def plot(self, name: None = None) -> AnyPlots: ...
     @overload
-    def plot(self, name: str | int) -> Plot: ...
+    def plot(self, name: str | int) -> AnyPlot: ...
     @checked
-    def plot(self, name: str | int | None = None) -> Plots | Plot:
+    def plot(self, name: str | int | None = None) -> AnyPlots | AnyPlot:
         """Return the report's figures, which show themselves in a notebook, or the one whose title has these words.
 
         Raises
@@ -258,9 +255,7 @@ class Calibration:
         >>> fit = il.fit_tumble(il.find_attitudes(il.simulate_tumble(gravity=9.81)), order=1, gravity=9.81)
         >>> fit.calibration.plot("sphere").save("sphere.html")
         """
-        from imulab.procedures import front
-
-        return front.plots(self, name)
+        return views().plots(self, name)
 
     @overload
     def to_frame(self, library: Literal["pandas"] | None = None) -> pandas.DataFrame: ...
@@ -300,26 +295,19 @@ class Calibration:
     @checked
     def apply(self, data: Data, *, again: bool = False, heading: bool = False, **reading: Unpack[Reading]) -> Recording:
         """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`."""
-        from imulab.procedures import front
-
-        return front.apply_to(self, data, reading, again=again, heading=heading)
+        corrected: Recording = views().apply_to(self, data, reading, again=again, heading=heading)
+        return corrected
 
     @checked
     def export(self, target: str, folder: str | Path, **options: Any) -> list[Path]:
         """Write the record in the form of firmware or another program; see `imulab.export` for targets and options."""
-        from imulab.procedures import front
-
-        return front.export_to(self, target, folder, **options)
+        return views().export_to(self, target, folder, **options)
 
     def __repr__(self) -> str:
-        from imulab.procedures import front
-
-        return front.text(self)
+        return views().text(self)
 
     def _repr_html_(self) -> str:
-        from imulab.procedures import front
-
-        return front.html(self)
+        return views().html(self)
 
     def __str__(self) -> str:
         lines = [f"{self.procedure} calibration of {self.sensor.get('serial', 'a unit without serial number')}"]

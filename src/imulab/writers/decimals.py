@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
+import imulab.writers._digits as _digits
 from imulab.recording import Array
-from imulab.writers import _digits
 from imulab.writers.powers_of_ten import powers_of_ten
 
 

@@ -18,7 +18,8 @@ from imulab.procedures.gyro_array.bandwidth import Response, responses
 from imulab.procedures.gyro_array.checks import Checks
 from imulab.procedures.gyro_array.clocks import on_one_clock
 from imulab.procedures.gyro_array.compare_figures import exhibits_of_comparison
-from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
+from imulab.procedures.gyro_array.fuse import FuseOptions, fuse, open_stream
+from imulab.procedures.gyro_array.fused import Fused
 from imulab.procedures.gyro_array.memory import memory_text
 from imulab.procedures.gyro_array.model import FEWEST_ROBUST, Elements, array_calibration, feedback_notes, find_elements
 from imulab.procedures.gyro_array.sections import MethodRow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from imulab.estimation.rows import HISTORY, zero_rows
 from imulab.procedures.gyro_array.blobs import blob_stream, fusion_of_blob
 from imulab.procedures.gyro_array.checks import Checks
 from imulab.procedures.gyro_array.clocks import Clock, to_one_clock
+from imulab.procedures.gyro_array.fused import Fused
 from imulab.procedures.gyro_array.health import Health
 from imulab.procedures.gyro_array.kalman import RATE_WALK, default_bias_walk, noise_about_mean, steady_gain
 from imulab.procedures.gyro_array.memory import memory_text
@@ -30,10 +31,8 @@ from imulab.procedures.gyro_array.model import (
     find_elements,
 )
 from imulab.procedures.gyro_array.sections import model_of
-from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
-from imulab.report.elements import Exhibits
 from imulab.units import from_si, parse_unit
 
 _NEED_THREE = ("robust", "support", "least-squares")
@@ -115,64 +114,6 @@ class FuseOptions:
             raise OptionError(f"rate walk {self.rate_walk:g}: expected 0 or more")
         if self.still is not None and not self.still[0] < self.still[1]:
             raise OptionError(f"still {self.still[0]:g}:{self.still[1]:g}: expected a start before its end")
-
-
-@dataclass(frozen=True, repr=False)
-class Fused(Drawn):
-    """The fused rate.
-
-    Attributes
-    ----------
-    time
-        s, shape (m,).
-    rate
-        In the unit of the readings, shape (m, axes).
-    weights, flags
-        Of each gyro in each sample, shape (m, axes, n), or None where they were not asked for.
-    elements
-        The columns that were fused.
-    health
-        What happened to each gyro.
-    block
-        The samples that were fused.
-    notes
-        Gaps in time, and whatever else a user should know.
-
-    Examples
-    --------
-    >>> import imulab as il
-    >>> fused = il.fuse(il.simulate_array(experiment="static", duration=10.0))
-    >>> fused.rate.shape == (len(fused.time), 1)
-    True
-    """
-
-    time: Array
-    rate: Array
-    weights: Array | None
-    flags: np.ndarray | None
-    elements: Elements
-    health: Health
-    block: Recording
-    notes: tuple[str, ...] = ()
-
-    subject: ClassVar[str] = "Fused rate"
-
-    def exhibits(self) -> Exhibits:
-        """Return the rate and the state of the gyros over time."""
-        from imulab.procedures.gyro_array.fused_figures import exhibits_of_fused
-
-        return exhibits_of_fused(self)
-
-    def recording(self) -> Recording:
-        """Return the fused rate as a recording, with the time and the head of what was fused: ``write`` takes it."""
-        columns, units = {"time": self.block.columns["time"]}, {"time": self.block.units["time"]}
-        for a, (name, unit) in enumerate(zip(self.elements.rate_names(), self.elements.units, strict=True)):
-            columns[name], units[name] = np.ascontiguousarray(self.rate[:, a]), unit
-        return replace(self.block, columns=columns, units=units, notes=())
-
-    def __repr__(self) -> str:
-        gyros, axes = self.elements.count, len(self.elements.axes)
-        return f"Fused({len(self.time)} samples of {gyros} gyros on {axes} axes, in {' '.join(self.elements.units)})"
 
 
 def fuse(

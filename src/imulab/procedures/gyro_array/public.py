@@ -15,13 +15,15 @@ from imulab.errors import DataError, OptionError
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.fit import ArrayFit
-from imulab.procedures.gyro_array.fuse import Fused, FuseOptions
+from imulab.procedures.gyro_array.fuse import FuseOptions
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
+from imulab.procedures.gyro_array.fused import Fused
 from imulab.procedures.gyro_array.kalman import RATE_WALK
 from imulab.procedures.gyro_array.memory import carried, fusion_text
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
-from imulab.procedures.inputs import Data, Part, Reading, Record, Window, as_record, as_recording, check_keywords
+from imulab.procedures.inputs import Record, as_record, as_recording, check_keywords
 from imulab.quantities import in_si, interval
+from imulab.reading import Data, Part, Reading, Window
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 

@@ -21,13 +21,14 @@ from imulab.estimation.noise.spectrum import Spectrum
 from imulab.estimation.noise.terms import NAMES, prepare
 from imulab.estimation.noise.use import edge_as_white
 from imulab.estimation.ranked import NORMAL_95
-from imulab.procedures.inputs import Data, Reading, as_record
+from imulab.procedures.inputs import as_record
 from imulab.procedures.noise.engineering import label
 from imulab.procedures.noise.fit import fit_recordings
 from imulab.procedures.noise.logs import given_log
 from imulab.procedures.noise.sections import Column, Fit, drawn_of, fit_of
 from imulab.procedures.result import Drawn
 from imulab.quantities import fraction
+from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits

@@ -15,7 +15,7 @@ from imulab.report.elements import plain_number
 from imulab.verdict import Note
 
 if TYPE_CHECKING:
-    from imulab.procedures.noise.fit import ColumnModel, Drift
+    from imulab.procedures.noise.model import ColumnModel, Drift
 
 _MANY_SPIKES = 0.01
 _MOST_NAMED = 3

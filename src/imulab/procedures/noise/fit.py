@@ -13,75 +13,26 @@ from numpy.typing import NDArray
 from imulab.arguments import checked
 from imulab.errors import DataError, OptionError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
-from imulab.estimation.noise.analysis import Analysis, analysed, without_steps
+from imulab.estimation.noise.analysis import analysed, without_steps
 from imulab.estimation.noise.choice import CANDIDATES
-from imulab.estimation.noise.cleaning import PERHAPS, Line, Step
+from imulab.estimation.noise.cleaning import PERHAPS
 from imulab.estimation.noise.cosine import Stretch
-from imulab.estimation.noise.regression import Regression, ramp_coefficients
+from imulab.estimation.noise.regression import ramp_coefficients
 from imulab.estimation.noise.rest import Rest, at_rest
 from imulab.frames import is_frame
-from imulab.procedures.inputs import Data, Reading
 from imulab.procedures.noise.choices import HORIZON, NO_COVARIATE, SAY_STEPS, check_options
 from imulab.procedures.noise.logs import given_log
+from imulab.procedures.noise.model import ColumnModel, Drift
 from imulab.procedures.noise.record import make_record
 from imulab.procedures.options import names_of_columns
 from imulab.procedures.result import Result
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording, Source
 from imulab.records.calibration import Calibration
 from imulab.units import parse_unit, si_unit
 
 _SAME_RATE = 0.01
-_COVARIATE_UNITS = {"time": "s", "temperature": "K"}
-
-
-@dataclass(frozen=True)
-class Drift:
-    """How a column follows time or temperature: slope and its uncertainty in SI, with the models without and with it.
-
-    `taken` says whether the model is that of what is left.
-    """
-
-    covariate: str
-    found: Regression
-    letters: tuple[str, str]
-    taken: bool
-
-    @property
-    def slope(self) -> float:
-        """Unit of the column over that of the covariate."""
-        return float(self.found.slope[0])
-
-    @property
-    def standard_uncertainty(self) -> float:
-        """Of the slope."""
-        return float(self.found.standard_uncertainty[0])
-
-
-@dataclass(frozen=True)
-class ColumnModel:
-    """The noise of a column.
-
-    Attributes
-    ----------
-    name, unit
-        Of the column; the unit in SI.
-    analysis
-        Spectrum, candidates, chosen model.
-    spikes, knocks, lines, steps
-        What was found that is no noise; of knocks start and length, s.
-    drifts
-        How it follows time and temperature.
-    """
-
-    name: str
-    unit: str
-    analysis: Analysis
-    spikes: int
-    knocks: tuple[tuple[float, float], ...]
-    lines: tuple[Line, ...]
-    steps: tuple[Step, ...]
-    drifts: tuple[Drift, ...]
 
 
 @dataclass(frozen=True, repr=False)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from imulab.disk import is_large, on_disk
 from imulab.estimation.noise.long_rest import long_rest
 from imulab.estimation.noise.rest import Rest
-from imulab.procedures.inputs import Data, Reading, as_blocks, as_recording
+from imulab.procedures.inputs import as_blocks, as_recording
+from imulab.reading import Data, Reading
 from imulab.recording import Recording, Source
 
 

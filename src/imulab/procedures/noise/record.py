@@ -21,7 +21,7 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 
 if TYPE_CHECKING:
     from imulab.estimation.noise.cleaning import Step
-    from imulab.procedures.noise.fit import ColumnModel, Drift
+    from imulab.procedures.noise.model import ColumnModel, Drift
 
 _DIGITS = 7
 _TAILS = (0.025, 0.975)

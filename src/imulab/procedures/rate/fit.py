@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from imulab.earth import EARTH
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
 from imulab.gravity import checked_latitude
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.inputs import Record, as_record, as_recording
 from imulab.procedures.rate.axes import TableAxes, find_axes, length_said, other_unit_said, with_accelerometers
 from imulab.procedures.rate.choices import AXES, MOUNTINGS, ORDERS, gyros_of, part_of_one, rates_of
 from imulab.procedures.rate.dwells import Dwells, find_dwells, gyro_columns
@@ -28,6 +28,7 @@ from imulab.procedures.rate.simulate import RateRecordings
 from imulab.procedures.rate.solve import Problem, Solution, solve, without_lean
 from imulab.procedures.result import Result
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 

@@ -31,7 +31,7 @@ from imulab.units import from_si
 from imulab.verdict import UNJUDGED
 
 if TYPE_CHECKING:
-    from imulab.procedures.rate.turns import AxisTurns
+    from imulab.procedures.rate.turnrests import AxisTurns
 
 _TURN = 2 * np.pi
 _SMOOTH = 0.05  # s

@@ -21,7 +21,7 @@ from imulab.units import from_si
 from imulab.verdict import Bad, Note
 
 if TYPE_CHECKING:
-    from imulab.procedures.rate.turns import AxisTurns
+    from imulab.procedures.rate.turnrests import AxisTurns
 
 _FAR = 0.1
 _LOOKS = {"x": ("circle", INK), "y": ("diamond", GOOD), "z": ("square", BAD)}

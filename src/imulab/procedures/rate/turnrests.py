@@ -19,6 +19,34 @@ _TURNED = np.radians(15)
 
 
 @dataclass(frozen=True)
+class AxisTurns:
+    """The turns about one body axis.
+
+    Attributes
+    ----------
+    count, angle
+        Turns made, signed, and the angle that the gyroscope states, rad, shape (k,).
+    residual, uncertainty
+        What is left of each angle by the scale factor found, and its standard uncertainty, rad, shape (k,).
+    scale, scale_uncertainty
+        Stated over true angle.
+    freedom
+        Turns less one where they scatter beyond the fence, and that scatter is in the uncertainty; else None.
+    motion
+        Number of each turn among the motions, shape (k,).
+    """
+
+    count: Array
+    angle: Array
+    residual: Array
+    uncertainty: Array
+    scale: float
+    scale_uncertainty: float
+    freedom: int | None
+    motion: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Motions:
     """What happened between rests, m of them.
 

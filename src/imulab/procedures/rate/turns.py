@@ -15,15 +15,16 @@ import numpy as np
 
 from imulab.errors import DataError, OptionError
 from imulab.estimation.least_squares import chi_square_probability
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.inputs import Record, as_record, as_recording
 from imulab.procedures.rate.axes import BY_ACCELEROMETERS, other_unit_said, with_accelerometers
 from imulab.procedures.rate.choices import AXES, FENCE, gyros_of, part_of_one
 from imulab.procedures.rate.prior import prior_at, with_prior
 from imulab.procedures.rate.turnaxes import check_accel, with_axes
 from imulab.procedures.rate.turnrecord import turns_record
-from imulab.procedures.rate.turnrests import Motions, carried, composed, find_motions
+from imulab.procedures.rate.turnrests import AxisTurns, Motions, carried, composed, find_motions
 from imulab.procedures.result import Result
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 
@@ -36,34 +37,6 @@ _ASKEW = 0.4
 _CHANCE = 0.01
 _FACTORS = np.geomspace(0.4, 2.5, 41)
 _CARRIES = np.radians(15)
-
-
-@dataclass(frozen=True)
-class AxisTurns:
-    """The turns about one body axis.
-
-    Attributes
-    ----------
-    count, angle
-        Turns made, signed, and the angle that the gyroscope states, rad, shape (k,).
-    residual, uncertainty
-        What is left of each angle by the scale factor found, and its standard uncertainty, rad, shape (k,).
-    scale, scale_uncertainty
-        Stated over true angle.
-    freedom
-        Turns less one where they scatter beyond the fence, and that scatter is in the uncertainty; else None.
-    motion
-        Number of each turn among the motions, shape (k,).
-    """
-
-    count: Array
-    angle: Array
-    residual: Array
-    uncertainty: Array
-    scale: float
-    scale_uncertainty: float
-    freedom: int | None
-    motion: tuple[int, ...]
 
 
 @dataclass(frozen=True, repr=False)

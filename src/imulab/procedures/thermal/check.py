@@ -13,7 +13,7 @@ from imulab.columns import triad
 from imulab.earth import at_latitude
 from imulab.errors import DataError, OptionError, RecordError, UnitError
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.inputs import Record, as_record, as_recording
 from imulab.procedures.result import Drawn
 from imulab.procedures.thermal.checks import check_holds, prepared
 from imulab.procedures.thermal.gyrocheck import GyroCheck, check_gyros
@@ -24,6 +24,7 @@ from imulab.procedures.thermal.record import of_record
 from imulab.procedures.thermal.rows import Problem, linearise, together
 from imulab.procedures.thermal.sections import thermal_of
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits

@@ -13,7 +13,7 @@ from imulab.earth import EarthRate, at_latitude
 from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.inputs import Record, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.thermal.checks import check_holds, prepared
 from imulab.procedures.thermal.choices import further_of, laws_of
@@ -29,6 +29,7 @@ from imulab.procedures.thermal.record import make_record
 from imulab.procedures.thermal.rows import Problem
 from imulab.procedures.thermal.solve import Solution
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.units import conversion_factor, parse_unit

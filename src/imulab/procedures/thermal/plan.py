@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import ObservabilityError, OptionError
-from imulab.procedures.inputs import Data
 from imulab.procedures.thermal.choices import APART, DEGREES, LEAST_SPAN, degrees_of, further_of
 from imulab.procedures.thermal.design import Design, exchange, nodes, way
 from imulab.procedures.thermal.gyroplan import noise_and_scatter, plan_gyroscopes
@@ -18,6 +17,7 @@ from imulab.procedures.thermal.planned import PlannedSoak, ThermalPlan, Tried
 from imulab.procedures.tumble.plan import shortest_path, sphere_candidates
 from imulab.procedures.tumble.planning import Known, candidates_of, noise_of
 from imulab.quantities import in_si, temperature_list
+from imulab.reading import Data
 from imulab.recording import Array
 from imulab.units import STANDARD_GRAVITY
 

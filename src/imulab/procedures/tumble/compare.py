@@ -12,7 +12,7 @@ from imulab.errors import OptionError, RecordError
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.estimation.ranked import median
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Reading, Record, as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.result import Drawn
 from imulab.procedures.tumble.apply import output_factor
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -25,6 +25,7 @@ from imulab.procedures.tumble.prior import FALSE_ALARM, SCATTERED, contradiction
 from imulab.procedures.tumble.record import Scaling, scaled_parameters
 from imulab.procedures.tumble.sections import attitudes_of, fit_of, model_of
 from imulab.quantities import in_si
+from imulab.reading import Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.report.elements import Exhibits

@@ -12,7 +12,7 @@ from imulab.earth import at_latitude
 from imulab.errors import OptionError
 from imulab.estimation.least_squares import Observability
 from imulab.gravity import Gravity, at_place, local_gravity
-from imulab.procedures.inputs import Reading, Record, as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble import texts
 from imulab.procedures.tumble.attitudes import Attitudes
@@ -30,6 +30,7 @@ from imulab.procedures.tumble.orders import OrderRow
 from imulab.procedures.tumble.record import make_record
 from imulab.procedures.tumble.sections import model_of
 from imulab.quantities import in_si, whole
+from imulab.reading import Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 

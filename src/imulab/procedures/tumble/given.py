@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imulab.errors import DataError, OptionError
-from imulab.procedures.inputs import Data, Reading, Sampling, as_recording
+from imulab.procedures.inputs import as_recording
 from imulab.procedures.tumble.attitudes import Attitudes
 from imulab.procedures.tumble.segment import find_attitudes
+from imulab.reading import Data, Reading, Sampling
 from imulab.recording import Array
 
 TumbleData: TypeAlias = Attitudes | Data

@@ -7,13 +7,14 @@ from os import PathLike
 from typing import Any, Unpack
 
 from imulab.earth import at_latitude
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.inputs import Record, as_record, as_recording
 from imulab.procedures.result import Result
 from imulab.procedures.tumble import gyro
 from imulab.procedures.tumble.gyro import GyroFit
 from imulab.procedures.tumble.gyrorecord import with_gyro
 from imulab.procedures.tumble.segment import find_attitudes
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.records.calibration import Calibration
 
 

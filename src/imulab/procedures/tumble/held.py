@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+import imulab.procedures.tumble._segment as _segment
 from imulab.estimation.ranked import distinct, median, medians
-from imulab.procedures.tumble import _segment
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Motion
 from imulab.recording import Array, Recording
 

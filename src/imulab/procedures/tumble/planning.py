@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from imulab.errors import ImulabError, OptionError, RecordError
-from imulab.procedures.inputs import Data, as_recording
+from imulab.procedures.inputs import as_recording
 from imulab.procedures.loading import load
 from imulab.procedures.tumble import plan
 from imulab.procedures.tumble.choices import STARTS
@@ -24,6 +24,7 @@ from imulab.procedures.tumble.sections import attitudes_of, data_of, fit_of, mod
 from imulab.procedures.tumble.segment import find_attitudes
 from imulab.procedures.tumble.sheet import directions_of, norths_of
 from imulab.quantities import in_si, quantity, whole
+from imulab.reading import Data
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.recognition import is_json

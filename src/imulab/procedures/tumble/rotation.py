@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.procedures.tumble import _rotation
+import imulab.procedures.tumble._rotation as _rotation
 from imulab.recording import Array
 
 

@@ -16,16 +16,17 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+import imulab.procedures.tumble._segment as _segment
 from imulab.columns import triad
 from imulab.errors import OptionError, SegmentError
 from imulab.estimation.ranked import median, quantile
 from imulab.estimation.rows import leave_out
-from imulab.procedures.inputs import Data, Sampling, as_recording
-from imulab.procedures.tumble import _segment
+from imulab.procedures.inputs import as_recording
 from imulab.procedures.tumble.attitude_table import attitude_table
 from imulab.procedures.tumble.attitudes import Attitudes, Trace
 from imulab.procedures.tumble.clipping import check_clipped_rows, check_clipping
 from imulab.procedures.tumble.held import SMALLEST_BLOCK, Held, covariance_and_motion, resolutions
+from imulab.reading import Data, Sampling
 from imulab.recording import Array, Recording, check_finite, check_time
 
 _BLOCK_SECONDS = 0.1

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Unpack
 import numpy as np
 
 from imulab.errors import DataError, OptionError, listed
-from imulab.procedures.inputs import Data, Reading, as_blocks
+from imulab.procedures.inputs import as_blocks
 from imulab.procedures.options import names_of_columns
 from imulab.procedures.result import Result
 from imulab.procedures.warmup.choices import BEYOND, EXITS, MODELS, POOLS, settling_size
@@ -31,6 +31,7 @@ from imulab.procedures.warmup.quality import after_of
 from imulab.procedures.warmup.record import make_record
 from imulab.procedures.warmup.solve import coefficient_covariance, statistics
 from imulab.quantities import in_si, number, temperature_list
+from imulab.reading import Data, Reading
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 

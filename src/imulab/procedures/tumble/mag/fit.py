@@ -11,7 +11,7 @@ import numpy as np
 from imulab.errors import DataError, OptionError, listed, quoted
 from imulab.estimation.least_squares import f_test
 from imulab.gravity import Gravity, at_place
-from imulab.procedures.inputs import Reading, Record, as_record
+from imulab.procedures.inputs import Record, as_record
 from imulab.procedures.result import Result
 from imulab.procedures.tumble.choices import LOSSES, MAG_ORDERS
 from imulab.procedures.tumble.given import TumbleData, as_attitudes
@@ -25,6 +25,7 @@ from imulab.procedures.tumble.mag.solve import Joint, solve
 from imulab.procedures.tumble.mag.stated import Place, stated_place
 from imulab.procedures.tumble.options import check_field
 from imulab.quantities import in_si
+from imulab.reading import Reading
 from imulab.records.calibration import Calibration
 
 _STEEPEST = np.radians(87.0)

@@ -1,19 +1,20 @@
-"""The figures of a fused rate: the rate over time, and when each gyro was not in use."""
+"""A fused rate as it shows itself: the rate over time, and when each gyro was not in use."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
-from imulab.procedures.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK
+from imulab.procedures.gyro_array.health import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK, Health
+from imulab.procedures.gyro_array.model import Elements
 from imulab.procedures.gyro_array.traces import curves, of_axis
+from imulab.procedures.result import Drawn
+from imulab.recording import Array, Recording
 from imulab.report.channels import thinned
 from imulab.report.elements import BAD, GOOD, INK, QUIET, Exhibits, Figure, ReportTable
 from imulab.report.traces import DASHES, axis, rounded, scatter
-
-if TYPE_CHECKING:
-    from imulab.procedures.gyro_array.fuse import Fused
 
 STATES = (
     (EXCLUDED, "excluded", "circle-open", QUIET),
@@ -27,7 +28,63 @@ _PIECES = 240
 _COLOURS = (GOOD, BAD, "#8e6bbd")
 
 
-def exhibits_of_fused(fused: Fused) -> Exhibits:
+@dataclass(frozen=True, repr=False)
+class Fused(Drawn):
+    """The fused rate.
+
+    Attributes
+    ----------
+    time
+        s, shape (m,).
+    rate
+        In the unit of the readings, shape (m, axes).
+    weights, flags
+        Of each gyro in each sample, shape (m, axes, n), or None where they were not asked for.
+    elements
+        The columns that were fused.
+    health
+        What happened to each gyro.
+    block
+        The samples that were fused.
+    notes
+        Gaps in time, and whatever else a user should know.
+
+    Examples
+    --------
+    >>> import imulab as il
+    >>> fused = il.fuse(il.simulate_array(experiment="static", duration=10.0))
+    >>> fused.rate.shape == (len(fused.time), 1)
+    True
+    """
+
+    time: Array
+    rate: Array
+    weights: Array | None
+    flags: np.ndarray | None
+    elements: Elements
+    health: Health
+    block: Recording
+    notes: tuple[str, ...] = ()
+
+    subject: ClassVar[str] = "Fused rate"
+
+    def exhibits(self) -> Exhibits:
+        """Return the rate and the state of the gyros over time."""
+        return _exhibits(self)
+
+    def recording(self) -> Recording:
+        """Return the fused rate as a recording, with the time and the head of what was fused: ``write`` takes it."""
+        columns, units = {"time": self.block.columns["time"]}, {"time": self.block.units["time"]}
+        for a, (name, unit) in enumerate(zip(self.elements.rate_names(), self.elements.units, strict=True)):
+            columns[name], units[name] = np.ascontiguousarray(self.rate[:, a]), unit
+        return replace(self.block, columns=columns, units=units, notes=())
+
+    def __repr__(self) -> str:
+        gyros, axes = self.elements.count, len(self.elements.axes)
+        return f"Fused({len(self.time)} samples of {gyros} gyros on {axes} axes, in {' '.join(self.elements.units)})"
+
+
+def _exhibits(fused: Fused) -> Exhibits:
     """Return the rate over time and, for each axis with flags, the state of its gyros; a table of them."""
     elements = fused.elements
     length = f"{fused.time[-1] - fused.time[0]:.4g} s"

@@ -1,6 +1,6 @@
-"""What recordings and records show of themselves, and what is done with them next.
+"""What recordings and records show of themselves, and what is done with them next: `imulab.views.Views`.
 
-`Recording` and `Calibration` lie below all procedures; their methods import this one module when they are called.
+`Recording` and `Calibration` lie below all procedures; their methods ask the package for this module when called.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import numpy as np
 from imulab.errors import OptionError, RecordError, listed
 from imulab.procedures.apply import apply
 from imulab.procedures.exporting import export as export_records
-from imulab.procedures.inputs import Reading, as_recording
+from imulab.procedures.inputs import as_recording
 from imulab.procedures.loading import load as load
 from imulab.procedures.procedure import Row
 from imulab.procedures.registry import procedure_of
 from imulab.procedures.reports import exhibits_of, parameter_rows
 from imulab.procedures.reports import write_report as write_report
+from imulab.reading import Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.report.channels import channel_figures
