@@ -1,6 +1,5 @@
 """A procedure that nobody knows but the registry goes all the way: fit, record, report, apply, show and a fleet."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,22 +59,48 @@ def _exhibits(record):
     )
 
 
-MADE_UP = Procedure(
-    name="drift",
-    command="drifts",
-    title="Drift at rest",
-    line_title="Drifts",
-    task=Task("one recording", (1, 1), OPTIONS, lambda texts, label: read_options(OPTIONS, texts, label), _fit),
-    check=lambda record: None,
-    exhibits=_exhibits,
-    tables=_tables,
-    sections=(Section("gyro", golden=golden_gyroscopes, apply=apply_gyro, triad="gyro"),),
-)
+class DriftSection(Section):
+    kind = "gyro"
+    triad = "gyro"
+
+    def golden(self, table, random):
+        return golden_gyroscopes(table, random)
+
+    def apply(self, unit, columns, recording):
+        return apply_gyro(unit, columns, recording)
+
+
+class DriftProcedure(Procedure):
+    name = "drift"
+    command = "drifts"
+    title = "Drift at rest"
+    line_title = "Drifts"
+    task = Task("one recording", (1, 1), OPTIONS, lambda texts, label: read_options(OPTIONS, texts, label), _fit)
+    sections = (DriftSection(),)
+
+    def check(self, record):
+        pass
+
+    def exhibits(self, record):
+        return _exhibits(record)
+
+    def tables(self, record, fusion=None):
+        return _tables(record)
+
+
+class ExportedDrift(DriftProcedure):
+    """One whose records other programs can hold."""
+
+    states_triads = True
+
+    def triads(self, record):
+        accel = Accelerometers(np.full(3, 2.0), np.eye(3), np.ones(3), np.array([[0.1, 0, 0]]), np.zeros(3), "m/s^2")
+        return Triads(accel, None)
 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    monkeypatch.setitem(PROCEDURES, MADE_UP.command, MADE_UP)
+    monkeypatch.setitem(PROCEDURES, "drifts", DriftProcedure())
     monkeypatch.chdir(tmp_path)
     for k in (1, 2):
         rng = np.random.default_rng(k)
@@ -125,8 +150,7 @@ def test_its_record_is_exported_where_its_entry_states_triads(record, monkeypatc
     assert main(["export", "--to", "ros", "1.json", "-o", "ros"]) == 2
     reason = "ros: a drift record cannot be exported: it states no accelerometers; use --to c or --to blob"
     assert reason in capsys.readouterr().err
-    accel = Accelerometers(np.full(3, 2.0), np.eye(3), np.ones(3), np.array([[0.1, 0, 0]]), np.zeros(3), "m/s^2")
-    monkeypatch.setitem(PROCEDURES, "drifts", replace(MADE_UP, triads=lambda record: Triads(accel, None)))
+    monkeypatch.setitem(PROCEDURES, "drifts", ExportedDrift())
     assert main(["export", "--to", "ros", "1.json", "-o", "ros", "--lossy"]) == 0
     said = capsys.readouterr().err
     assert "k2_x" in said

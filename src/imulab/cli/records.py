@@ -117,15 +117,15 @@ class _Rows:
 def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
     from imulab.power_on import TAKEN_FROM
-    from imulab.procedures.apply import beyond_tests_of, warnings_of
+    from imulab.procedures.apply import procedures_in, warnings_of
     from imulab.verdict import Note
 
-    tests = [test for record in records for test in beyond_tests_of(record)]
+    tests = [(record, procedure) for record in records for procedure in procedures_in(record)]
     counts, largest, name = [0] * len(tests), [0.0] * len(tests), ""
     for number, block in enumerate(blocks):
-        for index, (record, beyond, _) in enumerate(tests):
+        for index, (record, procedure) in enumerate(tests):
             try:
-                here, most = beyond(record, block)
+                here, most = procedure.beyond(record, block)
             except ImulabError:  # what only an earlier record of the chain makes usable; apply itself refuses the rest
                 continue
             counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
@@ -137,9 +137,9 @@ def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording
             messages += [f"{block.name}: was corrected before, by {entry}" for entry in block.corrected_by]
             for message in dict.fromkeys(messages):
                 warn(message)
-    for (record, _, said), count, most in zip(tests, counts, largest, strict=True):
+    for (record, procedure), count, most in zip(tests, counts, largest, strict=True):
         if count:
-            warn(f"{name}: {said(record, count, most)}")
+            warn(f"{name}: {procedure.beyond_message(record, count, most)}")
 
 
 @with_options(READ)

@@ -17,7 +17,7 @@ from imulab.printable import printable
 from imulab.procedures.registry import PROCEDURES, procedure_of
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
-from imulab.records.triads import CROSS_TERMS, NOT_FITTED, Accelerometers, Gyroscopes, Magnetometers, text_in_g
+from imulab.records.triads import CROSS_TERMS, Accelerometers, Gyroscopes, Magnetometers, text_in_g
 from imulab.units import STANDARD_GRAVITY
 
 AXES = "xyz"
@@ -60,20 +60,18 @@ def one_unit(records: Sequence[Calibration], target: str) -> UnitModel:
     RecordError
         The record lacks a parameter.
     """
-    found = []
     for record in records:
-        entry = procedure_of(record)
-        if entry.triads is None:
-            reason = (entry.elsewhere or "it states no accelerometers").format(target=target)
-            instead = "; use --to c or --to blob" if entry.sections else ""
+        procedure = procedure_of(record)
+        if not procedure.states_triads:
+            reason = procedure.elsewhere.format(target=target)
+            instead = "; use --to c or --to blob" if procedure.sections else ""
             raise OptionError(f"{target}: a {record.procedure} record cannot be exported: {reason}{instead}")
-        found.append((record, entry.triads))
     if len(records) != 1:
-        known = " or ".join(entry.name for entry in PROCEDURES.values() if entry.triads is not None)
+        known = " or ".join(procedure.name for procedure in PROCEDURES.values() if procedure.states_triads)
         raise OptionError(f"{target}: expected one {known} record, found {len(records)}")
-    ((record, triads_of),) = found
+    (record,) = records
     try:
-        triads = triads_of(record)
+        triads = procedure_of(record).triads(record)
     except RecordError as error:
         raise RecordError(f"{target}: {error}") from None
     return UnitModel(record, triads.accel, triads.gyro, triads.mag)
@@ -134,8 +132,7 @@ def held_accelerometers(
     if error <= _NEGLIGIBLE * STANDARD_GRAVITY:
         return accel, error, []
     what = "bias, scale factor and misalignment" if misalignment else "bias and scale factor"
-    linear_fit = procedure_of(unit.record).linear_fit
-    fit = NOT_FITTED if linear_fit is None else linear_fit(unit.record, misalignment=misalignment)
+    fit = procedure_of(unit.record).linear_fit(unit.record, misalignment=misalignment)
     held = fit.accel or accel
     return held, accel_loss(accel, correction(held)), [f"{what} {fit.remark}"]
 

@@ -61,14 +61,12 @@ def offset_law(
     RecordError
         The record lacks a coefficient.
     """
-    over = [record for record in records if procedure_of(record).laws is not None]
+    over = [record for record in records if procedure_of(record).over_temperature]
     if not over:
         return None
     if len(records) != 1:
         raise OptionError(f"{target}: a {over[0].procedure} record goes alone, found {len(records)} records")
-    laws_of = procedure_of(over[0]).laws
-    assert laws_of is not None
-    laws = laws_of(over[0])
+    laws = procedure_of(over[0]).laws(over[0])
     if laws.unit != "m/s^2":
         raise OptionError(
             f"{target}: corrects outputs in m/s^2, but the record is for accelerometers with outputs in {laws.unit}"
@@ -105,8 +103,7 @@ def _rest(
     record: Calibration, target: str, temperature: Array, design: Array
 ) -> tuple[Array | None, list[str], list[str]]:
     """Return the gyroscopes' offset as coefficients of a design, what its lack of all else costs, and a comment."""
-    laws_of = procedure_of(record).gyro_laws
-    laws = None if laws_of is None else laws_of(record)
+    laws = procedure_of(record).gyro_laws(record)
     if laws is None:
         return None, [], []
     if laws.unit != "rad/s":

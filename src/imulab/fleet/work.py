@@ -138,8 +138,7 @@ def make_record(unit: FleetUnit, files: UnitFiles) -> Calibration:
 def summarise(record: Calibration, content_sha256: str) -> Summary:
     """Return what table and history need of a record that `make_record` has made."""
     made = record.sections["fleet"]
-    hook = PROCEDURES[made["procedure"]].on_line
-    on_line = None if hook is None else hook(record)
+    on_line = PROCEDURES[made["procedure"]].on_line(record)
     return Summary(
         serial=record.sensor["serial"],
         procedure=made["procedure"],

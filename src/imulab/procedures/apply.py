@@ -15,19 +15,17 @@ from imulab.device.blob import Blob
 from imulab.device.unit import DeviceUnit
 from imulab.errors import DataError, OptionError, RecordError
 from imulab.power_on import with_power_on_temperature
-from imulab.procedures.inputs import Data, Reading, Record, as_record, as_recording
+from imulab.procedures.inputs import Record, as_record, as_recording
 from imulab.procedures.loading import load_any
 from imulab.procedures.order import check_after, check_order, entry, thermals_of
-from imulab.procedures.procedure import Section
+from imulab.procedures.procedure import Procedure, Section
 from imulab.procedures.registry import joined_of, procedure_of, section
 from imulab.procedures.unit_tables import tables_of
 from imulab.quantities import in_si
+from imulab.reading import Data, Reading
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration
 from imulab.verdict import SENTENCES, Note
-
-_Beyond = Callable[[Calibration, Recording], tuple[int, float]]
-_Said = Callable[[Calibration, int, float], str]
 
 _FAR_IN_TEMPERATURE = 20.0
 
@@ -87,7 +85,7 @@ def loaded(record: Calibration | Blob, name: str | None = None, *, again: bool =
         if unknown:
             raise RecordError(f"{record.name}: a section {unknown[0]!r} cannot be applied to a recording")
         # The table of an array is for `array fuse`; it leaves the other columns of a recording alone.
-        chain = tuple((found, entry) for found, entry in known if found is not None and found.apply is not None)
+        chain = tuple((found, entry) for found, entry in known if found is not None and found.corrects)
         if not chain:
             raise RecordError(f"{record.name}: nothing in this blob corrects a recording; array fuse takes it")
         holds = (sha256(record.data).hexdigest(), *map(str, record.text.get("records", ())))
@@ -112,13 +110,12 @@ def with_heading(chain: Sequence[Loaded], records: Sequence[Calibration | Blob])
     found, why = list(chain), ""
     for index in reversed(range(len(records))):
         record = records[index]
-        law = None if isinstance(record, Blob) else procedure_of(record).heading
-        if law is None or isinstance(record, Blob):
+        if isinstance(record, Blob) or not procedure_of(record).has_heading:
             kind = "a blob" if isinstance(record, Blob) else f"a {record.procedure} record"
             why = why or f"{found[index].name}: heading needs a record with magnetometers, found {kind}"
             continue
         try:
-            found[index] = replace(found[index], further=law(record))
+            found[index] = replace(found[index], further=procedure_of(record).heading(record))
         except RecordError as error:
             why = f"{found[index].name}: {error}"
             continue
@@ -208,7 +205,6 @@ def apply(
     )
     corrected = recording
     for part, columns in sections_for(ready.sections, recording):
-        assert part.apply is not None
         corrected = part.apply(ready.unit, columns, corrected)
     if ready.further is not None:
         corrected = ready.further(corrected)
@@ -255,7 +251,7 @@ def apply_blocks(records: Iterable[Calibration | Blob | Loaded], blocks: Iterabl
 def _why_unchanged(chain: Iterable[Loaded], recording: Recording) -> Iterator[str]:
     for ready in chain:
         for part, columns in ready.sections:
-            if part.unchanged is not None and (message := part.unchanged(columns, recording)):
+            if message := part.unchanged(columns, recording):
                 yield message
 
 
@@ -263,7 +259,7 @@ def sections_for(
     sections: Sequence[tuple[Section, Mapping[str, Any]]], recording: Recording
 ) -> Sequence[tuple[Section, Mapping[str, Any]]]:
     """Return the sections that a recording has the columns for, where it has those of one triad of two."""
-    kept = [part for part in sections if part[0].triad is None or _has_any(recording, part[0].triad)]
+    kept = [part for part in sections if not part[0].triad or _has_any(recording, part[0].triad)]
     return kept or sections  # with nothing to correct, the section itself says which columns it expects
 
 
@@ -298,7 +294,7 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
         missing = " and ".join(KINDS[triad].sensors for triad in absent)
         found.append(Note(f"{recording.name}: no {missing} in it: its {there} alone are corrected"))
     for part, columns in parts:
-        found += [] if part.remarks is None else part.remarks(columns, recording)
+        found += part.remarks(columns, recording)
     made = None if isinstance(record, Blob) else record.model.get("temperature")
     here = recording.mean_temperature()
     if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
@@ -310,12 +306,6 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     ]
 
 
-def beyond_tests_of(record: Calibration | Blob) -> list[tuple[Calibration, _Beyond, _Said]]:
-    """Return what counts samples far beyond what the record was made at, and what says so, each with the record."""
-    if isinstance(record, Blob):
-        return []
-    return [
-        (record, of.beyond, of.beyond_message)
-        for of in (procedure_of(record), *joined_of(record))
-        if of.beyond is not None and of.beyond_message is not None
-    ]
+def procedures_in(record: Calibration | Blob) -> list[Procedure]:
+    """Return the procedures whose results a record holds; of a blob none is known."""
+    return [] if isinstance(record, Blob) else [procedure_of(record), *joined_of(record)]

@@ -77,9 +77,7 @@ def compare_records(first: Record, second: Record) -> Changes:
     """
     one, other = (as_record(record, "compare_records") for record in (first, second))
     procedure = procedure_of(one)
-    pair = one, other
-    if procedure.comparable and other.procedure == one.procedure:
-        pair = procedure.comparable(one, other)
+    pair = procedure.comparable(one, other) if other.procedure == one.procedure else (one, other)
     return Changes(**vars(compared(*pair, procedure.same_meaning)), record=one)
 
 

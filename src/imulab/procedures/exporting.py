@@ -120,17 +120,17 @@ def export(
 
 def _fusion(to: str, method: str | None, memory: str | float | None, records: Sequence[Calibration]) -> Fusion:
     for record in records if to in _FIRMWARE else ():
-        fusion = procedure_of(record).fusion
-        if fusion is not None:
-            return fusion(record, method, None if memory is None else str(memory))
+        procedure = procedure_of(record)
+        if procedure.fuses:
+            return procedure.fusion(record, method, None if memory is None else str(memory))
     raise OptionError("method and memory say how a gyro array fuses: expected its record, and target c or blob")
 
 
 def _noise_of(record: Calibration, name: str) -> Mapping[str, Any]:
-    noise = procedure_of(record).noise
-    if noise is None:
-        raise OptionError(f"{name}: expected what 'imulab allan --json' printed, found a {record.procedure} record")
-    return noise(record)
+    try:
+        return procedure_of(record).noise(record)
+    except OptionError as error:
+        raise OptionError(f"{name}: {error}") from None
 
 
 def _noise(file: str) -> Mapping[str, Any]:

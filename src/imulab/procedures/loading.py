@@ -51,9 +51,9 @@ def loads_sealed(data: bytes, name: str) -> tuple[Calibration, str]:
     """Return a record from the bytes of its file, and its ``content_sha256``; errors as for `load`."""
     record, seal = parsed(data, name)
     try:
-        for entry in PROCEDURES.values():
-            if entry.name == record.procedure:
-                entry.check(record)
+        for procedure in PROCEDURES.values():
+            if procedure.name == record.procedure:
+                procedure.check(record)
     except RecordError as error:
         raise RecordError(f"{name}: {error}") from None
     return record, seal

@@ -1,6 +1,7 @@
 """What a procedure is to the rest of the package: its fit, what its record gives a unit, and how it is shown.
 
-An entry names functions of its folder by `deferred`, so that the registry costs nothing until one of them is called.
+Each procedure's folder has a class of `Procedure` that overrides what it has, and imports the rest of its folder when
+one of its methods is called, so that the registry costs nothing.
 """
 
 from __future__ import annotations
@@ -8,11 +9,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
+from imulab.errors import OptionError
 from imulab.procedures.options import Option
+from imulab.records.triads import NOT_FITTED
+from imulab.units import STANDARD_GRAVITY, from_si
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,17 +28,6 @@ if TYPE_CHECKING:
     from imulab.records.comparison import Change
     from imulab.records.triads import AccelerometerLaws, GyroscopeLaws, LinearFit, Triads
     from imulab.report.elements import Exhibits
-
-
-def deferred(where: str) -> Callable[..., Any]:
-    """Return a function that is imported when it is first called; `where` is ``"imulab.module:name"``."""
-    module, _, name = where.partition(":")
-
-    def call(*given: Any, **named: Any) -> Any:
-        return getattr(import_module(module), name)(*given, **named)
-
-    call.__name__ = name
-    return call
 
 
 class Files(Protocol):
@@ -87,7 +79,6 @@ class Task:
         return tuple(option.name for option in self.options)
 
 
-@dataclass(frozen=True)
 class Section:
     """One kind of section in a unit's tables: the struct ``il_<kind>`` of the C core.
 
@@ -95,28 +86,35 @@ class Section:
     ----------
     kind
         Name of the struct.
-    golden
-        Table and random numbers to the vectors of an exported unit's self-test: input, and what the core makes of it.
-    apply
-        The unit, what the section says of its columns, and a recording to the corrected recording; None where a section
-        corrects no columns of their own.
     triad
-        ``accel`` or ``gyro`` where the section corrects that triad: it is left out where a recording has none of it.
-    unchanged
-        What the section says of its columns and a recording to the reason why it leaves it as it is, or None.
-    remarks
-        The same to what a user should know about correcting that recording, `unchanged` included.
+        ``accel``, ``gyro`` or ``mag`` where the section corrects that triad: it is left out where a recording has none
+        of it.
+    corrects
+        Whether it corrects columns of a recording.
     since_power_on
         Whether the correction follows the time since power-on.
     """
 
-    kind: str
-    golden: Callable[[DeviceTable, np.random.Generator], dict[str, Any]]
-    apply: Callable[[DeviceUnit, Mapping[str, Any], Recording], Recording] | None = None
-    triad: str | None = None
-    unchanged: Callable[[Mapping[str, Any], Recording], str | None] | None = None
-    remarks: Callable[[Mapping[str, Any], Recording], list[str]] | None = None
-    since_power_on: bool = False
+    kind: ClassVar[str]
+    triad: ClassVar[str] = ""
+    corrects: ClassVar[bool] = True
+    since_power_on: ClassVar[bool] = False
+
+    def golden(self, table: DeviceTable, random: np.random.Generator) -> dict[str, Any]:
+        """Return the vectors of an exported unit's self-test: inputs, and what the core makes of them by a table."""
+        raise NotImplementedError
+
+    def apply(self, unit: DeviceUnit, columns: Mapping[str, Any], recording: Recording) -> Recording:
+        """Return the corrected recording; `columns` is what the section says of its columns."""
+        raise NotImplementedError
+
+    def unchanged(self, columns: Mapping[str, Any], recording: Recording) -> str | None:
+        """Return why a recording stays as it is, None where it is corrected."""
+        return None
+
+    def remarks(self, columns: Mapping[str, Any], recording: Recording) -> list[str]:
+        """Return what a user should know about correcting a recording, why it stays as it is included."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -156,9 +154,17 @@ class OnLine:
     freedom: float | None
 
 
-@dataclass(frozen=True)
+READING_UNITS = {
+    "rad/s": (from_si(1.0, "deg/h"), "deg/h"),
+    "m/s^2": (from_si(1.0, "ug"), "µg"),
+    "rad": (1e3, "mrad"),
+    "rad/s/(m/s^2)": (from_si(STANDARD_GRAVITY, "deg/h"), "deg/h/g"),
+}
+"""Factor from an SI unit, and the unit in which people read it, where a procedure has no other."""
+
+
 class Procedure:
-    """A procedure's entry in the registry.
+    """A procedure, as the registry knows it.
 
     Attributes
     ----------
@@ -172,90 +178,142 @@ class Procedure:
         Of its part in the report of a fleet.
     task
         How it is run on the files of one unit.
-    check
-        Of a record read from its file: raises RecordError where its sections are not what the procedure writes.
-    exhibits
-        Record to headline, facts, figures and tables.
-    tables
-        Record to the tables of a unit, in the order in which they are applied.
-    fusion
-        Record, and texts of method and memory or None, to how the unit is to fuse, which `tables` then takes; None
-        where it fuses nothing.
-    noise
-        Record to what exporters make noise keys of, in the form of ``allan --json``; None where it states no noise.
     sections
-        The kinds of these tables.
-    triads
-        Record to its accelerometers and gyroscopes as matrices, which other programs' files are made from; None where
-        it states none.
-    laws
-        Record to the laws of its accelerometers over temperature, which autopilots take as offsets; None where it
-        states none.
-    gyro_laws
-        The same of its gyroscopes, None for a record without.
-    linear_fit
-        Record (and whether to keep the misalignment) to its accelerometers fitted anew without nonlinearity, for
-        programs that hold none; None where they cannot be.
+        The kinds of tables that it gives a unit.
     elsewhere
         Why another program's file cannot hold its records, where they state no triads; ``{target}`` is that program.
     not_applied
-        Why its records correct no recording by `apply`, and what takes them; None where they do.
-    rows
-        Record to its parameters in the units in which people read them; by their units if None.
-    summary
-        Record to the table that it shows of itself first, titles and rows of text; of all its parameters if None.
-    change_unit
-        Change of a parameter and record to the factor from SI and the unit in which it is read; by unit if None.
-    same_meaning
-        Name of a parameter and two records to whether it means the same in both; by its unit alone if None.
-    comparable
-        Two records to the same two with parameters that mean the same in both, None where theirs do; raises RecordError
-        where there are none.
-    on_line
-        Record to what units of a line are compared by; None where a parameter means the same in all records.
-    heading
-        Record to what adds magnetic heading and dip to a recording that it corrected; raises RecordError where it holds
-        no magnetometers. None where no record of the procedure does.
-    beyond
-        Record and recording to how many samples lie beyond what the record was made at, and the largest specific force
-        among them, m/s^2; None where no such limit is known.
-    joined
-        Record of another procedure, whose ``fit`` and ``data`` hold this one's under its name, to what it shows of it.
-    beyond_message
-        Record, that number and that force to what a user should know.
+        Why its records correct no recording by `apply`, and what takes them; empty where they do.
+    states_triads
+        Whether its records state accelerometers and gyroscopes as matrices, which other programs' files are made from.
+    over_temperature
+        Whether its records hold laws over temperature, which autopilots take as offsets.
+    fuses
+        Whether its records say how a unit fuses several gyroscopes.
+    has_heading
+        Whether a record can hold magnetometers, which tell magnetic heading and dip.
+    joins
+        Whether records of other procedures can hold its results beside their own, in ``fit`` and ``data`` by its name.
     """
 
-    name: str
-    command: str
-    title: str
-    line_title: str
-    task: Task
-    check: Callable[[Calibration], None]
-    exhibits: Callable[[Calibration], Exhibits]
-    tables: Callable[..., tuple[DeviceTable, ...]]
-    sections: tuple[Section, ...]
-    fusion: Callable[[Calibration, str | None, str | None], Fusion] | None = None
-    noise: Callable[[Calibration], Mapping[str, Any]] | None = None
-    triads: Callable[[Calibration], Triads] | None = None
-    laws: Callable[[Calibration], AccelerometerLaws] | None = None
-    gyro_laws: Callable[[Calibration], GyroscopeLaws | None] | None = None
-    linear_fit: Callable[..., LinearFit] | None = None
-    elsewhere: str | None = None
-    not_applied: str | None = None
-    rows: Callable[[Calibration], Sequence[Row]] | None = None
-    summary: Callable[[Calibration], tuple[list[str], list[list[str]]]] | None = None
-    change_unit: Callable[[Change, Calibration], tuple[float, str]] | None = None
-    same_meaning: Callable[[str, Calibration, Calibration], bool] | None = None
-    comparable: Callable[[Calibration, Calibration], tuple[Calibration, Calibration]] | None = None
-    on_line: Callable[[Calibration], OnLine] | None = None
-    heading: Callable[[Calibration], Callable[[Recording], Recording]] | None = None
-    beyond: Callable[[Calibration, Recording], tuple[int, float]] | None = None
-    beyond_message: Callable[[Calibration, int, float], str] | None = None
-    joined: Callable[[Calibration], Exhibits] | None = None
+    name: ClassVar[str]
+    command: ClassVar[str]
+    title: ClassVar[str]
+    line_title: ClassVar[str]
+    task: ClassVar[Task]
+    sections: ClassVar[tuple[Section, ...]] = ()
+    elsewhere: ClassVar[str] = "it states no accelerometers"
+    not_applied: ClassVar[str] = ""
+    states_triads: ClassVar[bool] = False
+    over_temperature: ClassVar[bool] = False
+    fuses: ClassVar[bool] = False
+    has_heading: ClassVar[bool] = False
+    joins: ClassVar[bool] = False
 
     def section(self, kind: str) -> Section:
         """Return one of its kinds of section."""
         return next(known for known in self.sections if known.kind == kind)
+
+    # What a record is and shows.
+
+    def check(self, record: Calibration) -> None:
+        """Check a record from its file; raises RecordError where its sections are not what the procedure writes."""
+        raise NotImplementedError
+
+    def exhibits(self, record: Calibration) -> Exhibits:
+        """Return headline, facts, figures and tables of a record."""
+        raise NotImplementedError
+
+    def joined(self, record: Calibration) -> Exhibits:
+        """Return what a record of another procedure shows of this one's results in it."""
+        raise NotImplementedError
+
+    def summary(self, record: Calibration) -> tuple[list[str], list[list[str]]]:
+        """Return the table that a record shows of itself first, titles and rows; empty for that of all parameters."""
+        return [], []
+
+    def rows(self, record: Calibration) -> Sequence[Row]:
+        """Return the parameters in the units in which people read them."""
+        rows = []
+        for name, parameter in record.parameters.items():
+            factor, unit = READING_UNITS.get(parameter.unit, (1.0, parameter.unit))
+            u = parameter.standard_uncertainty
+            rows.append(Row(name, parameter.value * factor, None if u is None else u * factor, unit))
+        return rows
+
+    # Two records of a unit, and the units of a line.
+
+    def change_unit(self, change: Change, record: Calibration) -> tuple[float, str]:
+        """Return the factor from SI and the unit in which the change of a parameter is read."""
+        return READING_UNITS.get(change.unit, (1.0, change.unit))
+
+    def same_meaning(self, name: str, first: Calibration, second: Calibration) -> bool:
+        """Return whether a parameter means the same in two records."""
+        return True
+
+    def comparable(self, first: Calibration, second: Calibration) -> tuple[Calibration, Calibration]:
+        """Return two records with parameters that mean the same in both; raises RecordError where there are none."""
+        return first, second
+
+    def on_line(self, record: Calibration) -> OnLine | None:
+        """Return what units of a line are compared by, None where a parameter means the same in all records."""
+        return None
+
+    # What a record gives a unit, and what corrects a recording.
+
+    def tables(self, record: Calibration, fusion: Fusion | None = None) -> tuple[DeviceTable, ...]:
+        """Return the tables of a unit, in the order in which they are applied; an array fuses by `fusion`."""
+        raise NotImplementedError
+
+    def fusion(self, record: Calibration, method: str | None, memory: str | None) -> Fusion:
+        """Return how the unit is to fuse, by texts of method and memory; as the record carries where these are None."""
+        raise NotImplementedError
+
+    def heading(self, record: Calibration) -> Callable[[Recording], Recording]:
+        """Return what adds magnetic heading and dip to a recording that the record corrected.
+
+        Raises
+        ------
+        RecordError
+            It holds no magnetometers.
+        """
+        raise NotImplementedError
+
+    def beyond(self, record: Calibration, recording: Recording) -> tuple[int, float]:
+        """Return how many samples lie beyond what the record was made at, and the largest value among them, SI."""
+        return 0, 0.0
+
+    def beyond_message(self, record: Calibration, count: int, largest: float) -> str:
+        """Say that so many samples, the largest of them in SI, lie beyond what the record was made at."""
+        raise NotImplementedError
+
+    # What other programs take of a record.
+
+    def noise(self, record: Calibration) -> Mapping[str, Any]:
+        """Return what exporters make noise keys of, in the form of ``allan --json``.
+
+        Raises
+        ------
+        OptionError
+            Its records state no noise.
+        """
+        raise OptionError(f"expected what 'imulab allan --json' printed, found a {record.procedure} record")
+
+    def triads(self, record: Calibration) -> Triads:
+        """Return accelerometers, gyroscopes and magnetometers as matrices."""
+        raise NotImplementedError
+
+    def linear_fit(self, record: Calibration, *, misalignment: bool) -> LinearFit:
+        """Return the accelerometers fitted anew without nonlinearity (and misalignment), for programs without."""
+        return NOT_FITTED
+
+    def laws(self, record: Calibration) -> AccelerometerLaws:
+        """Return the laws of the accelerometers over temperature."""
+        raise NotImplementedError
+
+    def gyro_laws(self, record: Calibration) -> GyroscopeLaws | None:
+        """Return the laws of the gyroscopes over temperature, None for a record without."""
+        return None
 
 
 def source_of(access: Files, name: str, called: str | None = None) -> Source | None:

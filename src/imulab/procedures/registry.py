@@ -1,6 +1,6 @@
-"""The registry: one entry per procedure, with all that the rest of the package asks of it.
+"""The registry: the procedures, with all that the rest of the package asks of them.
 
-Nobody else tells procedures apart by name. A further procedure is a folder with an entry, and a line here.
+Nobody else tells procedures apart by name. A further procedure is a folder with a class, and a line here.
 """
 
 from __future__ import annotations
@@ -8,18 +8,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from imulab.errors import RecordError
-from imulab.procedures.centrifuge.entry import ENTRY as CENTRIFUGE
-from imulab.procedures.gyro_array.entry import ENTRY as GYRO_ARRAY
-from imulab.procedures.noise.entry import ENTRY as NOISE
+from imulab.procedures.centrifuge.entry import CentrifugeProcedure
+from imulab.procedures.gyro_array.entry import GyroArrayProcedure
+from imulab.procedures.noise.entry import NoiseProcedure
 from imulab.procedures.procedure import Procedure, Section
-from imulab.procedures.rate.entry import ENTRY as RATE
-from imulab.procedures.thermal.entry import ENTRY as THERMAL
-from imulab.procedures.tumble.entry import ENTRY as TUMBLE
-from imulab.procedures.warmup.entry import ENTRY as WARMUP
+from imulab.procedures.rate.entry import RateProcedure
+from imulab.procedures.thermal.entry import ThermalProcedure
+from imulab.procedures.tumble.entry import TumbleProcedure
+from imulab.procedures.warmup.entry import WarmupProcedure
 from imulab.records.calibration import Calibration
 
 PROCEDURES: dict[str, Procedure] = {
-    entry.command: entry for entry in (TUMBLE, GYRO_ARRAY, WARMUP, CENTRIFUGE, NOISE, THERMAL, RATE)
+    procedure.command: procedure
+    for procedure in (
+        TumbleProcedure(),
+        GyroArrayProcedure(),
+        WarmupProcedure(),
+        CentrifugeProcedure(),
+        NoiseProcedure(),
+        ThermalProcedure(),
+        RateProcedure(),
+    )
 }
 """By the names of the command line and of fleets' manifests."""
 
@@ -32,23 +41,23 @@ def procedure_of(record: Calibration) -> Procedure:
     RecordError
         It is not known.
     """
-    for entry in PROCEDURES.values():
-        if entry.name == record.procedure:
-            return entry
-    known = " ".join(entry.name for entry in PROCEDURES.values())
+    for procedure in PROCEDURES.values():
+        if procedure.name == record.procedure:
+            return procedure
+    known = " ".join(procedure.name for procedure in PROCEDURES.values())
     raise RecordError(f"unknown procedure {record.procedure!r}; known procedures: {known}")
 
 
 def joined_of(record: Calibration) -> list[Procedure]:
     """Return the other procedures whose results a record holds beside its own."""
-    others = (entry for entry in PROCEDURES.values() if entry.joined is not None and entry.name != record.procedure)
-    return [entry for entry in others if entry.name in record.fit]
+    others = (procedure for procedure in PROCEDURES.values() if procedure.joins and procedure.name != record.procedure)
+    return [procedure for procedure in others if procedure.name in record.fit]
 
 
 def sections() -> Iterator[Section]:
     """Yield every kind of section that a unit's tables can have."""
-    for entry in PROCEDURES.values():
-        yield from entry.sections
+    for procedure in PROCEDURES.values():
+        yield from procedure.sections
 
 
 def section(kind: str) -> Section | None:

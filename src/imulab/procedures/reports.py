@@ -14,14 +14,6 @@ from imulab.procedures.registry import joined_of, procedure_of
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import Change
 from imulab.report.elements import Exhibits
-from imulab.units import STANDARD_GRAVITY, from_si
-
-_READ = {
-    "rad/s": (from_si(1.0, "deg/h"), "deg/h"),
-    "m/s^2": (from_si(1.0, "ug"), "µg"),
-    "rad": (1e3, "mrad"),
-    "rad/s/(m/s^2)": (from_si(STANDARD_GRAVITY, "deg/h"), "deg/h/g"),
-}
 
 
 def exhibits_of(record: Calibration) -> Exhibits:
@@ -32,10 +24,9 @@ def exhibits_of(record: Calibration) -> Exhibits:
     RecordError
         Its procedure is not known, or it lacks the data that they need.
     """
-    exhibits: Exhibits = procedure_of(record).exhibits(record)
-    for entry in joined_of(record):
-        assert entry.joined is not None
-        more = entry.joined(record)
+    exhibits = procedure_of(record).exhibits(record)
+    for procedure in joined_of(record):
+        more = procedure.joined(record)
         exhibits = replace(
             exhibits,
             headline=f"{exhibits.headline} {more.headline}",
@@ -47,22 +38,12 @@ def exhibits_of(record: Calibration) -> Exhibits:
 
 def change_unit(change: Change, record: Calibration) -> tuple[float, str]:
     """Return the factor from SI and the unit in which people read the change of a parameter."""
-    own = procedure_of(record).change_unit
-    return _READ.get(change.unit, (1.0, change.unit)) if own is None else own(change, record)
+    return procedure_of(record).change_unit(change, record)
 
 
 def parameter_rows(record: Calibration) -> Sequence[Row]:
     """Return the parameters of a record in the units in which people read them."""
-    own = procedure_of(record).rows
-    if own is not None:
-        rows: Sequence[Row] = own(record)
-        return rows
-    found = []
-    for name, p in record.parameters.items():
-        factor, unit = _READ.get(p.unit, (1.0, p.unit))
-        u = p.standard_uncertainty
-        found.append(Row(name, p.value * factor, None if u is None else u * factor, unit))
-    return found
+    return procedure_of(record).rows(record)
 
 
 def rendered(record: Calibration) -> str:

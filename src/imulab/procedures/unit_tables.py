@@ -23,8 +23,7 @@ def tables_of(record: Calibration, fusion: Fusion | None = None) -> tuple[Device
     RecordError
         The record lacks a parameter or has one that cannot be.
     """
-    made_by = procedure_of(record)
-    return made_by.tables(record) if made_by.fusion is None else made_by.tables(record, fusion)
+    return procedure_of(record).tables(record, fusion)
 
 
 def tables_of_all(records: Sequence[Calibration], fusion: Fusion | None = None) -> list[DeviceTable]:

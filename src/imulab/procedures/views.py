@@ -126,9 +126,8 @@ def _headline(record: Calibration) -> str:
 
 def _summary(record: Calibration) -> tuple[list[str], list[list[str]]]:
     """Return the table that a record shows first; nothing of one that lacks what it is made from."""
-    own = procedure_of(record).summary
     try:
-        return ([], []) if own is None else own(record)
+        return procedure_of(record).summary(record)
     except RecordError:
         return [], []
 
