@@ -117,10 +117,10 @@ class _Rows:
 def _with_warnings(records: list[Calibration | Blob], blocks: Iterable[Recording]) -> Iterator[Recording]:
     """Pass blocks on; say behind the first what a user should know, and at the end what lay beyond the test."""
     from imulab.power_on import TAKEN_FROM
-    from imulab.procedures.apply import procedures_in, warnings_of
+    from imulab.procedures.apply import results_in, warnings_of
     from imulab.verdict import Note
 
-    tests = [(record, procedure) for record in records for procedure in procedures_in(record)]
+    tests = results_in(records)
     counts, largest, name = [0] * len(tests), [0.0] * len(tests), ""
     for number, block in enumerate(blocks):
         for index, (record, procedure) in enumerate(tests):

@@ -306,6 +306,7 @@ def warnings_of(record: Calibration | Blob, recording: Recording) -> list[str]:
     ]
 
 
-def procedures_in(record: Calibration | Blob) -> list[Procedure]:
-    """Return the procedures whose results a record holds; of a blob none is known."""
-    return [] if isinstance(record, Blob) else [procedure_of(record), *joined_of(record)]
+def results_in(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:
+    """Return each record with each procedure whose results it holds; a blob does not say what it holds."""
+    known = [record for record in records if isinstance(record, Calibration)]
+    return [(record, procedure) for record in known for procedure in (procedure_of(record), *joined_of(record))]
